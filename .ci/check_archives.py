@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Check that a wheel and a source archive hold every file of the checkout that belongs in them.
 
-The wheel's description must not point into the repository: a package index shows it without the files.
+The wheel's description must not point into the repository: a package index shows it without the
+files.
 
 Usage: python .ci/check_archives.py dist/ltcl-*.whl dist/ltcl-*.tar.gz
 """

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Install a wheel and a source archive as a user would, for each Python that ltcl is for, and use them.
 
-Each archive goes into an empty virtual environment of its own, away from the checkout. All other packages
-come as wheels: nothing is compiled. Then `ltcl doctor` and a small `ltcl demo` must end well, with neither
-compiler nor linker on PATH; that takes an OpenCL driver, the wheel of PoCL on Linux x86-64. Pythons are those
-of the classifiers in pyproject.toml that PATH has; those that are missing are named, which is no error unless
---all is given.
+Each archive goes into an empty virtual environment of its own, away from the checkout. All other
+packages come as wheels: nothing is compiled. Then `ltcl doctor` and a small `ltcl demo` must end
+well, with neither compiler nor linker on PATH; that takes an OpenCL driver, the wheel of PoCL on
+Linux x86-64. Pythons are those of the classifiers in pyproject.toml that PATH has; those that are
+missing are named, which is no error unless --all is given.
 
 Usage: python .ci/check_install.py [--all] [--python 3.12] dist/ltcl-*.whl dist/ltcl-*.tar.gz
 """
@@ -39,7 +39,8 @@ def interpreter(version: str) -> str | None:
     found = shutil.which(f"python{version}")
     if found is None:
         return None
-    # Version managers put a command of every version there, most of which only say that they are not active.
+    # Version managers put a command of every version there, most of which only say that they are
+    # not active.
     code = "import ensurepip, sys, venv; print(sys.version.split()[0])"
     answer = subprocess.run([found, "-c", code], capture_output=True, text=True, check=False)  # noqa: S603
     return found if answer.returncode == 0 and answer.stdout.startswith(f"{version}.") else None
@@ -52,8 +53,17 @@ def use(python: str, archive: Path, folder: Path) -> str | None:
     own = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     steps = [
         [python, "-m", "venv", str(folder / "venv")],
-        # The archive itself may be source, nothing else: `hatchling`, which builds it, is a wheel, too.
-        [str(own / "python"), "-m", "pip", "install", "--quiet", "--only-binary=:all:", str(archive)],
+        # The archive itself may be source, nothing else: `hatchling`, which builds it, is a wheel,
+        # too.
+        [
+            str(own / "python"),
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--only-binary=:all:",
+            str(archive),
+        ],
         [str(own / "python"), "-m", "pip", "check"],
         [str(own / "python"), "-c", VERSION],
         [str(own / "ltcl"), "doctor"],
@@ -95,7 +105,9 @@ def main() -> int:
             print(f"Python {version}, {archive.name}: {verdict} ({spent:.0f} s)", flush=True)
     if missing:
         print(f"NOT TESTED, since PATH has no such Python with venv: {', '.join(missing)}")
-    return int(failed > 0 or (given.all and bool(missing)) or len(missing) == len(given.python or NAMED))
+    return int(
+        failed > 0 or (given.all and bool(missing)) or len(missing) == len(given.python or NAMED)
+    )
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 
 Failures are named as they happen: a run that is ended has said what failed.
 
-One reason to skip is accepted: that the folder `../shared/data` is absent, which holds captures that
-are not part of the project. Expected failures (`xfail`) are no skips.
+One reason to skip is accepted: that the folder `../shared/data` is absent, which holds captures
+that are not part of the project. Expected failures (`xfail`) are no skips.
 """
 
 from __future__ import annotations
@@ -57,4 +57,6 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """Refuse a run without any test of the `device` fixture, which fails where there is no device."""
     fixtures: set[Any] = set().union(*(getattr(item, "fixturenames", ()) for item in session.items))
     if "device" not in fixtures:
-        raise pytest.UsageError("no test asks for the `device` fixture: the kernels would go untested")
+        raise pytest.UsageError(
+            "no test asks for the `device` fixture: the kernels would go untested"
+        )

@@ -17,7 +17,12 @@ from ltcl.scenes.viewer import Viewer
 from ltcl.solvers import Solution, Status
 
 NEUTRAL, FLOOR = (1, 2, 3, 5), 2  # walls, in the order of `box`: the first is red, the fifth green
-ALBEDO = ((0.49, 0.06, 0.06), *(3 * (grey,) for grey in (0.45, 0.49, 0.42)), (0.06, 0.49, 0.06), 3 * (0.47,))
+ALBEDO = (
+    (0.49, 0.06, 0.06),
+    *(3 * (grey,) for grey in (0.45, 0.49, 0.42)),
+    (0.06, 0.49, 0.06),
+    3 * (0.47,),
+)
 LIGHT = (1.0, 0.8, 0.5, 1.0, 1.0, 0.8)  # on each wall
 RTOL = 1e-2  # residual at which a solve counts as done
 
@@ -91,6 +96,8 @@ def race(name: str, n: int, sides: int, albedo: float, device: ltcl.Device) -> R
     l_d = albedo * np.broadcast_to(np.array(LIGHT[:sides])[:, None], (n, sides, n)).reshape(-1)
     (S,) = scene.transport(first_bounce=scene.first_bounce, device=device).systems
     (l_out,) = all_bounces(scene, l_d[None])
-    jacobi, chebyshev = (ltcl.solve(S, l_out, m, rtol=1e-5, throw=False) for m in ("jacobi", "chebyshev"))
+    jacobi, chebyshev = (
+        ltcl.solve(S, l_out, m, rtol=1e-5, throw=False) for m in ("jacobi", "chebyshev")
+    )
     rho_a = albedo * float(np.linalg.eigvalsh(scene.form_factors)[-1])
     return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, relative(chebyshev.x, l_d))

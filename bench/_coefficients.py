@@ -11,8 +11,15 @@ import scipy.sparse
 from rich.console import Console
 
 import ltcl
-from ltcl.compression.coefficients import drop_below
-from ltcl.operators import Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, restrict_to_support
+from ltcl.operators import (
+    Compressed,
+    IdentityPlus,
+    ScaledColumns,
+    Tiles,
+    Wavelet,
+    restrict_to_support,
+)
+from ltcl.tasks.compression.coefficients import drop_below
 
 ROWS = 64  # more, and the system hands out and takes back memory at every step
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """R of a right-angled corner of one albedo, dense, with a sixteenth of the work of one inverse.
 
-The corner has two mirrors, from left to right and from top to bottom. Light that is even or odd under each of
-them stays so at every bounce: four kinds that never mix. A quarter of the corner, N / 4 pixels, tells all of
-such light, and A there is the sum of its four mirror images with the signs of the kind.
+The corner has two mirrors, from left to right and from top to bottom. Light that is even or odd
+under each of them stays so at every bounce: four kinds that never mix. A quarter of the corner, N /
+4 pixels, tells all of such light, and A there is the sum of its four mirror images with the signs
+of the kind.
 
-Form factors depend on three offsets only, n^3 numbers for the N^2 = 4 n^4 entries of A: products with A of
-131072 pixels, 69 GB, take a table of 134 MB.
+Form factors depend on three offsets only, n^3 numbers for the N^2 = 4 n^4 entries of A: products
+with A of 131072 pixels, 69 GB, take a table of 134 MB.
 """
 
 from __future__ import annotations
@@ -23,20 +24,26 @@ from ltcl.scenes.scene import transport
 class Bounce:
     """A = albedo F of `ltcl.scenes.dihedral(n, albedo)`, (N, N) with N = 2 n^2, never stored.
 
-    `table` (n, n, n): form factors of patches d apart along the seam, in column p of the left wall, which
-    sees, and column q of the right one, both counted from the left.
+    `table` (n, n, n): form factors of patches d apart along the seam, in column p of the left wall,
+    which sees, and column q of the right one, both counted from the left.
     """
 
     def __init__(self, n: int, albedo: float) -> None:
         self.n, self.albedo, self.grid, self.shape = n, albedo, (n, 2 * n), (2 * n * n, 2 * n * n)
-        left, right = np.array([((0, 0, -1), (-1, 0, 0)), ((0, 0, -1), (0, 1, 0))], np.float64)  # down, right
+        left, right = np.array(
+            [((0, 0, -1), (-1, 0, 0)), ((0, 0, -1), (0, 1, 0))], np.float64
+        )  # down, right
         d, p, q = np.ogrid[:n, :n, :n]
         offsets = np.broadcast_arrays(p + 0.5 - n, q + 0.5, d)
         places = (np.stack([each[k] for each in offsets], axis=-1).reshape(-1, 3) for k in range(n))
-        self.table = np.stack([exchange.exchange(left, right, place).reshape(n, n) for place in places])
+        self.table = np.stack(
+            [exchange.exchange(left, right, place).reshape(n, n) for place in places]
+        )
         around = np.abs(np.arange(2 * n) - n)  # n, n - 1, ..., 0, ..., n - 1, of which n is none
         even = np.concatenate([self.table, np.zeros_like(self.table[:1])])[np.roll(around, n)]
-        self._spectrum = np.ascontiguousarray(np.fft.rfft(even, axis=0).real)  # cosine transforms over d
+        self._spectrum = np.ascontiguousarray(
+            np.fft.rfft(even, axis=0).real
+        )  # cosine transforms over d
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1 of A, (stop - start, N) float32."""
@@ -70,7 +77,9 @@ def interreflection(n: int, albedo: float, progress: Callable[[str], object]) ->
     for number, kind in enumerate(kinds):
         progress(f"  bounces of light, kind {number + 1} of 4")
         form_factors = np.tensordot(signs[number], images, 1)
-        kind[:] = transport(form_factors, np.full(size, albedo), np.ones(size)) / albedo - np.eye(size)
+        kind[:] = transport(form_factors, np.full(size, albedo), np.ones(size)) / albedo - np.eye(
+            size
+        )
     R = np.empty((n, 2 * n, n, 2 * n), np.float32)
     for image, of_kinds in enumerate(signs):
         block = np.tensordot(of_kinds / 4, kinds, 1).reshape(half, n, half, n)

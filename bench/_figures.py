@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the benches of the paper's figures share: claims that are checked, and the page they are drawn on.
 
-A claim of the paper is measured on every run, and one that fails ends the bench with exit status 1. Where
-exact transport disagrees with the paper the claim says why in `differs`; it must then not hold, so that
-the remark cannot outlive its reason.
+A claim of the paper is measured on every run, and one that fails ends the bench with exit status 1.
+Where exact transport disagrees with the paper the claim says why in `differs`; it must then not
+hold, so that the remark cannot outlive its reason.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from ltcl.images import from_srgb, to_srgb
 from ltcl.plots.page import FAINT, GRID, PAPER, axes_at, figure_of, heading, label_at
 from ltcl.scenes import Scene
 
-Box = tuple[float, float, float, float]  # left, top, width and height in pixels, from the top left corner
+Box = tuple[
+    float, float, float, float
+]  # left, top, width and height in pixels, from the top left corner
 WIDTH, MARGIN, SIZE = 1000, 30, 400  # pixels of the page, and of a view
 
 
@@ -42,7 +44,9 @@ class Claim:
     differs: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "holds", bool(self.holds))  # comparisons of arrays give NumPy's own
+        object.__setattr__(
+            self, "holds", bool(self.holds)
+        )  # comparisons of arrays give NumPy's own
 
     @property
     def passed(self) -> bool:
@@ -53,12 +57,20 @@ class Claim:
     def verdict(self) -> str:
         """What the table says."""
         if self.differs:
-            return f"DIFFERS: {self.differs}" if self.passed else "FAILS: holds, though it is said to differ"
+            return (
+                f"DIFFERS: {self.differs}"
+                if self.passed
+                else "FAILS: holds, though it is said to differ"
+            )
         return "holds" if self.passed else "FAILS"
 
 
 def conclude(
-    given: Options, title: str, claims: Sequence[Claim], facts: dict[str, Any], draw: Callable[[], Figure]
+    given: Options,
+    title: str,
+    claims: Sequence[Claim],
+    facts: dict[str, Any],
+    draw: Callable[[], Figure],
 ) -> None:
     """Publish the claims, and exit with 1 if one is not as expected."""
     table = Table("claim", "measured", "wanted", "verdict", show_lines=True)
@@ -105,7 +117,9 @@ def pictures(figure: Figure, top: float, shown: Sequence[tuple[Any, ...]], gap: 
         picture(figure, (left, top, width), image, *text)
 
 
-def graph(figure: Figure, box: Box, title: str, xlabel: str, ylabel: str, scale: str = "log") -> Axes:
+def graph(
+    figure: Figure, box: Box, title: str, xlabel: str, ylabel: str, scale: str = "log"
+) -> Axes:
     """Axes for curves, in the colours of the page; the title stands 26 pixels above the box."""
     axes = axes_at(figure, box)
     axes.set_yscale(scale)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What every bench shares: options, timing, the roofline, and the report.
 
-Ratios count: competitors are timed in turn with us, as the speed of a machine drifts. Figures are medians.
+Ratios count: competitors are timed in turn with us, as the speed of a machine drifts. Figures are
+medians.
 """
 
 from __future__ import annotations
@@ -54,7 +55,13 @@ class Row:
 
     @classmethod
     def of_times(
-        cls, question: str, who: str, theirs: float, ours: float, unit: str, target: float | None = None
+        cls,
+        question: str,
+        who: str,
+        theirs: float,
+        ours: float,
+        unit: str,
+        target: float | None = None,
     ) -> Row:
         """The less, the better."""
         return cls(question, who, theirs, ours, unit, theirs / ours, target)
@@ -88,8 +95,9 @@ def options(description: str, own: Mapping[str, Mapping[str, Any]] | None = None
 def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:
     """Median seconds of each action, run in turn A B C A B C.
 
-    Before its turn comes a rest, as threads of BLAS and OpenMP spin after their work; then it runs until the
-    processor is awake, and once more, which counts: in a solve a product follows a product.
+    Before its turn comes a rest, as threads of BLAS and OpenMP spin after their work; then it runs
+    until the processor is awake, and once more, which counts: in a solve a product follows a
+    product.
     """
     times: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(repeats):
@@ -130,26 +138,39 @@ def triad(device: Device, smoke: bool, parts: int = 1) -> tuple[Callable[[], Non
 
 
 def report(
-    given: Options, title: str, rows: list[Row], facts: dict[str, Any], draw: Callable[[], Any] | None = None
+    given: Options,
+    title: str,
+    rows: list[Row],
+    facts: dict[str, Any],
+    draw: Callable[[], Any] | None = None,
 ) -> None:
     """Publish comparisons, by default as bars."""
     table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
     for row in rows:
         target = "" if row.target is None else f"{row.target:.3g}x"
         figures = (f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x")
-        table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
+        table.add_row(
+            row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict
+        )
     content = {"rows": [{**asdict(row), "verdict": row.verdict} for row in rows]}
     publish(given, title, facts, table, content, draw or (lambda: _bars(title, rows)))
 
 
 def publish(
-    given: Options, title: str, facts: dict[str, Any], table: Table, content: Any, draw: Callable[[], Any]
+    given: Options,
+    title: str,
+    facts: dict[str, Any],
+    table: Table,
+    content: Any,
+    draw: Callable[[], Any],
 ) -> None:
     """Print facts and table; write them with `content`, and draw, where the command line asked for it."""
     console = Console(width=150)
     console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
     for name, value in facts.items():
-        console.print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+        console.print(
+            f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}"
+        )
     if given.smoke:
         console.print("[yellow]--smoke: sizes this small show that it runs, not how fast[/]")
     console.print(table)
@@ -184,7 +205,9 @@ def _bars(title: str, rows: list[Row]) -> Any:
     for place, row in zip(places, rows, strict=True):
         if row.target is not None:
             axes.plot([row.target] * 2, [place - 0.4, place + 0.4], color="#c0392b", lw=2)
-    axes.set_yticks(places, [f"{row.question}\nagainst {row.competitor}" for row in rows], fontsize=7)
+    axes.set_yticks(
+        places, [f"{row.question}\nagainst {row.competitor}" for row in rows], fontsize=7
+    )
     axes.set_xscale("log")
     axes.set_xlabel("times better (red: target)")
     axes.set_title(title, fontsize=10)

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A transport measured from photographs alone, beside the true one: how far off, and what it costs.
 
-A corner of 64 x 64 projector pixels, each wall 64 x 32, of which the exact transport is known. A virtual
-camera photographs it: a response that nothing tells the software, a black offset of 0.4 %, ambient light,
-photon and read noise, 8 or 12 bits. Then the measured T is used, and compared in the camera's own unit of
-light (its last code; nothing else fixes it, so one scale a channel is not counted as an error):
+A corner of 64 x 64 projector pixels, each wall 64 x 32, of which the exact transport is known. A
+virtual camera photographs it: a response that nothing tells the software, a black offset of 0.4 %,
+ambient light, photon and read noise, 8 or 12 bits. Then the measured T is used, and compared in the
+camera's own unit of light (its last code; nothing else fixes it, so one scale a channel is not
+counted as an error):
 
     T p             of patterns that no scan has seen
     compensated     a picture that is shown with the pattern that T says
-    bounces 1 to 3  of a picture, against their `std`, which is known without the truth: root mean squares
-    far light       the sum of what a pixel gets from beyond its tile of n / 8 pixels and the tiles around it
+    bounces 1 to 3  of a picture, against their `std`, which is known without the truth: root mean
+    squares far light       the sum of what a pixel gets from beyond its tile of n / 8 pixels and
+    the tiles around it
 
-An adaptive scan has to need a fifth of the photographs of one pixel at a time at most. Smaller corners give
-photographs and time against the number of pixels, beside what the plan said before the first one.
+An adaptive scan has to need a fifth of the photographs of one pixel at a time at most. Smaller
+corners give photographs and time against the number of pixels, beside what the plan said before the
+first one.
 """
 
 from __future__ import annotations
@@ -57,8 +60,8 @@ LINES = {
 class Found:
     """One acquisition: photographs and seconds of exposure, as planned and as taken; seconds it ran.
 
-    `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations. `far` is the error of far
-    light row by row, `weak` that of all of it, which noise hardly changes.
+    `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations. `far` is the error
+    of far light row by row, `weak` that of all of it, which noise hardly changes.
     """
 
     name: str
@@ -131,7 +134,9 @@ def shown(T: ltcl.Transport, P: np.ndarray) -> np.ndarray:
 def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str) -> Found:
     response, bits = CAMERAS[camera]
     grid, T_or = (truth.n, truth.n), truth.matrices if truth.channels == 3 else truth.matrices[0]
-    rig = VirtualRig(T_or, grid, mixing=truth.mixing, response=response, bits=bits, ambient=0.01, seed=2)
+    rig = VirtualRig(
+        T_or, grid, mixing=truth.mixing, response=response, bits=bits, ambient=0.01, seed=2
+    )
     with TemporaryDirectory() as folder:
         path, start = Path(folder) / "T.zarr", time.perf_counter()
         T = acquire(rig, geometry="aligned", strategy=strategy, store=path, device=device)
@@ -173,7 +178,9 @@ def of_bounces(T: ltcl.Transport, truth: Truth) -> tuple[list[float], float]:
         for part in (found, found.std)
     )
     error = ours - truth.bounces(image, 3)
-    ratios = np.sqrt(np.mean(error**2, axis=(1, 2)) / np.mean(deviation.astype(np.float64) ** 2, axis=(1, 2)))
+    ratios = np.sqrt(
+        np.mean(error**2, axis=(1, 2)) / np.mean(deviation.astype(np.float64) ** 2, axis=(1, 2))
+    )
     return ratios.tolist(), float(np.min(np.mean(np.abs(error) < 3 * deviation, axis=(1, 2))))
 
 
@@ -183,7 +190,9 @@ def compensated(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> float:
     level = 0.25 if truth.channels == 1 else 0.1
     desired = level * (1 + 0.4 * np.sin(7 * x + 4 * y))[..., None] * np.ones(truth.channels)
     wanted = (desired / unit).astype(np.float32)
-    pattern = ltcl.compensate(T, wanted[..., 0] if truth.channels == 1 else wanted, rtol=1e-3).pattern
+    pattern = ltcl.compensate(
+        T, wanted[..., 0] if truth.channels == 1 else wanted, rtol=1e-3
+    ).pattern
     given = np.asarray(pattern, np.float64).reshape(-1, 1, truth.channels)
     error = truth.seen(given)[:, 0] - desired.reshape(-1, truth.channels)
     return float(10 * np.log10(desired.max() ** 2 / np.mean(error**2)))
@@ -193,20 +202,45 @@ def claims(found: list[Found], costs: list[Found], largest: int) -> list[Claim]:
     cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
     over = max(one.photographs / one.planned for one in costs)
     fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"
-    counts, is_fifth = f"{cost['adaptive']} of {cost['pixel']}", 5 * cost["adaptive"] <= cost["pixel"]
+    counts, is_fifth = (
+        f"{cost['adaptive']} of {cost['pixel']}",
+        5 * cost["adaptive"] <= cost["pixel"],
+    )
     listed = [
         Claim(fifth, counts, "at most 1 / 5", is_fifth),
-        Claim("photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1),
+        Claim(
+            "photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1
+        ),
     ]
     for one in found:
         ratios = ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:])
         bounces = f"{one.name}: bounces 1 to 3, error over std"
         inside = f"{one.inside:.1%} within 3 deviations"
         listed += [
-            Claim(f"{one.name}: T p of held patterns", f"{one.held:.2%}", "at most 2 %", one.held <= 0.02),
-            Claim(f"{one.name}: row sum furthest off", f"{one.sums:.2%}", "at most 2 %", one.sums <= 0.02),
-            Claim(f"{one.name}: far light, all", f"{one.weak:.2%} off", "at most 2 %", one.weak <= 0.02),
-            Claim(f"{one.name}: compensated", f"{one.decibels:.1f} dB", "at least 30", one.decibels >= 30),
+            Claim(
+                f"{one.name}: T p of held patterns",
+                f"{one.held:.2%}",
+                "at most 2 %",
+                one.held <= 0.02,
+            ),
+            Claim(
+                f"{one.name}: row sum furthest off",
+                f"{one.sums:.2%}",
+                "at most 2 %",
+                one.sums <= 0.02,
+            ),
+            Claim(
+                f"{one.name}: far light, all",
+                f"{one.weak:.2%} off",
+                "at most 2 %",
+                one.weak <= 0.02,
+            ),
+            Claim(
+                f"{one.name}: compensated",
+                f"{one.decibels:.1f} dB",
+                "at least 30",
+                one.decibels >= 30,
+            ),
             Claim(bounces, f"{ratios}; {inside}", "at most 2", max(one.bounces[1:]) <= 2),
         ]
     return listed
@@ -263,7 +297,9 @@ def main() -> None:
         facts[f"{one.name}, far light row by row"] = one.far
         facts[f"{one.name}, direct part, error over std"] = one.bounces[0]
         if one.strategy != "adaptive":
-            facts[f"{one.name}, columns beside white before they added up to it"] = one.sum_deviation
+            facts[f"{one.name}, columns beside white before they added up to it"] = (
+                one.sum_deviation
+            )
     for cost in costs:
         name = f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"
         facts[name] = cost.photographs / cost.planned

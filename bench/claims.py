@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """No answer that is quietly wrong: random systems of all kinds, methods and scales, every claim checked.
 
-S is well conditioned, nearly singular, of entries that differ by many orders, or a diffuse scene, in every
-form that `solve` takes; S and b are scaled by up to 1e30 and down to 1e-30. Of each solve that says CONVERGED
-the residual is computed in extended precision, with the numbers that were given: above 1.01 times the
-tolerance it counts as untrue. A solve may well fail, as long as it says so.
+S is well conditioned, nearly singular, of entries that differ by many orders, or a diffuse scene,
+in every form that `solve` takes; S and b are scaled by up to 1e30 and down to 1e-30. Of each solve
+that says CONVERGED the residual is computed in extended precision, with the numbers that were
+given: above 1.01 times the tolerance it counts as untrue. A solve may well fail, as long as it says
+so.
 """
 
 from __future__ import annotations
@@ -78,7 +79,10 @@ KINDS: dict[str, Callable[[Device, np.ndarray], tuple[Any, np.ndarray]]] = {
     "LinearOperator": lambda device, S: (aslinearoperator(S), S),
     "Dense": lambda device, S: (Dense(device, S), S.astype(np.float32)),
     "CSR": lambda device, S: (CSR(device, scipy.sparse.csr_array(S)), S),
-    "tiles": lambda device, S: (A := Tiles(device, scipy.sparse.csr_array(S)), A.matrix().toarray()),
+    "tiles": lambda device, S: (
+        A := Tiles(device, scipy.sparse.csr_array(S)),
+        A.matrix().toarray(),
+    ),
     "I + R": identity_plus,
 }
 
@@ -88,7 +92,9 @@ def untrue(device: Device, random: Random, tally: Counter[str]) -> str | None:
     n = LARGE if random.uniform() < SHARE else int(random.choice([1, 2, 3, 7, 20, 60]))
     methods = [method for method in METHODS if method not in SAMPLED]
     matrix, kind, method = (str(random.choice(list(of))) for of in (MATRICES, KINDS, methods))
-    scale_S, scale_b = 10.0 ** random.choice([-30.0, -20.0, -5.0, 0.0, 0.0, 0.0, 5.0, 20.0, 30.0], 2)
+    scale_S, scale_b = 10.0 ** random.choice(
+        [-30.0, -20.0, -5.0, 0.0, 0.0, 0.0, 5.0, 20.0, 30.0], 2
+    )
     rtol = 10.0 ** random.uniform(-8.0 if random.uniform() < 0.3 else -4.0, -0.5)
     b = random.uniform(-0.3, 1.0, (n, 3) if random.uniform() < 0.3 else n) * scale_b
     try:
@@ -107,7 +113,9 @@ def untrue(device: Device, random: Random, tally: Counter[str]) -> str | None:
     truth = float(np.max(left / np.linalg.norm((b / scale_b).astype(np.float64), axis=0)))
     if truth <= CLAIM * rtol:
         return None
-    what = f"{matrix}, {kind}, N = {n}, {method}, scales {scale_S:g} and {scale_b:g}, rtol {rtol:.2g}"
+    what = (
+        f"{matrix}, {kind}, N = {n}, {method}, scales {scale_S:g} and {scale_b:g}, rtol {rtol:.2g}"
+    )
     return f"{what}: claimed {s.residual:.2g}, is {truth:.2g}"
 
 
@@ -118,7 +126,9 @@ def main() -> None:
         warnings.simplefilter("error")
         claims = [untrue(given.device, random, tally) for _ in range(total)]
     found = [claim for claim in claims if claim is not None]
-    rows = [Row("untrue claims", f"of {total} solves", 0.0, len(found), "claims", float(not found), 1.0)]
+    rows = [
+        Row("untrue claims", f"of {total} solves", 0.0, len(found), "claims", float(not found), 1.0)
+    ]
     facts = dict(tally) | {f"untrue {i}": claim for i, claim in enumerate(found)}
     report(given, "Claims of convergence", rows, facts)
     if found:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Frames over a cluster: frames a second and efficiency over workers, memory over many frames, and kills.
 
-Workers are processes on this machine, of one core each, so that two are a machine twice as large as one. This
-process, which reads and writes the frames, has no core of its own; what it takes of one says how many frames
-it can feed to workers. The rate of one film is that of a long one: after the first quarter, when workers have
-T and its kernels. The other has a quarter of the pixels and is timed with the start, so that what a cluster
-costs shows. In the kill table workers end by SIGKILL while a run is on its way; its files are compared with a
-serial run's.
+Workers are processes on this machine, of one core each, so that two are a machine twice as large as
+one. This process, which reads and writes the frames, has no core of its own; what it takes of one
+says how many frames it can feed to workers. The rate of one film is that of a long one: after the
+first quarter, when workers have T and its kernels. The other has a quarter of the pixels and is
+timed with the start, so that what a cluster costs shows. In the kill table workers end by SIGKILL
+while a run is on its way; its files are compared with a serial run's.
 """
 
 from __future__ import annotations
@@ -86,8 +86,12 @@ def main() -> None:
         place = Path(name)
         for name, side in (("T.npz", size), ("little.npz", size // 2)):
             ltcl.save(place / name, ltcl.scenes.box(side, sides=3).transport())
-        T, little = (ltcl.load(place / name, device=given.device) for name in ("T.npz", "little.npz"))
-        os.environ["LTCL_CACHE"] = str(place / "cache")  # one memory of timings, so the same kernels
+        T, little = (
+            ltcl.load(place / name, device=given.device) for name in ("T.npz", "little.npz")
+        )
+        os.environ["LTCL_CACHE"] = str(
+            place / "cache"
+        )  # one memory of timings, so the same kernels
         source, short = film(T, place / "film", frames), film(little, place / "short", frames)
 
         def run(out: str, source: Path = source, T: ltcl.Transport = T, **others: Any) -> float:
@@ -105,14 +109,23 @@ def main() -> None:
             for count, client in clients.items():
                 before = time.process_time()
                 rates[count].append(rate(run, frames, f"{count} {turn}", client))
-                whole[count].append(frames / run(f"whole {count} {turn}", short, little, client=client))
+                whole[count].append(
+                    frames / run(f"whole {count} {turn}", short, little, client=client)
+                )
                 fed += [2 * frames / (time.process_time() - before)] * (turn > 0)
-        facts |= {"pixels": T.shape[1], "frames": frames, "of memory": many, "cores": os.cpu_count()}
+        facts |= {
+            "pixels": T.shape[1],
+            "frames": frames,
+            "of memory": many,
+            "cores": os.cpu_count(),
+        }
         facts["frames a second that this process can feed, of a core"] = float(np.median(fed))
         goal = None if given.smoke else 2.0 * EFFICIENCY
         for what, found in (("long film", rates), ("short film of a quarter of the pixels", whole)):
             one, two = (float(np.median(found[count][1:])) for count in found)
-            rows.append(Row(f"two workers, {what}", "one worker", one, two, "frames/s", two / one, goal))
+            rows.append(
+                Row(f"two workers, {what}", "one worker", one, two, "frames/s", two / one, goal)
+            )
         client, sizes, own = clients[2], [], psutil.Process()
 
         def weigh(step: str, done: int, total: int | None) -> None:
@@ -125,7 +138,9 @@ def main() -> None:
         quarter = max(1, len(sizes) // 4)
         early, late = np.median(sizes[:quarter]), np.median(sizes[-quarter:])
         goal = None if given.smoke else 1.0 / GROWTH
-        rows.append(Row("largest process, last quarter", "first", early, late, "MB", early / late, goal))
+        rows.append(
+            Row("largest process, last quarter", "first", early, late, "MB", early / late, goal)
+        )
 
         ended: list[int] = []
 
@@ -139,7 +154,9 @@ def main() -> None:
         slow = run("killed", client=client, progress=kill)
         same = float(bytes_of(place / "killed") == bytes_of(place / "serial"))
         facts |= {"kills, after frames": ended, "seconds with kills": slow, "files": frames + 1}
-        rows.append(Row(f"bytes after {len(ended)} kills", "serial run", 1.0, same, "equal", same, 1.0))
+        rows.append(
+            Row(f"bytes after {len(ended)} kills", "serial run", 1.0, same, "equal", same, 1.0)
+        )
     report(given, "Frames over a cluster", rows, facts)
 
 

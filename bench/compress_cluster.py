@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compression by workers of one core each: the corner of `resolution131k.py`, by one of them and by two.
 
-Dask workers make, transform and threshold blocks of rows, then of the columns that are left. Each is bound to
-a core, with one thread for OpenCL; one is timed after the other, and the numbers must have the same bits.
+Dask workers make, transform and threshold blocks of rows, then of the columns that are left. Each
+is bound to a core, with one thread for OpenCL; one is timed after the other, and the numbers must
+have the same bits.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from distributed import Client, LocalCluster
 from _coefficients import note
 from _corner import Bounce
 from _harness import Options, Row, options, report
-from ltcl.compression.coefficients import Analysis, Coefficients, coefficients
-from ltcl.compression.sources import source
 from ltcl.operators import Wavelet
+from ltcl.tasks.compression.coefficients import Analysis, Coefficients, coefficients
+from ltcl.tasks.compression.sources import source
 from resolution131k import MEMORY, REFERENCE, THRESHOLD
 
 SHARE = 0.6  # of the time of one worker, which two may take
@@ -50,8 +51,14 @@ def main() -> None:
     for name in ("indptr", "indices", "data"):
         np.testing.assert_array_equal(getattr(one.core, name), getattr(two.core, name))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    facts = {"pixels": rows.shape[0], "share of the time": fast / slow, "peak memory here, MB": peak}
-    row = Row.of_times("numbers of A", "one worker", slow, fast, "s", None if given.smoke else 1 / SHARE)
+    facts = {
+        "pixels": rows.shape[0],
+        "share of the time": fast / slow,
+        "peak memory here, MB": peak,
+    }
+    row = Row.of_times(
+        "numbers of A", "one worker", slow, fast, "s", None if given.smoke else 1 / SHARE
+    )
     report(given, "compression by two workers of a core", [row], facts)
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compression to what pictures need, judged by a second measurement and by pictures that it never saw.
 
-The case: a box with two blocks, 64 x 64 pixels, path-traced (`scenes.tracing`), so that two measurements
-differ by 19 % in the Frobenius norm of R and by 0.31 % in T p; and a simulated one, four walls with a block,
-exact form factors, entries Poisson counts of as much noise. Then 200 pictures (parts of a photograph,
-letters, checkerboards, single pixels) in each of six scenes: the largest loss of appearance, direct light
-and compensating pattern, over what is stated.
+The case: a box with two blocks, 64 x 64 pixels, path-traced (`scenes.tracing`), so that two
+measurements differ by 19 % in the Frobenius norm of R and by 0.31 % in T p; and a simulated one,
+four walls with a block, exact form factors, entries Poisson counts of as much noise. Then 200
+pictures (parts of a photograph, letters, checkerboards, single pixels) in each of six scenes: the
+largest loss of appearance, direct light and compensating pattern, over what is stated.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ from scenes import tracing
 
 FROBENIUS, HELD, ACCURATE = 0.19, 200, 1e-4
 PATHS = 10_240  # a camera pixel, for such differences
-LIMITS = (0.01, "pictures", 150), ("noise", "pictures", 700), (0.1, "worst", None)  # bytes a row, at most
+LIMITS = (
+    (0.01, "pictures", 150),
+    ("noise", "pictures", 700),
+    (0.1, "worst", None),
+)  # bytes a row, at most
 OVER = "worst held picture over stated, "
 
 
@@ -36,7 +40,9 @@ def box(n: int) -> np.ndarray:
     walls = np.arange(4 * n * n).reshape(n, 4, n)
     order = np.block([[walls[:, 0], walls[:, 1]], [walls[:, 2], walls[:, 3]]]).ravel()
     block = scenes.Block((0.3, 0.3, 0.0), (0.3, 0.3, 0.5))
-    return scenes.box(n, 4, albedo=0.28, occluder=block).transport().to_numpy()[np.ix_(order, order)]
+    return (
+        scenes.box(n, 4, albedo=0.28, occluder=block).transport().to_numpy()[np.ix_(order, order)]
+    )
 
 
 def measure(T: np.ndarray, grid: tuple[int, int]) -> list[ltcl.Transport]:
@@ -45,7 +51,9 @@ def measure(T: np.ndarray, grid: tuple[int, int]) -> list[ltcl.Transport]:
     R = np.maximum(T / F - np.eye(len(F)), 0.0)
     counts = 2.0 * R.sum() / (FROBENIUS * np.linalg.norm(R)) ** 2
     paths = (np.random.default_rng(seed).poisson(counts * R) / counts for seed in (1, 2))
-    return [ltcl.Transport(((np.eye(len(F)) + each) * F).astype(np.float32), grid) for each in paths]
+    return [
+        ltcl.Transport(((np.eye(len(F)) + each) * F).astype(np.float32), grid) for each in paths
+    ]
 
 
 def held(grid: tuple[int, int], count: int) -> np.ndarray:
@@ -57,7 +65,9 @@ def held(grid: tuple[int, int], count: int) -> np.ndarray:
         board = np.add.outer(np.arange(h) // (k % 7 + 1), np.arange(w) // (k % 5 + 1)) % 2
         page, word = np.zeros(grid, np.uint8), "".join(random.choice(list("abcdefgMNOPQ789"), 20))
         for line in range(9, h, 10):
-            cv2.putText(page, word, (-int(random.integers(20)), line), cv2.FONT_HERSHEY_PLAIN, 0.7, (255,))
+            cv2.putText(
+                page, word, (-int(random.integers(20)), line), cv2.FONT_HERSHEY_PLAIN, 0.7, (255,)
+            )
         part = cv2.resize(whole[y : y + side, x : x + side], (w, h), interpolation=cv2.INTER_AREA)
         pixel = np.eye(1, h * w, int(random.integers(h * w))).reshape(grid)
         pictures.append((part, page / 255.0 if page.any() else board, board, pixel)[k % 4].ravel())
@@ -100,7 +110,10 @@ def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, A
             text = f"{name}: bytes a row at rtol {rtol}"
             claims.append(Claim(text, f"{row:.4g}", f"at most {most}", row <= most))
         if rtol == "noise":
-            text, ratio = f"{name}: appearance error over that of the exact T, noise", off(C) / exact
+            text, ratio = (
+                f"{name}: appearance error over that of the exact T, noise",
+                off(C) / exact,
+            )
             claims.append(Claim(text, f"{ratio:.3f}", "at most 1.1", ratio <= 1.1))
     return facts, claims
 

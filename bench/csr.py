@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The CSR product, beside what memory gives, SciPy, and MKL and cuSPARSE where they are installed.
 
-N = 131072 pixels, 256 nonzeros a row, in runs of 16 neighbours (as light transport has them) and at random;
-1, 3, 4 and 8 right-hand sides. Ours is timed with vectors on the device, as inside a solve. Bytes are 8 per
-nonzero (float32 value, 32-bit column), counted once however many right-hand sides there are.
+N = 131072 pixels, 256 nonzeros a row, in runs of 16 neighbours (as light transport has them) and at
+random; 1, 3, 4 and 8 right-hand sides. Ours is timed with vectors on the device, as inside a solve.
+Bytes are 8 per nonzero (float32 value, 32-bit column), counted once however many right-hand sides
+there are.
 """
 
 from __future__ import annotations
@@ -63,7 +64,9 @@ def compare(given: Options, name: str, A: Any) -> list[Row]:
             target = TRIAD_TARGET if "runs" in name else None
             rows.append(Row(question, "our triad", roof, rate, "GB/s", rate / roof, target))
         elif k in SIDE_TARGET:
-            rows.append(Row.of_times(question, "k = 1", alone, ours / k, "ms a side", SIDE_TARGET[k]))
+            rows.append(
+                Row.of_times(question, "k = 1", alone, ours / k, "ms a side", SIDE_TARGET[k])
+            )
     return rows
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs of Gray code into a map, beside OpenCV's structured_light, in megapixels a second.
 
-42 photographs, 1280 x 1024, 8 bits, of a projector of 1024 x 768 that lights a plane askance, with noise.
-OpenCV decodes pairs of cameras (`GrayCodePattern.decode`), two copies of ours here, and both pictures
-count; its own next step, a disparity for each projector pixel, is in that time and cannot be left out. Ours
-decides every bit by direct and indirect light, drops what neighbours do not confirm and, in the second row,
-finds fractions of a pixel: the facts tell what comes of that.
+42 photographs, 1280 x 1024, 8 bits, of a projector of 1024 x 768 that lights a plane askance, with
+noise. OpenCV decodes pairs of cameras (`GrayCodePattern.decode`), two copies of ours here, and both
+pictures count; its own next step, a disparity for each projector pixel, is in that time and cannot
+be left out. Ours decides every bit by direct and indirect light, drops what neighbours do not
+confirm and, in the second row, finds fractions of a pixel: the facts tell what comes of that.
 """
 
 from __future__ import annotations
@@ -64,11 +64,17 @@ def main() -> None:
     rows, theirs = [], 2 * rate["opencv"]
     for name, (question, target) in QUESTIONS.items():
         ours = rate[name]
-        row = Row(question, "cv2 GrayCodePattern.decode", theirs, ours, "Mpixel/s", ours / theirs, target)
+        row = Row(
+            question, "cv2 GrayCodePattern.decode", theirs, ours, "Mpixel/s", ours / theirs, target
+        )
         rows.append(row)
     some = slice(H // 2, H // 2 + 2)  # rows in which OpenCV is asked pixel by pixel
-    answers = [peer.getProjPixel(coded, i, j) for j in range(some.start, some.stop) for i in range(W)]
-    places = np.array([(np.nan, np.nan) if bad else place for bad, place in answers]).reshape(-1, W, 2)
+    answers = [
+        peer.getProjPixel(coded, i, j) for j in range(some.start, some.stop) for i in range(W)
+    ]
+    places = np.array([(np.nan, np.nan) if bad else place for bad, place in answers]).reshape(
+        -1, W, 2
+    )
     x, y = np.moveaxis(places, -1, 0)
     found, whole = decode(images, grid), decode(images, grid, subpixel=False)
     facts = {

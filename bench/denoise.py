@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How much nearer to the truth `ltcl.denoise` brings pictures and bounces, on five scenes that are known.
 
-Noise is a floor, in median first bounces, alone or with photon noise of as much at that light. Two bounds: of
-the same bases, with Wiener factors and folds of the truth; and of the first bounce, which stays as measured:
-the errors of the truth with that. Thresholds were chosen on corner, box and glossy, 12 pixels a side, without
-photon noise, at another seed; that of scenes that are not reciprocal after a look at glossy, here; bases of
-reciprocal ones by cases here, checked on five other scenes. It takes 3 minutes on 2 cores, one process.
+Noise is a floor, in median first bounces, alone or with photon noise of as much at that light. Two
+bounds: of the same bases, with Wiener factors and folds of the truth; and of the first bounce,
+which stays as measured: the errors of the truth with that. Thresholds were chosen on corner, box
+and glossy, 12 pixels a side, without photon noise, at another seed; that of scenes that are not
+reciprocal after a look at glossy, here; bases of reciprocal ones by cases here, checked on five
+other scenes. It takes 3 minutes on 2 cores, one process.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ import _figures as figures
 import ltcl
 from _figures import Claim
 from _harness import options
-from ltcl import denoising
 from ltcl.plots.page import OTHERS
+from ltcl.tasks import denoising
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from tests.noise.measured import SCENES, measure, noise_of, truth
+from tests.transport.noise.measured import SCENES, measure, noise_of, truth
 
 LEVELS, GOAL = (1e-4, 1e-3, 1e-2), 0.5
 QUANTITIES = ("random", "smooth", "patch", "bounce 1", "bounce 2", "bounce 3")
@@ -46,7 +47,12 @@ class Case(NamedTuple):
 
 def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     """Ten of each kind, (10, h, w): random binary ones, smooth ones, single patches."""
-    (h, w), (y, x), side, random = grid, np.indices(grid), max(grid[0] // 6, 1), np.random.default_rng(0)
+    (h, w), (y, x), side, random = (
+        grid,
+        np.indices(grid),
+        max(grid[0] // 6, 1),
+        np.random.default_rng(0),
+    )
     waves = random.uniform(0.0, 2.0 * np.pi, (3, 10, 1, 1))
     top, left = (random.integers(0, size - side + 1, (10, 1, 1)) for size in grid)
     patch = (y >= top) & (y < top + side) & (x >= left) & (x < left + side)
@@ -59,7 +65,9 @@ def oracle(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
     Y, grids = T.to_numpy(), (T.grid, T.grid)
     problem = denoising.Problem.of(Y, T.noise, 0, *grids)
     pilot = (exact * problem.gauge).astype(np.float32)
-    np.fill_diagonal(pilot, np.diag(denoising.shrink(problem, denoising.multiwavelets(grids), None)[0]))
+    np.fill_diagonal(
+        pilot, np.diag(denoising.shrink(problem, denoising.multiwavelets(grids), None)[0])
+    )
     return ltcl.Transport(problem.restore(denoising.refine(problem, pilot)[0], Y), T.grid)
 
 
@@ -75,11 +83,15 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
     picture = exact @ np.stack([kinds[0][0], kinds[1][0]])
 
     def light(T: ltcl.Transport) -> list[np.ndarray]:
-        return [T @ kind for kind in kinds] + list(ltcl.separate(T, picture, 3, method="direct").bounces)
+        return [T @ kind for kind in kinds] + list(
+            ltcl.separate(T, picture, 3, method="direct").bounces
+        )
 
     T, true, E = measure(exact, noise, n + int(photons)), light(exact), exact.to_numpy()
     lights = [light(some) for some in (T, ltcl.denoise(T), oracle(T, E), first_only(T, E))]
-    errors = np.array([[np.linalg.norm(a - b) for a, b in zip(x, true, strict=True)] for x in lights])
+    errors = np.array(
+        [[np.linalg.norm(a - b) for a, b in zip(x, true, strict=True)] for x in lights]
+    )
     errors[1:] /= errors[0]
     errors[0] /= [np.linalg.norm(b) for b in true]
     return Case(scene, n, level, photons, errors)
@@ -91,8 +103,12 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
     half, far = bound <= 0.4, float((left / bound)[left > GOAL].max(initial=0.0))
     reached = f"{(left[half] <= GOAL).sum()} of {half.sum()}"
     found = [
-        Claim("none is worse than before", f"{left.max():.2f} of it", "at most 1", left.max() <= 1.0),
-        Claim("at most half where the bound is at most 0.4", reached, "all", left[half].max() <= GOAL),
+        Claim(
+            "none is worse than before", f"{left.max():.2f} of it", "at most 1", left.max() <= 1.0
+        ),
+        Claim(
+            "at most half where the bound is at most 0.4", reached, "all", left[half].max() <= GOAL
+        ),
         Claim(
             "others than at most half are near the bound",
             f"{far:.2f} of it",
@@ -100,7 +116,9 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
             far <= 1.3,
             differs="bounce 3 of gloss",
         ),
-        Claim("the first bounce is no limit", f"{first.max():.2f}", "at most 0.1", first.max() <= 0.1),
+        Claim(
+            "the first bounce is no limit", f"{first.max():.2f}", "at most 0.1", first.max() <= 0.1
+        ),
     ]
     for level in LEVELS:
         own = [case.level == level for case in cases]
@@ -108,7 +126,9 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
         means = f"means {left[own].mean():.2f} and {bound[own].mean():.2f}"
         shares = f"{few} of {left[own].size}, bound {possible}; {means}"
         differs = (
-            "gloss" if level == LEVELS[-1] else "most coefficients of so few pixels stand out of the noise"
+            "gloss"
+            if level == LEVELS[-1]
+            else "most coefficients of so few pixels stand out of the noise"
         )
         text = f"at most half is left at a noise of {level:g}"
         found.append(Claim(text, shares, "all", few == left[own].size, differs=differs))
@@ -148,10 +168,13 @@ def main() -> None:
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # of glossy scenes, at each separation
     sizes = [(8, 1.0)] if given.smoke else [(12, 0.0), (12, 1.0), (20, 0.0)]
     some = SCENES[: 1 if given.smoke else None]
-    cases = [measured(name, n, level, light) for n, light in sizes for name in some for level in LEVELS]
+    cases = [
+        measured(name, n, level, light) for n, light in sizes for name in some for level in LEVELS
+    ]
     names = [f"{c.scene} {c.pixels}, noise {c.level:g}, photons {c.photons:g}" for c in cases]
     rows = [
-        dict(zip(QUANTITIES, case.shares.T.astype(float).round(5).tolist(), strict=True)) for case in cases
+        dict(zip(QUANTITIES, case.shares.T.astype(float).round(5).tolist(), strict=True))
+        for case in cases
     ]
     facts = dict(zip(names, rows, strict=True))
     for table in tables(cases):

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The paper's 4096 x 4096 case: the direct part of a picture, against dense inversion.
 
-The paper reports 0.09 s against 4.6 s, 51 times. Here: an open box of four walls of 32 x 32 pixels, its
-transport measured once and so already on the device; then, per picture, ours is one `ltcl.solve` to 1 %,
-transfers included, and the competitor is `numpy.linalg.solve` on the same S (which factorizes every time,
-as the paper's does). For the next picture a factorization may be kept, in float32, or an inverse,
-S^-1 = I - A with a dense A: ours is one product then, as the factors one pass over N^2 numbers.
+The paper reports 0.09 s against 4.6 s, 51 times. Here: an open box of four walls of 32 x 32 pixels,
+its transport measured once and so already on the device; then, per picture, ours is one
+`ltcl.solve` to 1 %, transfers included, and the competitor is `numpy.linalg.solve` on the same S
+(which factorizes every time, as the paper's does). For the next picture a factorization may be
+kept, in float32, or an inverse, S^-1 = I - A with a dense A: ours is one product then, as the
+factors one pass over N^2 numbers.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ def main() -> None:
     times = seconds(actions, repeats=5)
     question, kept = f"direct part at N = {T.shape[0]}", "LU kept, float32 (ours: an inverse kept)"
     rows = [
-        Row.of_times(question, "numpy.linalg.solve, float64", times["float64"], times["ours"], "s", 51.0),
+        Row.of_times(
+            question, "numpy.linalg.solve, float64", times["float64"], times["ours"], "s", 51.0
+        ),
         Row.of_times(question, kept, times["kept32"], times["inverse"], "s", 1.0),
     ]
     facts = {

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Faults of photographs in a scan by hand: whether they are refused, and the right photograph named.
 
-Scenes of five kinds are scanned from a list of photographs, as a person does it, by three cameras at random
-places. In each scan one thing goes wrong at a photograph drawn at random: two are exchanged, one is repeated,
-one is missing and the rest move up, a light of 1 to 10 % of white is on in one, the camera moves, one is
-exposed for a third of a stop more, or photographs from there on are JPEG of quality 70.
+Scenes of five kinds are scanned from a list of photographs, as a person does it, by three cameras
+at random places. In each scan one thing goes wrong at a photograph drawn at random: two are
+exchanged, one is repeated, one is missing and the rest move up, a light of 1 to 10 % of white is on
+in one, the camera moves, one is exposed for a third of a stop more, or photographs from there on
+are JPEG of quality 70.
 
-A fault counts where it moves T p by more than 1 %, relative to the same scan without it, noise included. All
-that count must be refused before their batch is kept, and 95 % of the refusals must name the photograph, or
-the one that it was exchanged with, or one of the JPEGs (the first may be dark, and not changed by it), among
-at most 4. Of scans without a fault none may be refused.
+A fault counts where it moves T p by more than 1 %, relative to the same scan without it, noise
+included. All that count must be refused before their batch is kept, and 95 % of the refusals must
+name the photograph, or the one that it was exchanged with, or one of the JPEGs (the first may be
+dark, and not changed by it), among at most 4. Of scans without a fault none may be refused.
 """
 
 from __future__ import annotations
@@ -79,17 +80,25 @@ def scene(name: str) -> tuple[np.ndarray, tuple[int, int]]:
 
 
 @cache
-def view(grid: tuple[int, int], seed: int, shift: float) -> tuple[tuple[int, int], scipy.sparse.csr_array]:
+def view(
+    grid: tuple[int, int], seed: int, shift: float
+) -> tuple[tuple[int, int], scipy.sparse.csr_array]:
     """A camera at a random place, shifted by some of its pixels."""
     rng = np.random.default_rng(seed)
-    offset, angle, direction = rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.05, 0.05), rng.uniform(0, 2 * np.pi)
+    offset, angle, direction = (
+        rng.uniform(-0.5, 0.5, 2),
+        rng.uniform(-0.05, 0.05),
+        rng.uniform(0, 2 * np.pi),
+    )
     shape = (int(1.2 * SIZE * grid[0]), int(1.2 * SIZE * grid[1]))
     c, s = np.cos(angle) / SIZE, np.sin(angle) / SIZE
 
     def place(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         a = u - shape[1] / 2 + shift * np.cos(direction)
         b = v - shape[0] / 2 + shift * np.sin(direction)
-        return c * a + s * b + (grid[1] - 1) / 2 + offset[0], c * b - s * a + (grid[0] - 1) / 2 + offset[1]
+        return c * a + s * b + (grid[1] - 1) / 2 + offset[0], c * b - s * a + (
+            grid[0] - 1
+        ) / 2 + offset[1]
 
     return shape, camera_map(place, shape, grid)
 
@@ -107,7 +116,11 @@ class Person:
         h, w = self.projector_grid
         y, x = np.mgrid[:h, :w] / max(h, w)
         lamp = T.sum(axis=1) * (0.6 + 0.8 * x + 0.3 * y).ravel()
-        added = lamp * np.random.default_rng(seed).uniform(0.01, 0.1) if kind == "light on in one" else 0.0
+        added = (
+            lamp * np.random.default_rng(seed).uniform(0.01, 0.1)
+            if kind == "light on in one"
+            else 0.0
+        )
         shift = float(kind.split()[1]) if kind and kind.startswith("moved") else 0.0
         rigs = []
         for moved, light in ((0.0, 0.01), (shift, 0.01 + added)):
@@ -149,7 +162,9 @@ class Person:
         if kind == "JPEG from one on" and n >= at:
             shift, quality = (self.bits or 8) - 8, [cv2.IMWRITE_JPEG_QUALITY, 70]
             _, data = cv2.imencode(".jpg", (image >> shift).astype(np.uint8), quality)
-            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)).astype(image.dtype) << shift
+            image = (
+                np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)).astype(image.dtype) << shift
+            )
         self._last = image
         return image
 
@@ -173,7 +188,9 @@ class Outcome:
         return f"{self.scan}, photograph {self.at} of {self.count}"
 
 
-def acquired(number: int, kind: str | None = None, at: int = 0) -> tuple[np.ndarray, np.ndarray, int]:
+def acquired(
+    number: int, kind: str | None = None, at: int = 0
+) -> tuple[np.ndarray, np.ndarray, int]:
     """T p of some patterns, which pixels are known, photographs; one number is one scan, to the noise."""
     name, camera, strategy = names(number)
     rig = Person(name, camera, number, kind, at)
@@ -194,7 +211,9 @@ def names(k: int) -> tuple[str, str, str]:
 def numbers(text: str) -> set[int]:
     """Numbers of photographs in a message, of ranges that are of at most 4."""
     result: set[int] = set()
-    for first, last in re.findall(r"photographs? (\d+)(?: \([^)]*\))?(?: to (?:photograph )?(\d+))?", text):
+    for first, last in re.findall(
+        r"photographs? (\d+)(?: \([^)]*\))?(?: to (?:photograph )?(\d+))?", text
+    ):
         stop = int(last or first)
         result |= set(range(int(first), stop + 1)) if stop - int(first) < 4 else set()
     return result
@@ -250,7 +269,9 @@ def main() -> None:
         facts[f"{kind}, kept"] = [f"{o.where}: {o.change:.1%}" for o in missed]
         facts[f"{kind}, another named"] = [f"{o.where}: {o.text}" for o in wrong]
     wrong = [one for one in outcomes if one.kind is None and one.refused]
-    claims.append(Claim("scans without a fault, refused", f"{len(wrong)} of {clean}", "0", not wrong))
+    claims.append(
+        Claim("scans without a fault, refused", f"{len(wrong)} of {clean}", "0", not wrong)
+    )
     facts |= {"refused without a fault": [f"{o.scan}: {o.text}" for o in wrong]}
     facts = {name: value for name, value in facts.items() if value}
     figures.conclude(given, "Faults of photographs", claims, facts, lambda: draw(shares))

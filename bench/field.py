@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A benchmark for inverse light transport: methods on scenes whose bounces are known (scenes/README.md).
 
-With `--data DIR` traces the scenes that DIR lacks (Mitsuba 3, LLVM), and scores the baselines on all in it.
-`--method mine="python mine.py"` scores that command instead, `--method dense` one of the baselines; either
-may be repeated. `--smoke` takes one small scene, which it simulates without LLVM, and says so.
+With `--data DIR` traces the scenes that DIR lacks (Mitsuba 3, LLVM), and scores the baselines on
+all in it. `--method mine="python mine.py"` scores that command instead, `--method dense` one of the
+baselines; either may be repeated. `--smoke` takes one small scene, which it simulates without LLVM,
+and says so.
 """
 
 from __future__ import annotations
@@ -25,7 +26,12 @@ DIVERGES = {("closed", "iteration")}
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "data": {"type": Path, "metavar": "DIR", "help": "the scenes; what is missing is traced"},
     "size": {"type": int, "default": dataset.SIZE, "help": "pixels along a side of what is traced"},
-    "method": {"action": "append", "default": [], "metavar": "NAME=COMMAND", "help": "not the baselines"},
+    "method": {
+        "action": "append",
+        "default": [],
+        "metavar": "NAME=COMMAND",
+        "help": "not the baselines",
+    },
 }
 
 
@@ -37,7 +43,9 @@ def commands(asked: list[str]) -> dict[str, str]:
     for text in asked or own:
         name, _, command = text.partition("=")
         if not command and name not in own:
-            raise SystemExit(f"--method {text}: it must be NAME=COMMAND, or one of {', '.join(own)}")
+            raise SystemExit(
+                f"--method {text}: it must be NAME=COMMAND, or one of {', '.join(own)}"
+            )
         chosen[name] = command or own[name]
     return chosen
 
@@ -57,7 +65,9 @@ def make(data: Path, given: Options) -> dict[str, Any]:
             dataset.simulate(data / name, name)
         else:
             small = {"size": 12, "paths": 256, "samples": 256}
-            dataset.trace(data / name, name, **(small if given.smoke else {"size": given.more.size}))
+            dataset.trace(
+                data / name, name, **(small if given.smoke else {"size": given.more.size})
+            )
     if not (scenes := dataset.found(data)):
         raise SystemExit(f"{data} has no scenes, and none can be traced: {why}")
     return facts | {name: scene.facts for name, scene in scenes.items()}
@@ -68,7 +78,9 @@ def main() -> None:
     given, failures = options(__doc__ or "", ARGUMENTS), []
     chosen = commands(given.more.method)
     if not given.smoke and given.more.data is None:
-        raise SystemExit("--data DIR is missing: the folder of the scenes, or where they are to be traced")
+        raise SystemExit(
+            "--data DIR is missing: the folder of the scenes, or where they are to be traced"
+        )
     with TemporaryDirectory() as scratch:
         data = given.more.data or Path(scratch)
         facts, results = make(data, given), dict[str, dict[str, dict[str, Any]]]()
@@ -82,7 +94,14 @@ def main() -> None:
                     failures.append(f"{name}, {method}: {results[name][method]['failed']}")
             for method, scores in results[name].items():
                 table.add_row(name, method, *scoring.row(scores))
-    publish(given, "Inverse light transport on known bounces", facts, table, {"results": results}, Figure)
+    publish(
+        given,
+        "Inverse light transport on known bounces",
+        facts,
+        table,
+        {"results": results},
+        Figure,
+    )
     if failures:
         raise SystemExit("failed:\n" + "\n".join(failures))
 

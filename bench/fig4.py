@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Figure 4: what each term of the inverse series does to a picture of a closed box (eq. 10, 12, 13).
 
-A closed diffuse box with a red, a green and four neutral walls, under light that is constant on each wall.
-l^(n) = (I - R + R^2 - ... + (-R)^n) l_out leads from the picture l_out to the direct light l_d.
+A closed diffuse box with a red, a green and four neutral walls, under light that is constant on
+each wall. l^(n) = (I - R + R^2 - ... + (-R)^n) l_out leads from the picture l_out to the direct
+light l_d.
 
-Claims of the paper: the terms alternate in sign; the picture bleeds red and green, which odd terms answer
-in cyan and magenta; the bleeding cancels; n terms remove the bounces up to n; the sums converge to l_d.
+Claims of the paper: the terms alternate in sign; the picture bleeds red and green, which odd terms
+answer in cyan and magenta; the bleeding cancels; n terms remove the bounces up to n; the sums
+converge to l_d.
 """
 
 from __future__ import annotations
@@ -55,14 +57,17 @@ def measure(n: int, device: ltcl.Device) -> Series:
 def bleeding(scene: Scene, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How much redder the floor is beside the red wall, and how much greener beside the green one.
 
-    Mean over the nearest patches of (..., 3, N), less that of the other colours, relative to its size.
+    Mean over the nearest patches of (..., 3, N), less that of the other colours, relative to its
+    size.
     """
     n = scene.grid[0]
     floor = values.reshape(*values.shape[:-1], n, 6, n)[..., FLOOR, :]
     red, green = floor[..., 0].mean(axis=-1), floor[..., -1].mean(axis=-1)
 
     def excess(colour: np.ndarray, own: int, other: int) -> np.ndarray:
-        return (colour[..., own] - (colour[..., other] + colour[..., 2]) / 2) / np.abs(colour).mean(axis=-1)
+        return (colour[..., own] - (colour[..., other] + colour[..., 2]) / 2) / np.abs(colour).mean(
+            axis=-1
+        )
 
     return excess(red, 0, 1), excess(green, 1, 0)
 
@@ -87,18 +92,28 @@ def claims(found: Series) -> list[Claim]:
     for _ in range(99):
         bounces.append(boxes.bounce(found.scene, bounces[-1]))
     expected = [np.tensordot(contents(n, 99), bounces, 1) for n in range(1, ORDERS + 1)]
-    off = np.linalg.norm(found.sums[1 : ORDERS + 1] - expected, axis=(1, 2)).max() / np.linalg.norm(found.l_d)
+    off = np.linalg.norm(found.sums[1 : ORDERS + 1] - expected, axis=(1, 2)).max() / np.linalg.norm(
+        found.l_d
+    )
     absent = not any(contents(n, n)[1:].any() for n in range(1, ORDERS + 1))
     closer = int(np.argmin(np.diff(errors[:21]) < 0)) or 20
-    listed = [Claim("terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", right == 1)]
+    listed = [
+        Claim(
+            "terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", right == 1
+        )
+    ]
     names = (("red", "cyan", "green"), ("green", "magenta", "red"))
-    for (own, opposite, other), excess in zip(names, bleeding(found.scene, found.terms[:11]), strict=True):
+    for (own, opposite, other), excess in zip(
+        names, bleeding(found.scene, found.terms[:11]), strict=True
+    ):
         text = f"the picture bleeds {own}; odd terms turn it to {opposite}, even ones to {own}"
         shown = " ".join(f"{value:+.0%}" for value in excess[:4])
         measured = f"beside the {own} wall, {own} over {other} and blue: {shown} ..."
         listed.append(Claim(text, measured, "+ - + - ...", bool((excess * alternate > 0).all())))
     colour = f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}"
-    removes = f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
+    removes = (
+        f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
+    )
     error = f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer"
     removed, converges = absent and off < 1e-5, errors[-1] < 1e-3 and closer == 20
     return [
@@ -119,9 +134,13 @@ def draw(found: Series) -> Figure:
     scene, gain, sums, terms = found.scene, 0.9 / np.quantile(found.sums[0], 0.999), [], []
     for n in SHOWN:
         image = figures.light(scene, scene.picture(found.sums[n]), gain)
-        sums.append((image, _after(n) if n else r"picture $l_{out}$", f"error {found.errors[n]:.2g}"))
+        sums.append(
+            (image, _after(n) if n else r"picture $l_{out}$", f"error {found.errors[n]:.2g}")
+        )
         scale = 1 / np.quantile(np.abs(found.terms[n]), 0.999)
-        power = rf"{'-+'[n % 2 == 0]}R^{n}\,l_{{out}}" if n > 1 else r"-R\,l_{out}" if n else "l_{out}"
+        power = (
+            rf"{'-+'[n % 2 == 0]}R^{n}\,l_{{out}}" if n > 1 else r"-R\,l_{out}" if n else "l_{out}"
+        )
         image = figures.signed(scene, scene.picture(found.terms[n]), scale)
         terms.append((image, f"${power}$", f"shown \u00d7 {scale:.2g}"))
     image = figures.light(scene, scene.picture(found.l_d), gain)
@@ -134,7 +153,11 @@ def draw(found: Series) -> Figure:
     draw_contents(figure)
     box = (640, 580, 330, 220)
     axes = figures.graph(figure, box, "Error of the sum, each colour", "terms n", "relative error")
-    for name, colour, channel in (("green", "#8bd17c", 1), ("red", "#ff5d5d", 0), ("blue", "#5c9cff", 2)):
+    for name, colour, channel in (
+        ("green", "#8bd17c", 1),
+        ("red", "#ff5d5d", 0),
+        ("blue", "#5c9cff", 2),
+    ):
         off = np.linalg.norm(found.sums[:, channel] - found.l_d[channel], axis=1)
         look: Any = {"color": colour, "lw": 2, "ls": "-" if channel else "--"}
         axes.plot(off / np.linalg.norm(found.l_d[channel]), label=name, **look)
@@ -156,7 +179,9 @@ def draw_contents(figure: Figure) -> None:
     for (n, j), value in np.ndenumerate(table):
         colour = "#15171b" if value else "#b9bdc4"
         axes.text(j, n, str(value), ha="center", va="center", fontsize=10, color=colour)
-    axes.set_xticks(range(BOUNCES + 1), ["direct", *map(str, range(1, BOUNCES + 1))], color=INK, fontsize=9.5)
+    axes.set_xticks(
+        range(BOUNCES + 1), ["direct", *map(str, range(1, BOUNCES + 1))], color=INK, fontsize=9.5
+    )
     names = ["picture", *map(_after, range(1, ORDERS + 1))]
     axes.set_yticks(range(ORDERS + 1), names, color=INK, fontsize=9.5)
     axes.tick_params(length=0)

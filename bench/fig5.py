@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Figure 5: how fast the inverse series converges, and where it does not (eq. 10, 14, 16, 20).
 
-Claims of the paper: (a) the same oscillation near a corner, an edge and a centre; (b) below albedo 1/2 the
-error follows the bound of eq. 16 up to a constant; (c) in a closed box albedo 0.45 converges in a few
-iterations, close to 0.5 slowly, 0.51 diverges; (d) at albedo 0.62 a closed box diverges, five sides are very
-slow, fewer are fast. Ours beside it: Chebyshev's iteration converges in all of them.
+Claims of the paper: (a) the same oscillation near a corner, an edge and a centre; (b) below albedo
+1/2 the error follows the bound of eq. 16 up to a constant; (c) in a closed box albedo 0.45
+converges in a few iterations, close to 0.5 slowly, 0.51 diverges; (d) at albedo 0.62 a closed box
+diverges, five sides are very slow, fewer are fast. Ours beside it: Chebyshev's iteration converges
+in all of them.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ from ltcl.theory import inverse_error_bound
 BELOW_HALF, ORDERS = (0.2, 0.3, 0.4, 0.45), 10
 ALBEDOS, SIDES, OPEN_ALBEDO = (0.2, 0.3, 0.4, 0.45, 0.49, 0.51), (6, 5, 4, 3, 2, 1), 0.62
 STEPS = 40  # drawn
-BOUNDS = {m: np.array([inverse_error_bound(m, k) for k in range(1, ORDERS + 1)]) for m in BELOW_HALF}
+BOUNDS = {
+    m: np.array([inverse_error_bound(m, k) for k in range(1, ORDERS + 1)]) for m in BELOW_HALF
+}
 ROUNDING = 1e-4  # of a norm: above, float32 products matter little
 SHADES = ("#8bd17c", "#5cc8ff", "#c792ea", "#ffd166", "#ffb347", "#ff5d5d")
 
@@ -43,7 +46,11 @@ def swings(n: int, device: ltcl.Device) -> dict[str, np.ndarray]:
     systems = scene.transport(first_bounce=scene.first_bounce, device=device).systems[:1]
     series = boxes.terms(systems, boxes.all_bounces(scene, l_d)[:1], ORDERS)[:, 0]
     floor = (np.cumsum(series, axis=0) / l_d[0]).reshape(-1, n, 6, n)[:, :, FLOOR]
-    return {"corner": floor[:, 0, 0], "edge": floor[:, n // 2, 0], "centre": floor[:, n // 2, n // 2]}
+    return {
+        "corner": floor[:, 0, 0],
+        "edge": floor[:, n // 2, 0],
+        "centre": floor[:, n // 2, n // 2],
+    }
 
 
 def norms(n: int, albedo: float, device: ltcl.Device) -> np.ndarray:
@@ -51,7 +58,9 @@ def norms(n: int, albedo: float, device: ltcl.Device) -> np.ndarray:
     scene = box(n, albedo=albedo)
     exact = np.eye(6 * n * n) - albedo * scene.form_factors
     (S,) = scene.transport(first_bounce=scene.first_bounce, device=device).systems
-    return np.array([np.linalg.norm(matrix_series(S, steps=k).x - exact, 2) for k in range(1, ORDERS + 1)])
+    return np.array(
+        [np.linalg.norm(matrix_series(S, steps=k).x - exact, 2) for k in range(1, ORDERS + 1)]
+    )
 
 
 @dataclass(frozen=True)
@@ -76,20 +85,26 @@ def measure(n: int, device: ltcl.Device) -> Found:
     closed = {m: race(f"closed, albedo {m}", n, 6, m, device) for m in ALBEDOS}
     opened = {sides: race(f"{sides} {name}", n, sides, OPEN_ALBEDO, device) for sides in SIDES}
     below, of_series = race("5 sides, albedo 0.6", n, 5, 0.6, device), swings(n, device)
-    return Found(of_series, {m: norms(n // 2, m, device) for m in BELOW_HALF}, closed, opened, below)
+    return Found(
+        of_series, {m: norms(n // 2, m, device) for m in BELOW_HALF}, closed, opened, below
+    )
 
 
 def claims(found: Found) -> list[Claim]:
     signs = np.array([np.sign(swing[:9] - 1) for swing in found.swings.values()])
     left = {name: abs(swing[8] - 1) / abs(swing[4] - 1) for name, swing in found.swings.items()}
-    is_alike = (signs == (-1.0) ** np.arange(9)).all() and max(left.values()) < 1.1 * min(left.values())
+    is_alike = (signs == (-1.0) ** np.arange(9)).all() and max(left.values()) < 1.1 * min(
+        left.values()
+    )
     parts = "4 terms more leave " + ", ".join(f"{part:.2f} ({name})" for name, part in left.items())
     large = {m: norm > ROUNDING for m, norm in found.norms.items()}
     ratios = {m: (norm / BOUNDS[m])[large[m]] for m, norm in found.norms.items()}
     worst = max(float(ratio.max(initial=0)) for ratio in ratios.values())
     off = max(np.abs(ratio / (1 - 2 * m) - 1).max(initial=0) for m, ratio in ratios.items())
     closed, opened, few = found.closed, found.opened, found.closed[0.45]
-    late = max(abs(r.steps() - math.log(RTOL) / math.log(r.rho)) for m, r in closed.items() if m < 0.5)
+    late = max(
+        abs(r.steps() - math.log(RTOL) / math.log(r.rho)) for m, r in closed.items() if m < 0.5
+    )
     fewer = [opened[sides].steps() for sides in SIDES[2:]]
     faster = f"4, 3, 2, 1 sides: 1 % in {', '.join(map(str, fewer))}"
     falls = fewer == sorted(set(fewer), reverse=True) and fewer[0] <= 20
@@ -110,16 +125,28 @@ def claims(found: Found) -> list[Claim]:
 
     return [
         Claim(alike, parts, "signs alternate; within 10 %", is_alike),
-        Claim("(b) the error stays below eq. 16", f"at most {worst:.3f} of the bound", "1", worst <= 1),
+        Claim(
+            "(b) the error stays below eq. 16", f"at most {worst:.3f} of the bound", "1", worst <= 1
+        ),
         Claim(constant, factor, "0.01", off < 0.01),
         Claim(quick, few.said, "1 % in at most 10", few.steps() <= 10, shared),
-        Claim("(c) the rate is m / (1 - m)", f"1 % at most {late:.1f} iterations off it", "1", late <= 1),
+        Claim(
+            "(c) the rate is m / (1 - m)",
+            f"1 % at most {late:.1f} iterations off it",
+            "1",
+            late <= 1,
+        ),
         slow("(c) near 0.5 slowly", closed[0.49], "0.49: "),
         Claim("(c) 0.51 diverges", closed[0.51].said, "diverges", closed[0.51].diverged),
         Claim("(d) 6 sides diverge", opened[6].said, "diverges", opened[6].diverged),
         slow("(d) 5 sides converge very slowly", opened[5], differs=limit),
         slow("(d) so they do below that limit", found.below, "0.60: "),
-        Claim("(d) fewer sides converge fast, the faster the fewer", faster, "falling, at most 20", falls),
+        Claim(
+            "(d) fewer sides converge fast, the faster the fewer",
+            faster,
+            "falling, at most 20",
+            falls,
+        ),
         Claim("ours: Chebyshev converges in all of them", products, "below 1e-4", converged),
     ]
 
@@ -139,7 +166,10 @@ def draw(found: Found) -> Figure:
         axes.plot(swing, "o-", color=shade, lw=2, ms=5, label=f"{name} of the floor")
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
     title, ylabel = "(b) Error of the series in a closed box", r"$\Vert S^{-1} - S_n^{-1} \Vert$"
-    axes, n = figures.graph(figure, (right, above, *size), title, "terms n", ylabel), range(1, ORDERS + 1)
+    axes, n = (
+        figures.graph(figure, (right, above, *size), title, "terms n", ylabel),
+        range(1, ORDERS + 1),
+    )
     for (m, norm), shade in zip(found.norms.items(), SHADES, strict=False):
         axes.plot(n, BOUNDS[m], color=shade, lw=1.5, ls=":")
         shown = np.where(norm > ROUNDING, norm, np.nan)
@@ -147,7 +177,9 @@ def draw(found: Found) -> Figure:
     axes.plot([], [], color=INK, lw=1.5, ls=":", label="bound, eq. 16")
     axes.legend(frameon=False, labelcolor=INK, fontsize=10)
     titles = "(c) Closed box, albedo 0.2 to 0.51", f"(d) Albedo {OPEN_ALBEDO}, box of 6 to 1 sides"
-    for place, title, races in zip((left, right), titles, (found.closed, found.opened), strict=True):
+    for place, title, races in zip(
+        (left, right), titles, (found.closed, found.opened), strict=True
+    ):
         axes = figures.graph(figure, (place, below, *size), title, "iteration", "relative residual")
         draw_races(axes, races)
     return figure
@@ -159,7 +191,9 @@ def draw_races(axes: Axes, races: Mapping[float, Race]) -> None:
     axes.set_xlim(0, STEPS)
     axes.set_ylim(low, high)
     for (name, found), shade in zip(races.items(), SHADES, strict=True):
-        y = np.maximum(found.jacobi.residuals[: STEPS + 1], low / 10)  # the last one of one wall is 0
+        y = np.maximum(
+            found.jacobi.residuals[: STEPS + 1], low / 10
+        )  # the last one of one wall is 0
         last = int(np.argmax((y <= low) | (y >= high))) or len(y) - 1
         axes.plot(found.chebyshev.residuals, color=INK, lw=1.2, ls=(0, (3, 2)))
         axes.plot(y[: last + 1], color=shade, lw=2)
@@ -175,7 +209,9 @@ def draw_races(axes: Axes, races: Mapping[float, Race]) -> None:
 def main() -> None:
     given = options(__doc__ or "")
     found = measure(4 if given.smoke else 16, given.device)
-    facts = {r.name: f"{r.said}; Chebyshev 1e-5 in {r.chebyshev.products} products" for r in found.races}
+    facts = {
+        r.name: f"{r.said}; Chebyshev 1e-5 in {r.chebyshev.products} products" for r in found.races
+    }
     figures.conclude(given, "Figure 5: convergence", claims(found), facts, lambda: draw(found))
 
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Figure 6: the inverse series where there are shadows, and where surfaces are glossy.
 
-Above, a box with a block in it, lit by a lamp; below, a box of glossy walls. Claims of the paper: the series
-recovers the direct light in 10 iterations with shadows, in 20 with gloss. It names no albedos; ours are such
-that rho(R) is about 0.7 and 0.8, for which these numbers are due (to 1 %). What is measured is that shadows
-and gloss leave the rate at rho(R) and come back as they were. Gloss needs the full light field for that
-(section 4); one camera and one projector measure less of it (eq. 28): what rho(R) becomes then is told too.
+Above, a box with a block in it, lit by a lamp; below, a box of glossy walls. Claims of the paper:
+the series recovers the direct light in 10 iterations with shadows, in 20 with gloss. It names no
+albedos; ours are such that rho(R) is about 0.7 and 0.8, for which these numbers are due (to 1 %).
+What is measured is that shadows and gloss leave the rate at rho(R) and come back as they were.
+Gloss needs the full light field for that (section 4); one camera and one projector measure less of
+it (eq. 28): what rho(R) becomes then is told too.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ from _harness import options
 from ltcl.plots.page import FAINT
 from ltcl.scenes import Block, Scene, box, glossy
 
-SHADED, BLOCK = 1.15 * np.array(ALBEDO[:5]), Block((0.3, 0.42, 0), (0.28, 0.28, 0.5), albedo=(0.5, 0.5, 0.5))
+SHADED, BLOCK = (
+    1.15 * np.array(ALBEDO[:5]),
+    Block((0.3, 0.42, 0), (0.28, 0.28, 0.5), albedo=(0.5, 0.5, 0.5)),
+)
 LAMP = (0.85, 0.75, 0.8)
 POLISHED, GLOSS, EXPONENT, PROJECTOR = 1.6 * np.array(ALBEDO[:5]), 0.5, 150, (2.3, 0.75, 0.7)
 SHADOWS, GLOSSES, MOST = (1, 2, 10), (1, 2, 20), 30  # iterations drawn, and made
@@ -53,7 +57,9 @@ class Recovery:
     def errors(self) -> np.ndarray:
         """Relative error of each sum, as it is seen."""
         truth = self.seen(self.l_d)
-        return np.array([np.linalg.norm(self.seen(l) - truth) for l in self.sums]) / np.linalg.norm(truth)
+        return np.array([np.linalg.norm(self.seen(l) - truth) for l in self.sums]) / np.linalg.norm(
+            truth
+        )
 
     @functools.cached_property
     def rho(self) -> float:
@@ -87,7 +93,10 @@ def with_gloss(n: int, smoke: bool) -> Recovery:
     l_d = np.stack([K @ (scene.Q @ np.ones(scene.Q.shape[1])) for K in scene.K])
     systems = tuple(map(LightField, scene.A))
     l_out = np.stack([S @ l for S, l in zip(systems, l_d, strict=True)])
-    sums, seen = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0), lambda l: scene.picture(l @ scene.P.T)
+    sums, seen = (
+        np.cumsum(boxes.terms(systems, l_out, MOST), axis=0),
+        lambda l: scene.picture(l @ scene.P.T),
+    )
     return Recovery(scene.matte, l_d, sums, systems, scene.A, seen)
 
 
@@ -95,7 +104,9 @@ def glossy_box(n: int, smoke: bool) -> Any:
     """Five glossy walls, camera and projector before the sixth."""
     room = boxes.from_the_front(box(1, 5, ALBEDO[:5]))
     directions, exponent = (16, EXPONENT / 2) if smoke else (64, EXPONENT)
-    return glossy(room, n, POLISHED, GLOSS, exponent, projector=PROJECTOR, directions=directions, rays=32)
+    return glossy(
+        room, n, POLISHED, GLOSS, exponent, projector=PROJECTOR, directions=directions, rays=32
+    )
 
 
 class LightField(scipy.sparse.linalg.LinearOperator):
@@ -124,23 +135,40 @@ def claims(shade: Recovery, gloss: Recovery, camera: float) -> list[Claim]:
     one_camera = "one camera's T F^-1 is another operator: gloss makes its rho(R) larger (eq. 28)"
     rates = []
     for name, found in (("shadows", shade), ("gloss", gloss)):
-        text, rate = f"{name}: each iteration leaves rho(R) of the error", found.errors[16] / found.errors[15]
+        text, rate = (
+            f"{name}: each iteration leaves rho(R) of the error",
+            found.errors[16] / found.errors[15],
+        )
         measured = f"{rate:.3f}, rho(R) = {found.rho:.3f}"
         rates.append(Claim(text, measured, "within 2%", abs(rate / found.rho - 1) < 0.02))
     return [
-        Claim("shadows: direct light in 10 iterations", f"1 % after {shade.steps}", "10", shade.steps <= 10),
+        Claim(
+            "shadows: direct light in 10 iterations",
+            f"1 % after {shade.steps}",
+            "10",
+            shade.steps <= 10,
+        ),
         Claim("shadows get as dark as they are", shadows, "below 1%", dark[10] < 0.01 < dark[0]),
-        Claim("gloss: direct light in 20 iterations", f"1 % after {gloss.steps}", "20", gloss.steps <= 20),
+        Claim(
+            "gloss: direct light in 20 iterations",
+            f"1 % after {gloss.steps}",
+            "20",
+            gloss.steps <= 20,
+        ),
         *rates,
         Claim("ours: Chebyshev needs fewer", products, "fewer", is_fewer),
         Claim(one_camera, radius, "larger", camera > gloss.rho),
     ]
 
 
-def draw_row(figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], name: str) -> None:
+def draw_row(
+    figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], name: str
+) -> None:
     images = [(name, f"error {found.errors[0]:.2g}", found.sums[0])]
     for n in shown:
-        images.append((f"{n} iteration{'s' * (n > 1)}", f"error {found.errors[n]:.2g}", found.sums[n]))
+        images.append(
+            (f"{n} iteration{'s' * (n > 1)}", f"error {found.errors[n]:.2g}", found.sums[n])
+        )
     images.append((r"direct light $l_d$", "the truth", found.l_d))
     gain = 0.9 / np.quantile(found.seen(found.sums[0]), 0.98)
     views = [(figures.light(found.scene, found.seen(l), gain), *text) for *text, l in images]
@@ -171,7 +199,9 @@ def main() -> None:
     given = options(__doc__ or "")
     shade = with_shadows(4 if given.smoke else 14, given.device)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)
-    scene = glossy_box(4 if given.smoke else 6, given.smoke)  # smaller, as one camera and projector see it
+    scene = glossy_box(
+        4 if given.smoke else 6, given.smoke
+    )  # smaller, as one camera and projector see it
     T = scene.transport(scene.first_bounce, given.device, on_dark="mask")
     camera = max(channel.spectral_radius for channel in ltcl.analyze(T).channels)
     errors = [[float(f"{e:.3g}") for e in found.errors] for found in (shade, gloss)]

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Figure 7: what it takes to find the direct light l_d of a picture l_out, over the resolution N.
 
-A white corner of two walls, N = 128 to 131072, of albedo 0.8: rho(R) is about 0.4 there, and the plain series
-converges. Four ways, the first also by the BLAS of NumPy, each to an error of at most 1 % against the truth:
+A white corner of two walls, N = 128 to 131072, of albedo 0.8: rho(R) is about 0.4 there, and the
+plain series converges. Four ways, the first also by the BLAS of NumPy, each to an error of at most
+1 % against the truth:
 
     series      S^-1 = I - R + R^2 - ... as a matrix (eq. 10), then times l_out    N^3
     iteration   l_d <- l_out - R l_d with all numbers of R (eq. 20)                N^2
     rows        the same with the rows of R in db2 wavelets, the paper's           N W
     both        the same with both sides of R in db2, on coefficients throughout   N W
 
-The last two keep the largest numbers that 0.7 % need, in 16 bits each. Timed is all from the picture on the
-host to l_d on the host, once R is in the form that the method wants. Dense R is (I - A)^-1 - I by
-factorization (`_corner.py`). Both compressed forms come from C of R = W^T C W, which eq. 21 makes on
-coefficients from rows of A that stream by, as in `resolution131k.py`; rows in wavelets are R W^T = W^T C.
-Each method goes as far as memory, and some minutes, allow. The truth needs no inverse: l_d = l_out - A l_out,
-A by exact rows.
+The last two keep the largest numbers that 0.7 % need, in 16 bits each. Timed is all from the
+picture on the host to l_d on the host, once R is in the form that the method wants. Dense R is (I -
+A)^-1 - I by factorization (`_corner.py`). Both compressed forms come from C of R = W^T C W, which
+eq. 21 makes on coefficients from rows of A that stream by, as in `resolution131k.py`; rows in
+wavelets are R W^T = W^T C. Each method goes as far as memory, and some minutes, allow. The truth
+needs no inverse: l_d = l_out - A l_out, A by exact rows.
 """
 
 from __future__ import annotations
@@ -36,14 +37,17 @@ from _corner import Bounce, interreflection
 from _figures import Claim
 from _harness import Options, options, seconds
 from ltcl import checks
-from ltcl.compression import invert_coefficients
-from ltcl.compression.coefficients import coefficients
-from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
 from ltcl.scenes import landscape
 from ltcl.solvers import matrix_series
+from ltcl.tasks.compression import invert_coefficients
+from ltcl.tasks.compression.coefficients import coefficients
+from ltcl.tasks.compression.sources import source
 
-SIZES, SMOKE = (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256), (2, 4, 8)  # patches along a wall, N = 2 n^2
+SIZES, SMOKE = (
+    (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256),
+    (2, 4, 8),
+)  # patches along a wall, N = 2 n^2
 SERIES, DENSE, SQUARES = 4232, 32768, 4  # the largest N; arrays of N x N float32 on the way
 PATIENCE, REPEATS = 3.0, 15  # s: what takes longer runs once
 ABOVE, LEAST = 5.0, 3  # times the launch floor: where a slope begins; of so many points at least
@@ -143,7 +147,9 @@ def of_rows(given: Options, at: Problem, C: Any) -> Any:
     columns = source("C", scipy.sparse.csr_array(C.T), MEMORY)
     drop, most = FINE * float(np.linalg.norm(C.data)), MOST * C.shape[0]
     synthesis = lambda a: W.apply_transpose(given.device.upload(a)).get()  # noqa: E731
-    return scipy.sparse.csr_array(coefficients(columns, None, synthesis, drop=drop, most=most).core.T)
+    return scipy.sparse.csr_array(
+        coefficients(columns, None, synthesis, drop=drop, most=most).core.T
+    )
 
 
 def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
@@ -159,7 +165,9 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
 
     kept = fewest(C, error, DROPPED)
     core, V = restrict_to_support(kept, W) if both else (kept, W)
-    return by_steps(system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out))
+    return by_steps(
+        system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out)
+    )
 
 
 @dataclass(frozen=True)
@@ -175,17 +183,25 @@ class Point:
 def ways(given: Options, at: Problem) -> dict[str, Way]:
     """Every method that goes so far, ready to run."""
     found, n = {}, len(at.l_out)
-    most = (checks.host_memory() / (4 * SQUARES)) ** 0.5  # pixels of dense R for which memory is left
+    most = (
+        checks.host_memory() / (4 * SQUARES)
+    ) ** 0.5  # pixels of dense R for which memory is left
     if n <= min(DENSE, most):
         R = interreflection(at.rows.n, ALBEDO, lambda said: note(f"N = {n}: {said.strip()}"))
         S = IdentityPlus(Dense(given.device, R))
         iteration = found["iteration"] = by_steps(S, at, n)
         if n <= min(SERIES, most):
-            found["series"] = by_matrices(lambda steps: matrix_series(S, steps=steps).x, at, iteration)
+            found["series"] = by_matrices(
+                lambda steps: matrix_series(S, steps=steps).x, at, iteration
+            )
             found["peer"] = by_matrices(lambda steps: by_numpy(S, steps), at, iteration)
     transform = analysis(Wavelet(given.device, at.rows.grid, "db2"))
-    A = coefficients(source("A", at.rows, MEMORY), transform, transform, THRESHOLD, first=THRESHOLD / 4)
-    both = -invert_coefficients(-A.core, rtol=FINE).D  # C of R = W^T C W in db2, far finer than needed
+    A = coefficients(
+        source("A", at.rows, MEMORY), transform, transform, THRESHOLD, first=THRESHOLD / 4
+    )
+    both = -invert_coefficients(
+        -A.core, rtol=FINE
+    ).D  # C of R = W^T C W in db2, far finer than needed
     found["both"] = by_wavelets(given, at, both, True)
     found["rows"] = by_wavelets(given, at, of_rows(given, at, both), False)
     return found
@@ -196,7 +212,9 @@ def measure(given: Options, n: int) -> list[Point]:
     start = time.perf_counter()
     at = problem(n)
     found, pixels = ways(given, at), len(at.l_out)
-    quick: dict[str, Callable[[], object]] = {k: way.run for k, way in found.items() if way.first <= PATIENCE}
+    quick: dict[str, Callable[[], object]] = {
+        k: way.run for k, way in found.items() if way.first <= PATIENCE
+    }
     spent = {name: way.first for name, way in found.items()} | seconds(quick, REPEATS)
     for name, way in found.items():
         ms = f"{1e3 * spent[name]:.4g} ms"
@@ -229,9 +247,9 @@ class Law:
 def law(pixels: np.ndarray, spent: np.ndarray) -> Law:
     """The slope of log time over log N above the launch floor.
 
-    The floor is the least time at any N: small solves are launches and checks, whose time varies. Points
-    count from where all take at least five times as long, and the last three in any case; the slope is 0
-    where the floor is one of these.
+    The floor is the least time at any N: small solves are launches and checks, whose time varies.
+    Points count from where all take at least five times as long, and the last three in any case;
+    the slope is 0 where the floor is one of these.
     """
     floor = float(spent.min())
     first = min(int(np.flatnonzero(spent < ABOVE * floor)[-1]) + 1, len(pixels) - LEAST)
@@ -245,7 +263,9 @@ def law(pixels: np.ndarray, spent: np.ndarray) -> Law:
 def slowdown(points: list[Point], slow: str, fast: str) -> tuple[int, float]:
     """The largest N that both methods reach, and how many times longer one takes there."""
     found = {p.pixels: p.seconds for p in points if p.method == fast}
-    last = max((p for p in points if p.method == slow and p.pixels in found), key=lambda p: p.pixels)
+    last = max(
+        (p for p in points if p.method == slow and p.pixels in found), key=lambda p: p.pixels
+    )
     return last.pixels, last.seconds / found[last.pixels]
 
 
@@ -272,7 +292,9 @@ def claims(points: list[Point], laws: dict[str, Law]) -> list[Claim]:
     errors = [p.way.error for p in points]
     least, most = min(errors), max(errors)
     limit = f"at most {ERROR:.0%}"
-    listed = [Claim("all methods run to 1 % error", f"{least:.2%} to {most:.2%}", limit, most <= ERROR)]
+    listed = [
+        Claim("all methods run to 1 % error", f"{least:.2%} to {most:.2%}", limit, most <= ERROR)
+    ]
     if not laws:
         return listed
     for name, found in laws.items():
@@ -300,7 +322,9 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
         "A corner of N pixels, each of which lights half of the others. A method starts with R in its own",
         "form, and ends with the same error against the truth. Dotted: launch floor and a power of N.",
     )
-    axes = figures.graph(figure, (85, 150, 880, 375), "Time", "resolution of light transport, N", "seconds")
+    axes = figures.graph(
+        figure, (85, 150, 880, 375), "Time", "resolution of light transport, N", "seconds"
+    )
     axes.set_xscale("log")
     for name, method in METHODS.items():
         pixels, spent = curve(points, name)
@@ -311,7 +335,11 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
             axes.plot(at, laws[name](at), ":", color=method.colour, lw=1.5)
         axes.plot(pixels, spent, "o" + method.line, color=method.colour, lw=2, ms=5, label=label)
         duration = f"{1e3 * spent[-1]:.3g} ms" if spent[-1] < 1.0 else f"{spent[-1]:.3g} s"
-        place: Any = {"xytext": (8, APART.get(name, 0)), "textcoords": "offset points", "va": "center"}
+        place: Any = {
+            "xytext": (8, APART.get(name, 0)),
+            "textcoords": "offset points",
+            "va": "center",
+        }
         axes.annotate(duration, (pixels[-1], spent[-1]), color=method.colour, fontsize=10, **place)
     axes.minorticks_off()
     axes.margins(x=0.1)
@@ -334,11 +362,17 @@ def main() -> None:
             f"{method.label}, numbers a row": [float(f"{p.way.kept:.4g}") for p in mine],
             f"{method.label}, MB": [float(f"{p.way.nbytes / 1e6:.4g}") for p in mine],
         }
-    slower = {"iteration": ("series", "peer"), "rows": ("iteration",), "both": ("iteration", "rows")}
+    slower = {
+        "iteration": ("series", "peer"),
+        "rows": ("iteration",),
+        "both": ("iteration", "rows"),
+    }
     for slow, fast in ((slow, fast) for fast, some in slower.items() for slow in some):
         at, ratio = slowdown(points, slow, fast)
         facts[f"{METHODS[slow].label} over {METHODS[fast].label} at N = {at}"] = ratio
-    figures.conclude(given, "Figure 7: resolution", claims(points, laws), facts, lambda: draw(points, laws))
+    figures.conclude(
+        given, "Figure 7: resolution", claims(points, laws), facts, lambda: draw(points, laws)
+    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Figure 8: Monte Carlo inversion at N = 5120, plain and with final gather.
 
-A box of five walls, 32 x 32 patches each, under a lamp. Claims of the paper: variance falls as one over the
-samples; 30 samples a pixel, noisy by themselves, suffice with one exact product at the end. Walks score at
-every step, where the paper's score where they end (eq. 26). Errors are those against the true direct light.
+A box of five walls, 32 x 32 patches each, under a lamp. Claims of the paper: variance falls as one
+over the samples; 30 samples a pixel, noisy by themselves, suffice with one exact product at the
+end. Walks score at every step, where the paper's score where they end (eq. 26). Errors are those
+against the true direct light.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ class Inversion:
 
     def run(self, samples: int, seed: int, kind: str) -> np.ndarray:
         """An estimate of the direct light."""
-        return ltcl.solve(self.S, self.l_out, "monte_carlo", samples=samples, seed=seed, **KINDS[kind]).x
+        return ltcl.solve(
+            self.S, self.l_out, "monte_carlo", samples=samples, seed=seed, **KINDS[kind]
+        ).x
 
 
 def invert(n: int, device: ltcl.Device) -> Inversion:
@@ -71,7 +74,9 @@ def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
     accurate, is_due = f"{due:.2f} times, within a tenth", abs(many / plain / due - 1) <= 0.1
     return [
         Claim(variance, slopes, "-1 within 99 % confidence", abs(value + 1) <= half),
-        Claim(gather, few, "at most 5%, a tenth of that without", gathered <= min(0.05, plain / 10)),
+        Claim(
+            gather, few, "at most 5%, a tenth of that without", gathered <= min(0.05, plain / 10)
+        ),
         Claim("more samples make it more accurate", more, accurate, is_due),
     ]
 
@@ -91,7 +96,9 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
         view = figures.light(found.scene, light.reshape(found.scene.grid), gain)
         views.append((view, label, f"error {found.error(light):.2g}"))
     figures.pictures(figure, 110, views, gap=20)
-    axes = figures.graph(figure, (85, 360, 860, 210), "Variance", "samples a pixel", "squared error")
+    axes = figures.graph(
+        figure, (85, 360, 860, 210), "Variance", "samples a pixel", "squared error"
+    )
     for (kind, values), colour in zip(errors.items(), ("#5cc8ff", "#ffb347"), strict=True):
         axes.loglog(COUNTS, (values**2).mean(axis=1), color=colour, lw=2, label=kind)
     axes.set_xticks(COUNTS, [str(count) for count in COUNTS])

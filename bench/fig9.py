@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Figure 9: each bounce of light as a picture of its own (eq. 27).
 
-Above, a dihedral of white walls, green light cast on the left one; below, a glossy board stands in it, under
-white light. Claims of the paper: successive bounces light the walls in turn; the highlight on the board is in
-the direct light alone. Bounces are exact of the Lambertian scene and approximate of the glossy one (eq. 28,
-29): how far they are off is measured against the scenes' own A^k l_d and P A^k F Q.
-The paper's timing, 0.09 s against 4.6 s of dense inversion at 4K x 4K, is measured by `bench/dense4k.py`.
+Above, a dihedral of white walls, green light cast on the left one; below, a glossy board stands in
+it, under white light. Claims of the paper: successive bounces light the walls in turn; the
+highlight on the board is in the direct light alone. Bounces are exact of the Lambertian scene and
+approximate of the glossy one (eq. 28, 29): how far they are off is measured against the scenes' own
+A^k l_d and P A^k F Q. The paper's timing, 0.09 s against 4.6 s of dense inversion at 4K x 4K, is
+measured by `bench/dense4k.py`.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ class Parts:
         """How much of each bounce's light on the two walls is on that which has its turn, (BOUNCES + 1,)."""
         n = self.scene.grid[0]
         light = np.abs(self.found.reshape(BOUNCES + 1, n, -1, n, 3)).sum(axis=(1, 3, 4))[:, :2]
-        return np.array([wall[k % 2] for k, wall in enumerate(light / light.sum(axis=1, keepdims=True))])
+        return np.array(
+            [wall[k % 2] for k, wall in enumerate(light / light.sum(axis=1, keepdims=True))]
+        )
 
 
 def diffuse(n: int, device: ltcl.Device) -> Parts:
@@ -68,7 +71,9 @@ def diffuse(n: int, device: ltcl.Device) -> Parts:
         bounces.append(boxes.bounce(scene, bounces[-1]))
     picture = T @ pattern
     separation = ltcl.separate(T, picture, BOUNCES, rtol=1e-4)
-    return Parts(scene, picture, separation, np.stack([scene.picture(bounce) for bounce in bounces]))
+    return Parts(
+        scene, picture, separation, np.stack([scene.picture(bounce) for bounce in bounces])
+    )
 
 
 def with_board(n: int, smoke: bool, device: ltcl.Device) -> Parts:
@@ -102,7 +107,12 @@ def claims(plain: Parts, board: Parts) -> list[Claim]:
     is_near = off[0] <= 1e-2 and off[1] <= 0.2
     return [
         Claim("successive bounces light the two walls in turn", in_turn, "99.9%", turns >= 0.999),
-        Claim("each bounce is A^k l_d", f"off by {_list(plain.off, '.1g')}", "1e-2", plain.off.max() <= 1e-2),
+        Claim(
+            "each bounce is A^k l_d",
+            f"off by {_list(plain.off, '.1g')}",
+            "1e-2",
+            plain.off.max() <= 1e-2,
+        ),
         Claim("they add up to the picture", f"to {left:.1g}", "1e-6", left <= 1e-6),
         Claim(beside, f"at least {least:.0%}", "75%", least >= 0.75),
         Claim("the highlight is in the direct light alone", times, "above 2; below 1.5", is_direct),
@@ -117,11 +127,17 @@ def _list(values: np.ndarray, form: str) -> str:
 def draw_parts(figure: Figure, parts: Parts, top: float, text: str) -> None:
     """Picture, direct and global light; below them the bounces, each as bright as it can be shown."""
     lefts, width = figures.columns(BOUNCES, gap=24)
-    gain = 0.9 / np.quantile(parts.picture[:, : parts.scene.grid[0]], 0.99)  # a highlight may be cut off
+    gain = 0.9 / np.quantile(
+        parts.picture[:, : parts.scene.grid[0]], 0.99
+    )  # a highlight may be cut off
     whole = (parts.picture, parts.separation.direct, parts.separation.indirect)
-    for left, label, image in zip(lefts, ("picture", "direct light", "global light"), whole, strict=False):
+    for left, label, image in zip(
+        lefts, ("picture", "direct light", "global light"), whole, strict=False
+    ):
         figures.picture(figure, (left, top, width), figures.light(parts.scene, image, gain), label)
-    figures.label_at(figure, lefts[-1], top - 22, text, size=10, color=figures.FAINT, linespacing=1.5)
+    figures.label_at(
+        figure, lefts[-1], top - 22, text, size=10, color=figures.FAINT, linespacing=1.5
+    )
     bounces = []
     for k, bounce in enumerate(parts.separation.bounces, start=1):
         own = 0.9 / np.quantile(bounce, 0.999)

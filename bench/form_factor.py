@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One bounce of light between 131424 patches of a closed box, form factors computed on the way, beside NumPy.
 
-NumPy computes the same sums in float32, a few rows at a time: centre to centre, the close pairs again at
-eight pairs of points, near pairs by SciPy from the same sparse corrections. It takes minutes for all rows,
-so it does a sample of them, is checked against ours there, and pairs a second are compared. Every row of F
-sums to 1 in a closed box: that is how far off the products are.
+NumPy computes the same sums in float32, a few rows at a time: centre to centre, the close pairs
+again at eight pairs of points, near pairs by SciPy from the same sparse corrections. It takes
+minutes for all rows, so it does a sample of them, is checked against ours there, and pairs a second
+are compared. Every row of F sums to 1 in a closed box: that is how far off the products are.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ class Peer:
     def __init__(self, device: Device, patches: Patches, rows: np.ndarray) -> None:
         placed, _ = scaled(device, patches, np.zeros((0, 2, 3)))
         parts = (placed.centre, placed.normal, placed.right, placed.down)
-        self.centre, self.normal, self.right, self.down = (part.astype(np.float32) for part in parts)
+        self.centre, self.normal, self.right, self.down = (
+            part.astype(np.float32) for part in parts
+        )
         self.area, self.reach = placed.area.astype(np.float32), FAR**2 * squared_size(placed)
         self.rows = rows
 
@@ -39,9 +41,13 @@ class Peer:
         d = self.centre - self.centre[i]
         values = self._exchange(d, self.normal[i], self.normal)
         close = np.flatnonzero(np.einsum("nc,nc->n", d, d) < self.reach + self.reach[i])
-        close = close[np.abs(self.normal[close] - self.normal[i]).max(axis=1) > 0]  # not of this wall
+        close = close[
+            np.abs(self.normal[close] - self.normal[i]).max(axis=1) > 0
+        ]  # not of this wall
         angle, total = np.arange(8) * np.pi / 4, np.zeros(len(close), np.float32)
-        place = (np.sqrt(1 / 6) * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.float32)
+        place = (np.sqrt(1 / 6) * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(
+            np.float32
+        )
         for k in range(8):
             (a, b), (u, v) = place[k], place[3 * k % 8]
             end = self.centre[close] + u * self.right[close] + v * self.down[close]
@@ -53,7 +59,9 @@ class Peer:
     def _exchange(self, d: np.ndarray, normal: np.ndarray, normals: np.ndarray) -> np.ndarray:
         here, there = d @ normal, -np.einsum("nc,nc->n", d, normals)
         r2 = np.einsum("nc,nc->n", d, d)
-        return np.where((here > 1e-6) & (there > 1e-6), here * there, 0) / (np.float32(np.pi) * r2**2 + 1e-30)
+        return np.where((here > 1e-6) & (there > 1e-6), here * there, 0) / (
+            np.float32(np.pi) * r2**2 + 1e-30
+        )
 
 
 def main() -> None:
@@ -63,7 +71,10 @@ def main() -> None:
     count = len(patches)
     rows = np.random.default_rng(0).choice(count, 16 if given.smoke else 64, replace=False)
     A = FormFactor(patches, device=given.device)
-    peer, x = Peer(given.device, patches, rows), np.random.default_rng(1).random((count, 3), dtype=np.float32)
+    peer, x = (
+        Peer(given.device, patches, rows),
+        np.random.default_rng(1).random((count, 3), dtype=np.float32),
+    )
     one = np.ascontiguousarray(x[:, 0])
     exact = peer(one) + A._near.apply(given.device.upload(one)).get()[rows]
     if not np.allclose(A.dot(one)[rows], exact, rtol=1e-4):

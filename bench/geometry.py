@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera that is not aligned with the projector: how well T comes out, by size of its pixels and noise.
 
-A corner of 16 x 16 projector pixels, each wall 16 x 8, of which the exact transport is known. A virtual
-camera sees it askance; its pixels integrate over their area, straddle projector pixels, and miss two or three
-of these at a corner of the picture. Which pixel sees which is found by Gray code, the camera's response from
-photographs, and T is scanned pixel by pixel. Then T p is compared for held patterns of noise, of stripes and
-of smooth light, in the camera's own unit (its last code), on all pixels that are not masked. Ten more cameras
-stand at random: 3 to 4.5 pixels to a projector pixel's side, shifted by up to a projector pixel, every other
-one turned; they see all of the picture and its rim, or some of it.
+A corner of 16 x 16 projector pixels, each wall 16 x 8, of which the exact transport is known. A
+virtual camera sees it askance; its pixels integrate over their area, straddle projector pixels, and
+miss two or three of these at a corner of the picture. Which pixel sees which is found by Gray code,
+the camera's response from photographs, and T is scanned pixel by pixel. Then T p is compared for
+held patterns of noise, of stripes and of smooth light, in the camera's own unit (its last code), on
+all pixels that are not masked. Ten more cameras stand at random: 3 to 4.5 pixels to a projector
+pixel's side, shifted by up to a projector pixel, every other one turned; they see all of the
+picture and its rim, or some of it.
 
-With Mitsuba 3 a rendered corner of unlike albedos is acquired from a camera half a wall beside the projector,
-and a picture on it is compensated. It is compared with pictures that nothing scanned, rendered from the
-projector's own place, where camera and projector pixels are the same: diffuse walls are as bright from there.
-Pixels with all neighbours well seen count; at the outline of the walls a projector pixel is partly dark.
+With Mitsuba 3 a rendered corner of unlike albedos is acquired from a camera half a wall beside the
+projector, and a picture on it is compensated. It is compared with pictures that nothing scanned,
+rendered from the projector's own place, where camera and projector pixels are the same: diffuse
+walls are as bright from there. Pixels with all neighbours well seen count; at the outline of the
+walls a projector pixel is partly dark.
 
-Where the photographs of a real set-up lie beside the checkout, their Gray code is decoded: 42 photographs,
-1280 x 1024, of a chessboard under Gray code for 1024 x 768, and the calibration that their authors found, who
-count a step of the code as two projector pixels.
+Where the photographs of a real set-up lie beside the checkout, their Gray code is decoded: 42
+photographs, 1280 x 1024, of a chessboard under Gray code for 1024 x 768, and the calibration that
+their authors found, who count a step of the code as two projector pixels.
 """
 
 from __future__ import annotations
@@ -54,13 +56,18 @@ KINDS = {"noise": slice(0, 2), "stripes": slice(2, 3), "smooth": slice(3, 6)}
 PLACES, PLACED = 10, (3.0, 4.5)  # cameras at random, and camera pixels to a side
 LIMIT, RENDERED, AT_RANDOM = 0.02, 0.04, 0.01
 ALBEDO = [(0.8, 0.8, 0.8), (0.4, 0.4, 0.4)]  # of the rendered corner
-SIZE, BASELINE, FINE = 3.5, 0.5, 512  # camera pixels to one of the projector's; of walls; paths of the truth
+SIZE, BASELINE, FINE = (
+    3.5,
+    0.5,
+    512,
+)  # camera pixels to one of the projector's; of walls; paths of the truth
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "graycode-real"
 BOARD_GRID, STEP = (768, 1024), 2.0
 LIT = 30  # codes that white shows more than black
 
 
-# A camera: pixels to a projector pixel's side, place on the projector's grid, (H, W), and its noise.
+# A camera: pixels to a projector pixel's side, place on the projector's grid, (H, W), and its
+# noise.
 View = namedtuple("View", "size place grid seed", defaults=[2])
 
 
@@ -90,7 +97,9 @@ def askance(size: float) -> View:
     def place(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         a, b = (u + 0.5) / W, (v + 0.5) / H
         d = 1 + 0.15 * a - 0.09 * b
-        return N * (1.123 * a + 0.054 * b - 0.043) / d - 0.9, N * (1.145 * b - 0.042 * a - 0.053) / d - 0.5
+        return N * (1.123 * a + 0.054 * b - 0.043) / d - 0.9, N * (
+            1.145 * b - 0.042 * a - 0.053
+        ) / d - 0.5
 
     return View(size, place, (H, W))
 
@@ -157,9 +166,14 @@ def rendered(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop
         white = np.ones(grid, np.float32)
         ours, theirs = np.asarray(T @ white, np.float64)[inner], truth.radiance(white)[inner]
         unit = ours @ theirs / (ours @ ours)
-        errors = [relative(unit * np.asarray(T @ p)[inner], truth.radiance(p)[inner]) for p in patterns]
+        errors = [
+            relative(unit * np.asarray(T @ p)[inner], truth.radiance(p)[inner]) for p in patterns
+        ]
         y, x = np.mgrid[:h, :w] / w
-        desired, level = 0.55 + 0.45 * np.sin(19 * np.hypot(x - 0.5, y - 0.37)), 0.7 * np.quantile(ours, 0.05)
+        desired, level = (
+            0.55 + 0.45 * np.sin(19 * np.hypot(x - 0.5, y - 0.37)),
+            0.7 * np.quantile(ours, 0.05),
+        )
         pattern = ltcl.compensate(T, (level * desired).astype(np.float32), rtol=1e-3).pattern
     both = desired * level / np.median(ours), np.clip(np.asarray(pattern, np.float64), 0.0, 1.0)
     decibels = [_decibels(truth.radiance(p)[inner], desired[inner]) for p in both]
@@ -187,11 +201,15 @@ def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
     camera = np.stack(np.nonzero(board)[::-1], axis=1).astype(np.float64)
     projector = np.stack([found.x[board], found.y[board]], axis=1).astype(np.float64)
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
-    distance = np.linalg.norm(cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1)
+    distance = np.linalg.norm(
+        cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1
+    )
     back, ahead = _reprojected(camera[::20], STEP * projector[::20], folder)
     return {
         "real photographs, lit pixels decoded": float(found.valid[lit].mean()),
-        "real, from a homography on the board, median of projector pixels": float(np.median(distance)),
+        "real, from a homography on the board, median of projector pixels": float(
+            np.median(distance)
+        ),
         "real, from a homography on the board, rms": float(np.sqrt(np.mean(distance**2))),
         "real, reprojected by the authors' calibration, rms of projector pixels": back,
         "real, and of camera pixels (its own residual is 0.86)": ahead,
@@ -221,7 +239,9 @@ def claims(found: list[Found], cameras: list[Found], loop: Loop | None) -> list[
             text = f"T p of held patterns, {one.size:g} camera pixels to a side, {one.camera}"
             listed.append(Claim(text, str(one), "at most 2 %", one.worst <= LIMIT))
     worst = [one.worst for one in cameras]
-    text = f"T p of held patterns, {len(cameras)} cameras at random, 3 to 4.5 camera pixels to a side"
+    text = (
+        f"T p of held patterns, {len(cameras)} cameras at random, 3 to 4.5 camera pixels to a side"
+    )
     measured = f"median {np.median(worst):.2%}, worst {max(worst):.2%}"
     listed.append(Claim(text, measured, "at most 1 %, each", max(worst) <= AT_RANDOM))
     if loop is not None:
@@ -237,11 +257,17 @@ def claims(found: list[Found], cameras: list[Found], loop: Loop | None) -> list[
 def facts(found: list[Found], cameras: list[Found], loop: Loop | None) -> dict[str, Any]:
     lines: dict[str, Any] = {"projector pixels": N * N}
     names = [f"{one.size:g} camera pixels, {one.camera}, {one.noise}" for one in found]
-    names += [f"at random, seed {seed}, {one.size:.2f} camera pixels" for seed, one in enumerate(cameras)]
-    lines |= {n: f"{o}; {o.masked} pixels masked" for n, o in zip(names, found + cameras, strict=True)}
+    names += [
+        f"at random, seed {seed}, {one.size:.2f} camera pixels" for seed, one in enumerate(cameras)
+    ]
+    lines |= {
+        n: f"{o}; {o.masked} pixels masked" for n, o in zip(names, found + cameras, strict=True)
+    }
     lines["rendered corner"] = "left out, mitsuba is not installed"
     if loop is not None:
-        lines["rendered corner"] = f"{loop.pattern.shape}, {loop.photographs} photographs of the scan"
+        lines["rendered corner"] = (
+            f"{loop.pattern.shape}, {loop.photographs} photographs of the scan"
+        )
     return lines | photographed()
 
 
@@ -260,7 +286,9 @@ def draw(found: list[Found], cameras: list[Found], loop: Loop | None) -> Figure:
         look: Any = {"color": f"C{number}", "marker": "o", "label": f"{camera}, {kind}"}
         axes.plot([one.size for one in some], [one.errors[kind] for one in some], style, **look)
     sizes, worst = [one.size for one in cameras], [one.worst for one in cameras]
-    axes.plot(sizes, worst, "x", color=figures.FAINT, label=f"{len(cameras)} cameras at random, worst")
+    axes.plot(
+        sizes, worst, "x", color=figures.FAINT, label=f"{len(cameras)} cameras at random, worst"
+    )
     _percent(axes)
     axes.legend(frameon=False, labelcolor=figures.FAINT, fontsize=8.5)
     title, xlabel = "By noise, 3 camera pixels", "electrons at full scale"

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How good the single-view approximation is: bounces of glossy scenes as one camera and one projector tell.
 
-T = P S F Q (eq. 28) is taken for S' F', with F' = P F Q diagonal and S' = T F'^-1, and bounce k of a picture
-for (I - S'^-1)^k F' l_in, where the light field has P A^k F Q l_in (eq. 29). Those are computed, and what
-`ltcl.separate` finds is compared with them, for a dihedral of which the left wall is lit, both walls or the
-other one alone being glossy. Bounces are found with a direct solver, so that nothing else is measured.
-Also: what T itself says about it (reciprocity, and negative light, which no bounce has), how fast the plain
-series l <- l_out - R l settles (the paper: about 20 iterations with gloss), and compensation, which is exact.
+T = P S F Q (eq. 28) is taken for S' F', with F' = P F Q diagonal and S' = T F'^-1, and bounce k of
+a picture for (I - S'^-1)^k F' l_in, where the light field has P A^k F Q l_in (eq. 29). Those are
+computed, and what `ltcl.separate` finds is compared with them, for a dihedral of which the left
+wall is lit, both walls or the other one alone being glossy. Bounces are found with a direct solver,
+so that nothing else is measured. Also: what T itself says about it (reciprocity, and negative
+light, which no bounce has), how fast the plain series l <- l_out - R l settles (the paper: about 20
+iterations with gloss), and compensation, which is exact.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from _figures import Claim
 from _harness import Options, options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
-from ltcl.separation import LARGEST_NEGATIVE
+from ltcl.tasks.separation import LARGEST_NEGATIVE
 
 ALBEDO, PROJECTOR = 0.5, (2.4, 1.2, 1.2)
 ROOMS = {"both walls": (1.0, 1.0), "unlit wall": (0.0, 1.0)}  # share of the gloss on each wall
@@ -78,7 +79,9 @@ def settles(T: np.ndarray, F: np.ndarray, l_in: np.ndarray) -> tuple[float, int 
     return radius, None
 
 
-def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device: ltcl.Device) -> Case:
+def measure(
+    scene: GlossyScene, room: str, exponent: float, gloss: float, device: ltcl.Device
+) -> Case:
     n, F = scene.grid[0], scene.first_bounce
     pattern = np.zeros(scene.grid)
     pattern[:, :n] = 1.0
@@ -90,7 +93,12 @@ def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device
     by_diagonal, _ = separated(ltcl.Transport(matrix, scene.grid, device=device), picture)
     error, size = norms(found - truth), norms(truth)
     negative = -np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))
-    errors = error / size, error / np.linalg.norm(picture), norms(by_diagonal - truth) / size, negative
+    errors = (
+        error / size,
+        error / np.linalg.norm(picture),
+        norms(by_diagonal - truth) / size,
+        negative,
+    )
     reported = T.reciprocity_defect, max(T.negative_bounces)
     desired = T @ np.random.default_rng(0).uniform(0.2, 0.8, scene.grid)
     compensation = ltcl.compensate(T, desired, method="direct")
@@ -122,24 +130,39 @@ def claims(found: Sequence[Case]) -> list[Claim]:
     shiny = [case for case in found if 0 < case.gloss <= MODERATE]
     later = sum(case.off[2] > case.off[1] for case in shiny)
     worse = f"bounce 2 is worse in {later} of {len(shiny)} scenes of gloss up to {MODERATE:g}"
-    squared = "(PAFQ)(PFQ)^-1, what the camera sees of a bounce, is squared; PA^2FQ is something else"
+    squared = (
+        "(PAFQ)(PFQ)^-1, what the camera sees of a bounce, is squared; PA^2FQ is something else"
+    )
     steps = [STEPS + 1 if c.iterations is None else c.iterations for c in shiny if c.exponent <= 20]
     taken = f"{min(steps)} to {max(steps)} at gloss up to {MODERATE:g}"
     wrong = [case for case in found if case.off[1] > 0.1]
     told, false = (sum(case.warned for case in some) for some in (wrong, matte))
     warning = "the warning of section 8.4 comes where bounce 1 is off by more than 10%"
     ratio = [case.negative[1] / case.off[1] for case in shiny]
-    negative = f"it is {min(ratio):.2f} to {max(ratio):.2f} times the error, at gloss up to {MODERATE:g}"
+    negative = (
+        f"it is {min(ratio):.2f} to {max(ratio):.2f} times the error, at gloss up to {MODERATE:g}"
+    )
     tells = min(ratio) > 0.5 and max(ratio) < 1.5
     decay = "later bounces are no worse: specular effects decay (section 8.4)"
     return [
         _below("without gloss all bounces are exact", max(max(case.off) for case in matte), 1e-4),
-        _below("the direct light is exact of any gloss, F = PFQ given", max(c.off[0] for c in found), 1e-3),
-        _below("compensation is exact of any gloss", max(case.compensation for case in found), 1e-4),
+        _below(
+            "the direct light is exact of any gloss, F = PFQ given",
+            max(c.off[0] for c in found),
+            1e-3,
+        ),
+        _below(
+            "compensation is exact of any gloss", max(case.compensation for case in found), 1e-4
+        ),
         _below("none of it is clipped", max(case.clipped for case in found), 0.0),
         _below(f"bounce 1 is about right at gloss {MODERATE:g}", max(c.off[1] for c in shiny), 0.3),
         Claim(decay, worse, "none", later == 0, differs=squared),
-        Claim("the plain series needs about 20 iterations with gloss", taken, "at most 20", max(steps) <= 20),
+        Claim(
+            "the plain series needs about 20 iterations with gloss",
+            taken,
+            "at most 20",
+            max(steps) <= 20,
+        ),
         Claim(warning, f"in {told} of {len(wrong)} scenes", "all", told == len(wrong)),
         Claim("and not without gloss", f"in {false} of {len(matte)} scenes", "none", not false),
         Claim("negative light in bounce 1 tells how far it is off", negative, "0.5 to 1.5", tells),
@@ -172,7 +195,9 @@ def draw(found: Sequence[Case]) -> Figure:
     _curves(axes, found, lambda case: case.defect)
     _curves(axes, found, lambda case: case.taken, marker="v", lw=1, alpha=0.7)
     axes.axhline(LARGEST_NEGATIVE, **dotted)
-    axes.text(0.79, LARGEST_NEGATIVE, "warning above", color=INK, fontsize=9, ha="right", va="bottom")
+    axes.text(
+        0.79, LARGEST_NEGATIVE, "warning above", color=INK, fontsize=9, ha="right", va="bottom"
+    )
     title = "Plain series: iterations to 1 % of the direct light"
     axes = figures.graph(figure, (right, below, *size), title, xlabel, "iterations", "linear")
     _curves(axes, found, lambda case: np.nan if case.iterations is None else case.iterations)
@@ -183,13 +208,17 @@ def draw(found: Sequence[Case]) -> Figure:
     return figure
 
 
-def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], **style: Any) -> None:
+def _curves(
+    axes: Axes, found: Sequence[Case], value: Callable[[Case], float], **style: Any
+) -> None:
     for room, line in zip(ROOMS, ("-", "--"), strict=True):
         for exponent in sorted({case.exponent for case in found}):
             some = [case for case in found if (case.room, case.exponent) == (room, exponent)]
             label = f"exponent {exponent:g}" if line == "-" else None
             look = {"marker": "o", "lw": 2, "ms": 4, "color": SHADES[exponent], "ls": line} | style
-            axes.plot([case.gloss for case in some], [value(case) for case in some], label=label, **look)
+            axes.plot(
+                [case.gloss for case in some], [value(case) for case in some], label=label, **look
+            )
     axes.set_xlim(0, 0.8)
 
 

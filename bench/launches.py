@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a step of each method asks of a device: kernels, waits, allocations and bytes over the bus.
 
-These counts are the same on every device. For every method and kind of operator a solve runs to a number of
-iterations that it cannot end before; steps are counted from product to product, medians. First solves are
-counted from an operator that nothing is known of: row sums, survey and tables included.
+These counts are the same on every device. For every method and kind of operator a solve runs to a
+number of iterations that it cannot end before; steps are counted from product to product, medians.
+First solves are counted from an operator that nothing is known of: row sums, survey and tables
+included.
 """
 
 from __future__ import annotations
@@ -88,7 +89,9 @@ def solver(method: str, b: np.ndarray, **rules: Any) -> Callable[[IdentityPlus],
 def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int) -> dict[str, Any]:
     target, waits_most, products = TARGETS[method]
     S = IdentityPlus(make())
-    b = np.random.default_rng(1).random((S.shape[0],) if k == 1 else (S.shape[0], k), dtype=np.float32)
+    b = np.random.default_rng(1).random(
+        (S.shape[0],) if k == 1 else (S.shape[0], k), dtype=np.float32
+    )
     with traffic() as first:
         solver(method, b, rtol=1e-2)(S)
     options = {"arnoldi": 0, "spectrum": (0.05, 2.0)} if method == "chebyshev" else {}
@@ -103,8 +106,13 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
     marks = [i for i, name in enumerate(names) if "matvec" in name]
     spans = [names[i:j] for i, j in zip(marks, marks[products:], strict=False)]
     waits = np.array([span.count(WAIT) for span in spans])
-    launches, waits = round(np.median([len(span) for span in spans] - waits)), round(np.median(waits))
-    pixels = method == "bounded" and "wavelets" in kind  # bounds are of pixels: transforms in every product
+    launches, waits = (
+        round(np.median([len(span) for span in spans] - waits)),
+        round(np.median(waits)),
+    )
+    pixels = (
+        method == "bounded" and "wavelets" in kind
+    )  # bounds are of pixels: transforms in every product
     hit = launches <= target and waits <= waits_most and allocations == 0
     first_waits = sum(name == WAIT for name, _ in first)
     return {

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs to radiance, beside OpenCV: megapixels a second, noise of the picture, error of the response.
 
-A smooth scene in three colours at 6 exposures, by a camera with an sRGB curve, 10000 electrons, a read noise
-of 0.2 % and a black offset of 0.4 %. A megapixel is one of a photograph, of three colours. OpenCV merges 8
-bits only; its mergers are given the camera's true response, as ours is, and know nothing of variance and
-masks. Noise is the root mean square of the relative error, at the best scale, where ours is valid; so is the
-error of the response, over linear values from 0.02 to 0.9 above black.
+A smooth scene in three colours at 6 exposures, by a camera with an sRGB curve, 10000 electrons, a
+read noise of 0.2 % and a black offset of 0.4 %. A megapixel is one of a photograph, of three
+colours. OpenCV merges 8 bits only; its mergers are given the camera's true response, as ours is,
+and know nothing of variance and masks. Noise is the root mean square of the relative error, at the
+best scale, where ours is valid; so is the error of the response, over linear values from 0.02 to
+0.9 above black.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def photographs(light: np.ndarray, levels: int) -> list[np.ndarray]:
     rng, kind = np.random.default_rng(0), np.uint8 if levels == 256 else np.uint16
     shots = []
     for t in SECONDS:
-        value = rng.poisson((light * t + BLACK) * ELECTRONS) / ELECTRONS + rng.normal(0, READ, light.shape)
+        value = rng.poisson((light * t + BLACK) * ELECTRONS) / ELECTRONS + rng.normal(
+            0, READ, light.shape
+        )
         shots.append(np.rint(to_srgb(np.clip(value, 0, 1)) * (levels - 1)).astype(kind))
     return shots
 
@@ -54,7 +57,10 @@ def error(found: np.ndarray, true: np.ndarray) -> float:
 def speeds(given: Options, n: int) -> list[Row]:
     light = scene(n)
     shots = {levels: photographs(light, levels) for levels in (256, 4096)}
-    response, noise = Response(from_srgb(np.linspace(0, 1, 4097))), NoiseModel(ELECTRONS, READ, BLACK)
+    response, noise = (
+        Response(from_srgb(np.linspace(0, 1, 4097))),
+        NoiseModel(ELECTRONS, READ, BLACK),
+    )
     times = np.array(SECONDS, np.float32)
     table = np.maximum(from_srgb(np.linspace(0, 1, 256)) - BLACK, 1e-6).astype(np.float32)
     curves = np.repeat(table[:, None, None], 3, axis=2)
@@ -68,14 +74,19 @@ def speeds(given: Options, n: int) -> list[Row]:
     rate = {name: len(SECONDS) * n * n / t / 1e6 for name, t in spent.items()}
     rows = []
     for name, bits in itertools.product(MERGERS, (8, 12)):
-        question, ours = f"merge {len(SECONDS)} x {n * n / 1e6:.3g} Mpixel, {bits} bits", rate[f"ours {bits}"]
+        question, ours = (
+            f"merge {len(SECONDS)} x {n * n / 1e6:.3g} Mpixel, {bits} bits",
+            rate[f"ours {bits}"],
+        )
         better = ours / rate[name]
         rows.append(Row(question, f"OpenCV {name}, 8 bits", rate[name], ours, "Mpixel/s", better))
     ours = merge(shots[256], SECONDS, response, noise)
     for name in MERGERS:
         theirs = np.asarray(actions[name]())
         off, own = (error(found[ours.valid], light[ours.valid]) for found in (theirs, ours.value))
-        rows.append(Row.of_times("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", 1.0))
+        rows.append(
+            Row.of_times("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", 1.0)
+        )
     return rows
 
 
@@ -89,7 +100,9 @@ def responses(n: int) -> list[Row]:
         start = time.perf_counter()
         table = action()
         spent = time.perf_counter() - start
-        zero = Response(table).linear(to_srgb(np.array([BLACK])))  # theirs do not tell black: it is given
+        zero = Response(table).linear(
+            to_srgb(np.array([BLACK]))
+        )  # theirs do not tell black: it is given
         return error(Response(table).linear(codes) - zero, used), spent
 
     def theirs(make: Callable) -> np.ndarray:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which method when: products with S that each one takes to 1 %, from dim rooms to bright ones.
 
-Closed boxes of one albedo m, where rho(R) = m / (1 - m); an open corner of albedo 0.9; and a glossy corner,
-whose S of one camera is not self-adjoint. A third of the pixels has random direct light. Every solution is
-checked in float64. A sweep of Gauss-Seidel counts as a product, and so do as many rows of Southwell's method
-as there are pixels; a factorization takes none. What `auto` takes, and times, are in solve.py.
+Closed boxes of one albedo m, where rho(R) = m / (1 - m); an open corner of albedo 0.9; and a glossy
+corner, whose S of one camera is not self-adjoint. A third of the pixels has random direct light.
+Every solution is checked in float64. A sweep of Gauss-Seidel counts as a product, and so do as many
+rows of Southwell's method as there are pixels; a factorization takes none. What `auto` takes, and
+times, are in solve.py.
 """
 
 from __future__ import annotations

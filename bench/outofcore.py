@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A transport of 8 GB on a disk, host and device held to 2 GB: products, solves; and rows on two devices.
 
-T = (I + R) F on a grid of 212 x 212 pixels has light between pixels that falls with their distance in the
-order of rows, so that products are also to be had by FFT in float64: these judge the answers. The file is
-written block by block below TMPDIR, and removed. Memory of the process is limited by RLIMIT_DATA, which
-counts all but files that are mapped to be read, and that of PoCL by POCL_MEMORY_LIMIT; reading T at once has
-to fail. Before each timing the system drops the file from its cache (posix_fadvise, DONTNEED). The disk's own
-speed is that of the best of 1, 2 and 4 threads that read the file into buffers of 4 MB and do nothing else.
+T = (I + R) F on a grid of 212 x 212 pixels has light between pixels that falls with their distance
+in the order of rows, so that products are also to be had by FFT in float64: these judge the
+answers. The file is written block by block below TMPDIR, and removed. Memory of the process is
+limited by RLIMIT_DATA, which counts all but files that are mapped to be read, and that of PoCL by
+POCL_MEMORY_LIMIT; reading T at once has to fail. Before each timing the system drops the file from
+its cache (posix_fadvise, DONTNEED). The disk's own speed is that of the best of 1, 2 and 4 threads
+that read the file into buffers of 4 MB and do nothing else.
 
-Two devices are halves of a PoCL device (OpenCL sub-devices), each with half of the rows of a dense matrix.
+Two devices are halves of a PoCL device (OpenCL sub-devices), each with half of the rows of a dense
+matrix.
 """
 
 from __future__ import annotations
@@ -62,7 +64,9 @@ class Scene:
         """Block by block, as no host may have room for all."""
         n, F = self.side**2, self.F.astype(np.float32)
         both = np.concatenate([self.kernel[:0:-1], self.kernel]).astype(np.float32)
-        windows = np.lib.stride_tricks.sliding_window_view(both, n)[::-1]  # row i begins with kernel[i]
+        windows = np.lib.stride_tricks.sliding_window_view(both, n)[
+            ::-1
+        ]  # row i begins with kernel[i]
         T: Any = np.lib.format.open_memmap(self.file, "w+", np.float32, (n, n))
         for start in range(0, n, 512):
             block = np.array(windows[start : start + 512])
@@ -132,9 +136,13 @@ def answers(given: Options, scene: Scene, T: np.ndarray) -> dict[str, Any]:
     picture = scene.seen(light).astype(np.float32)
     offsets: Any = range(-8, 9)
     diagonals = [np.full(n - abs(k), scene.kernel[abs(k)] + (k == 0)) for k in offsets]
-    near: Any = scipy.sparse.diags_array(diagonals, offsets=offsets) @ scipy.sparse.diags_array(scene.F)
+    near: Any = scipy.sparse.diags_array(diagonals, offsets=offsets) @ scipy.sparse.diags_array(
+        scene.F
+    )
     whole = ltcl.Transport(T, grid, device=given.device)
-    rough = ltcl.Transport(scipy.sparse.csr_array(near), grid, whole.first_bounce, device=given.device)
+    rough = ltcl.Transport(
+        scipy.sparse.csr_array(near), grid, whole.first_bounce, device=given.device
+    )
     tasks: dict[str, Callable[[], Any]] = {
         f"compensate {FRAMES} frames to 1e-2": lambda: ltcl.compensate(whole, picture),
         f"compensate {FRAMES} frames to 1e-4, by exact=": lambda: ltcl.compensate(
@@ -148,7 +156,9 @@ def answers(given: Options, scene: Scene, T: np.ndarray) -> dict[str, Any]:
         answer = solve()
         spent = time.perf_counter() - start
         bounced = hasattr(answer, "direct")  # light whose direct part that is makes the picture
-        found = (answer.direct / whole.first_bounce.reshape(grid))[None] if bounced else answer.pattern
+        found = (
+            (answer.direct / whole.first_bounce.reshape(grid))[None] if bounced else answer.pattern
+        )
         seen = picture[:1] if bounced else picture
         error = float(np.linalg.norm(scene.seen(found) - seen) / np.linalg.norm(seen))
         products = sum(s.products for s in (answer.solutions if bounced else [answer.solution]))
@@ -164,11 +174,17 @@ def devices(given: Options) -> list[Row]:
         return []
     equally = [device.cl.device_partition_property.EQUALLY, device.compute_units // 2]
     handles = device.handle.create_sub_devices(equally)[:2]
-    described = [dataclasses.replace(device.description, index=f"half {h}", handle=h) for h in handles]
+    described = [
+        dataclasses.replace(device.description, index=f"half {h}", handle=h) for h in handles
+    ]
     first, second = map(Device, described)
     matrix = np.ones((n, n), np.float32)
     both = MultiDevice(first, [Dense(first, matrix[: n // 2]), Dense(second, matrix[n // 2 :])])
-    ways = {"both": both, "one half": Dense(first, matrix), "the whole device": Dense(device, matrix)}
+    ways = {
+        "both": both,
+        "one half": Dense(first, matrix),
+        "the whole device": Dense(device, matrix),
+    }
     spent = seconds({name: product(A, np.ones(n)) for name, A in ways.items()})
     ms = {name: 1e3 * each for name, each in spent.items()}
     question, ours = f"dense, {n} rows on two halves", ms.pop("both")

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A product with the R of a smooth scene, in every format: error against bytes against time.
 
-A corner of albedo 0.8 on a grid of 96 x 192, N = 18432: light from everywhere arrives everywhere, so that R
-has no zeros but those within rounding. Kept are the largest numbers of R itself, of its rows in db2
-wavelets (the paper's), and of db2 wavelets on both sides; the errors are those of R l for a picture l, in
-float64. Others multiply the thresholded matrix at 1 %, each with its own sparse rows in float32, and the
-dense one. Ours is timed with vectors on the device, as inside a solve; where both sides are in wavelets a
-solve runs on the coefficients that are active, so that a product there is of the core alone: both figures
-are given.
+A corner of albedo 0.8 on a grid of 96 x 192, N = 18432: light from everywhere arrives everywhere,
+so that R has no zeros but those within rounding. Kept are the largest numbers of R itself, of its
+rows in db2 wavelets (the paper's), and of db2 wavelets on both sides; the errors are those of R l
+for a picture l, in float64. Others multiply the thresholded matrix at 1 %, each with its own sparse
+rows in float32, and the dense one. Ours is timed with vectors on the device, as inside a solve;
+where both sides are in wavelets a solve runs on the coefficients that are active, so that a product
+there is of the core alone: both figures are given.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from _coefficients import ROWS, analysis, largest, note, relative
 from _corner import interreflection
 from _harness import Options, Row, options, product, report, seconds, triad
 from _peers import missing, sparse_products
-from ltcl.compression.coefficients import coefficients
-from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
 from ltcl.scenes import landscape
+from ltcl.tasks.compression.coefficients import coefficients
+from ltcl.tasks.compression.sources import source
 
 ALBEDO, ERROR = 0.8, 0.01
 ERRORS = (0.1, 0.03, ERROR, 0.003)
@@ -42,7 +42,9 @@ OTHERS = "#ff7f9f"
 OURS_TARGET, SCIPY_TARGET = 15.0, 30.0
 
 
-Problem = namedtuple("Problem", "R grid x y")  # R (N, N) float32, a picture, and R times it in float64
+Problem = namedtuple(
+    "Problem", "R grid x y"
+)  # R (N, N) float32, a picture, and R times it in float64
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,9 @@ class Form:
         if self.into is None:
             core = CSR(given.device, numbers)
             return core, core
-        numbers, basis = (numbers, self.into) if self.out is None else restrict_to_support(numbers, self.into)
+        numbers, basis = (
+            (numbers, self.into) if self.out is None else restrict_to_support(numbers, self.into)
+        )
         core = Tiles(given.device, numbers, 8, "float16")
         return core, Compressed(core, basis if self.out else None, basis)
 
@@ -121,7 +125,9 @@ def measure(
     points = []
     for form, _, A in ways:
         error, kept = relative(A.matvec(at.x), at.y), numbers[form].nnz / len(at.x)
-        points.append(Point(form, wanted, error, kept, A.nbytes, ms[f"ours, {form}"], ms[f"core, {form}"]))
+        points.append(
+            Point(form, wanted, error, kept, A.nbytes, ms[f"ours, {form}"], ms[f"core, {form}"])
+        )
     return points, {name: ms[name] for name in others}
 
 
@@ -132,13 +138,20 @@ def compare(at: Problem, sparse: Point, best: Point, ms: dict[str, float]) -> li
     rows = []
     for how, ours in (("with transforms", best.pixels), ("in a solve", best.core)):
         for name, theirs in others.items():
-            rows.append(Row.of_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name)))
-    for name, size in (("thresholded rows of any peer", sparse.nbytes), ("dense numpy", at.R.nbytes)):
+            rows.append(
+                Row.of_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name))
+            )
+    for name, size in (
+        ("thresholded rows of any peer", sparse.nbytes),
+        ("dense numpy", at.R.nbytes),
+    ):
         rows.append(Row.of_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
     return rows
 
 
-def draw(at: Problem, points: list[Point], sparse: Point, best: Point, ms: dict[str, float]) -> Figure:
+def draw(
+    at: Problem, points: list[Point], sparse: Point, best: Point, ms: dict[str, float]
+) -> Figure:
     figure = figures.page(
         470,
         "What a product with a smooth R takes",
@@ -152,19 +165,28 @@ def draw(at: Problem, points: list[Point], sparse: Point, best: Point, ms: dict[
     time = figures.graph(figure, boxes[1], "Time", "milliseconds", "")
     for form, colour in COLOURS.items():
         mine = [point for point in points if point.form == form]
-        errors, style = [point.error for point in mine], {"color": colour, "marker": "o", "ms": 4, "lw": 2}
+        errors, style = (
+            [point.error for point in mine],
+            {"color": colour, "marker": "o", "ms": 4, "lw": 2},
+        )
         memory.loglog([point.nbytes / 1e6 for point in mine], errors, **style)
-        time.loglog([point.pixels for point in mine], errors, ls="--" if form == "both" else "-", **style)
+        time.loglog(
+            [point.pixels for point in mine], errors, ls="--" if form == "both" else "-", **style
+        )
         if form == "both":
             time.loglog([point.core for point in mine], errors, **style)
         name = FORMATS[form].replace("rows ", "rows\n").replace("sides ", "sides\n")
-        memory.text(mine[0].nbytes / 1e6, 1.15 * errors[0], name, color=colour, ha="center", fontsize=9)
+        memory.text(
+            mine[0].nbytes / 1e6, 1.15 * errors[0], name, color=colour, ha="center", fontsize=9
+        )
     peers = [(name, spent) for name, spent in ms.items() if name != "dense numpy"]
     for (name, spent), marker in zip(peers, "v^<>", strict=False):
         time.plot(spent, ERROR, marker, color=OTHERS, label=name, ms=7, zorder=4, ls="none")
     time.plot([], [], ":", color=OTHERS, lw=1, label="NumPy, dense: no error")
     fewer, faster = f"{sparse.nbytes / best.nbytes:.0f}", f"{sparse.pixels / best.core:.0f}"
-    across(memory, at.R.nbytes / 1e6, (sparse.nbytes / 1e6, best.nbytes / 1e6), f"{fewer} times less")
+    across(
+        memory, at.R.nbytes / 1e6, (sparse.nbytes / 1e6, best.nbytes / 1e6), f"{fewer} times less"
+    )
     text = f"{faster} times less,\n{sparse.pixels / best.pixels:.0f} with transforms"
     across(time, ms["dense numpy"], (sparse.pixels, best.core), text)
     figure.legend(loc="lower center", ncols=6, frameon=False, labelcolor="linecolor", fontsize=9.5)

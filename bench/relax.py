@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A Gauss-Seidel sweep, beside one product with the same matrix and beside PyAMG's; and block Gauss-Seidel.
 
-S = I + R with N = 131072 pixels and 256 nonzeros a row, in runs of 16 neighbours and at random, and a dense
-R of 4096 pixels. Ours is timed with vectors on the device, as inside a solve; PyAMG relaxes S in CSR, in
-float32 like ours. Block Gauss-Seidel is another method, of which a sweep is timed.
+S = I + R with N = 131072 pixels and 256 nonzeros a row, in runs of 16 neighbours and at random, and
+a dense R of 4096 pixels. Ours is timed with vectors on the device, as inside a solve; PyAMG relaxes
+S in CSR, in float32 like ours. Block Gauss-Seidel is another method, of which a sweep is timed.
 """
 
 from __future__ import annotations
@@ -35,14 +35,22 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
     relax = relaxation(S, "gauss_seidel")
     block = relaxation(S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
     upload = given.device.upload
-    sweeps, blocks = (Sweeps(how, upload(host), on_device, on_device.like()) for how in (relax, block))
-    full = scipy.sparse.csr_array(scipy.sparse.eye_array(n) + scipy.sparse.csr_array(R)).astype(np.float32)
+    sweeps, blocks = (
+        Sweeps(how, upload(host), on_device, on_device.like()) for how in (relax, block)
+    )
+    full = scipy.sparse.csr_array(scipy.sparse.eye_array(n) + scipy.sparse.csr_array(R)).astype(
+        np.float32
+    )
 
     def sweep(ours: Sweeps = sweeps) -> None:
         ours.sweep()
         given.device.finish()
 
-    actions: dict[str, Any] = {"product": product(S.R, b), "sweep": sweep, "block": lambda: sweep(blocks)}
+    actions: dict[str, Any] = {
+        "product": product(S.R, b),
+        "sweep": sweep,
+        "block": lambda: sweep(blocks),
+    }
     if theirs is not None:
         theirs(full, host, b)
         sweep()
@@ -53,7 +61,9 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
     sweeping, one = f"{name}, strips of {relax.block}", times["product"]
     rows = [
         Row.of_times(sweeping, "one product", one, times["sweep"], "ms", PRODUCT_TARGET),
-        Row.of_times(f"{name}, block method", "one product", one, times["block"], "ms", PRODUCT_TARGET),
+        Row.of_times(
+            f"{name}, block method", "one product", one, times["block"], "ms", PRODUCT_TARGET
+        ),
     ]
     if theirs is not None:
         target = PYAMG_TARGETS.get(name, PYAMG_DENSE)
@@ -72,7 +82,12 @@ def main() -> None:
     R = np.random.default_rng(2).random((dense, dense), dtype=np.float32) / dense
     rows += compare(given, f"dense {dense}", R, theirs)
     installed = "yes" if pyamg else "no: its rows are left out"
-    report(given, "Gauss-Seidel sweep", rows, {"pixels": n, "nonzeros a row": per_row, "PyAMG": installed})
+    report(
+        given,
+        "Gauss-Seidel sweep",
+        rows,
+        {"pixels": n, "nonzeros a row": per_row, "PyAMG": installed},
+    )
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The paper's resolution (figures 1 and 10): 131072 pixels, every one of which lights every other.
 
-A coloured corner of two walls, 256 x 256 pixels each. R has 1.7e10 numbers none of which is small beside its
-neighbours, 69 GB a colour, and is never formed:
+A coloured corner of two walls, 256 x 256 pixels each. R has 1.7e10 numbers none of which is small
+beside its neighbours, 69 GB a colour, and is never formed:
 
     A     rows from closed-form form factors, thresholded between db2 wavelets as they stream by
     R     (I - A)^-1 - I by Chebyshev's form of eq. 21, on coefficients
     T     (I + R) F, solved on coefficients
 
-A picture in colour is compensated and its bounces are separated to 1 %, the former with fewer numbers of R.
-The truth needs no inverse: of a picture l the direct light is l - A l, and bounce k + 1 is A times bounce k.
-These products take all numbers of A, by a Fourier transform along the seam.
+A picture in colour is compensated and its bounces are separated to 1 %, the former with fewer
+numbers of R. The truth needs no inverse: of a picture l the direct light is l - A l, and bounce k +
+1 is A times bounce k. These products take all numbers of A, by a Fourier transform along the seam.
 """
 
 from __future__ import annotations
@@ -31,17 +31,20 @@ from _coefficients import analysis, fewest, note, relative, transport
 from _corner import Bounce
 from _figures import Claim
 from _harness import Options, options, product, seconds
-from ltcl.compression import SparseInverse, invert_coefficients
-from ltcl.compression.coefficients import Coefficients, coefficients
-from ltcl.compression.sources import source
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
+from ltcl.tasks.compression import SparseInverse, invert_coefficients
+from ltcl.tasks.compression.coefficients import Coefficients, coefficients
+from ltcl.tasks.compression.sources import source
 
 ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
 THRESHOLD, RTOL = 2e-5, 5e-4  # of numbers of A; of solutions with R
-ERROR, SEPARATION = 1e-2, 2e-4  # wanted; of the solves from which bounces come, which are small beside them
+ERROR, SEPARATION = (
+    1e-2,
+    2e-4,
+)  # wanted; of the solves from which bounces come, which are small beside them
 SHARE = 0.6  # of the error of a pattern, what may be left out of R for it
 MEMORY = 1 << 28  # bytes of a block of rows
 BOUNCES = 2
@@ -93,7 +96,9 @@ def build(given: Options, rows: Bounce) -> Built:
             C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
             found.append(invert_coefficients(-C, rtol=RTOL))
     cores, fewer, (h, w) = [-one.D for one in found], [], rows.grid
-    with spent("what a pattern needs of R"):  # that the direct light of another picture is off by 0.6 %
+    with spent(
+        "what a pattern needs of R"
+    ):  # that the direct light of another picture is off by 0.6 %
         picture = 0.05 + 0.4 * landscape(h, w).astype(np.float64)
         grey = np.roll(picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
         exact = grey[:, None] - bounce(rows, grey[:, None])
@@ -121,7 +126,9 @@ def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]
         exact.append(bounce(rows, exact[-1]))
     parts = [separation.direct, *separation.bounces]
     pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
-    return [wanted, pattern, *parts], [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
+    return [wanted, pattern, *parts], [
+        relative(part.reshape(-1, 3), truth) for part, truth in pairs
+    ]
 
 
 def draw(names: list[str], images: list[np.ndarray]) -> Figure:
@@ -143,7 +150,10 @@ def main() -> None:
     rows = Bounce(8 if given.smoke else 256, REFERENCE)
     built = build(given, rows)
     images, errors = pictures(rows, built)
-    pixels, R = images[0].reshape(-1, 3).astype(np.float32), cast(Compressed, built.lighter.systems[0].R)
+    pixels, R = (
+        images[0].reshape(-1, 3).astype(np.float32),
+        cast(Compressed, built.lighter.systems[0].R),
+    )
 
     def solve() -> None:
         for c, S in enumerate(built.lighter.systems):
@@ -178,9 +188,13 @@ def main() -> None:
         text = f"{name} of 131072 pixels in colour"
         claims.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
     for name, most in TARGETS.items():
-        claims.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most))
+        claims.append(
+            Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most)
+        )
     title = "131072 pixels in colour"
-    figures.conclude(given, title, [] if given.smoke else claims, facts, lambda: draw(names, images))
+    figures.conclude(
+        given, title, [] if given.smoke else claims, facts, lambda: draw(names, images)
+    )
 
 
 if __name__ == "__main__":

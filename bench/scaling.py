@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How much faster two MPI ranks solve than one, and what a model says of 64 GPUs.
 
-A product over p ranks takes t(p) = a + b E / p + c N with E stored entries and N pixels: calls; the entries
-of a rank; and the vector, whole on each, which is read from the device, exchanged, written back and added to.
+A product over p ranks takes t(p) = a + b E / p + c N with E stored entries and N pixels: calls; the
+entries of a rank; and the vector, whole on each, which is read from the device, exchanged, written
+back and added to.
 
-Products wait for memory, which cores share. The limit is what two ranks gain where they do nothing but read
-the same numbers, half of them each, in the same turns; beside it stands that of the triad, which also writes.
+Products wait for memory, which cores share. The limit is what two ranks gain where they do nothing
+but read the same numbers, half of them each, in the same turns; beside it stands that of the triad,
+which also writes.
 """
 
 from __future__ import annotations
@@ -37,14 +39,23 @@ LARGE = 1 << 25  # entries, from which on two ranks must be 1.8 times as fast
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "OMP_NUM_THREADS": "1"}
 ROUNDS, BLOCK, PRODUCTS = 11, 256, 4
 GPUS, MEMORY, BUS, STEP = 64, 0.8 * 3.35e12, 25e9, 5e-6  # bytes a second, and seconds
-ASSUMED = "a GPU a rank, 80 % of 3.35 TB/s; bus and network 25 GB/s; log2 p steps of 5 us; a as here"
+ASSUMED = (
+    "a GPU a rank, 80 % of 3.35 TB/s; bus and network 25 GB/s; log2 p steps of 5 us; a as here"
+)
 
 
 def mpi(given: Options) -> tuple[list[Row], dict[str, Any]]:
     """Two ranks, a core and a thread each, in one run; rows and facts of the report."""
     sizes, rows, facts = SIZES[given.smoke], [], {}
     launcher = Path(sys.executable).with_name("mpiexec")
-    command = [str(launcher if launcher.exists() else "mpiexec"), "-n", "2", sys.executable, "-m", "mpi4py"]
+    command = [
+        str(launcher if launcher.exists() else "mpiexec"),
+        "-n",
+        "2",
+        sys.executable,
+        "-m",
+        "mpi4py",
+    ]
     command += [__file__, "rank", json.dumps(sizes)]
     run = subprocess.run(command, env=os.environ | ONE_THREAD, check=True, stdout=subprocess.PIPE)  # noqa: S603
     for (n, k), times in zip(sizes, found := json.loads(run.stdout), strict=True):
@@ -52,8 +63,12 @@ def mpi(given: Options) -> tuple[list[Row], dict[str, Any]]:
             pair = times[f"solve {who}"], times["solve 2 ranks"]
             rows.append(Row.of_times(f"Chebyshev by 2 ranks, {n} x {k}", who, *pair, "s", target))
         for what in ("reading the same", "triad"):
-            limit, gain = (times[f"{each} 1 rank"] / times[f"{each} 2 ranks"] for each in (what, "solve"))
-            rows.append(Row(f"gain by 2 ranks, {n} x {k}", what, limit, gain, "times", gain / limit))
+            limit, gain = (
+                times[f"{each} 1 rank"] / times[f"{each} 2 ranks"] for each in (what, "solve")
+            )
+            rows.append(
+                Row(f"gain by 2 ranks, {n} x {k}", what, limit, gain, "times", gain / limit)
+            )
         facts[f"Allgatherv of {n}, ms"] = 1e3 * times["exchange"]
         facts[f"relative difference from the solution without MPI, {n} x {k}"] = times["difference"]
     terms = [[1.0, n * k / p, n] for n, k in sizes[:-1] for p in (1, 2, 4)]
@@ -67,7 +82,9 @@ def model(terms: np.ndarray, times: np.ndarray) -> dict[str, Any]:
     """a, b and c, at least 0, by least squares of relative deviations, and what follows for GPUs."""
     shares = terms / times[:, None]
     a, b, c = scipy.optimize.nnls(shares, np.ones(len(times)))[0]
-    facts: dict[str, Any] = {"a in us, b and c in ns": f"{1e6 * a:.3g}, {1e9 * b:.3g}, {1e9 * c:.3g}"}
+    facts: dict[str, Any] = {
+        "a in us, b and c in ns": f"{1e6 * a:.3g}, {1e9 * b:.3g}, {1e9 * c:.3g}"
+    }
     facts["largest relative deviation of the model"] = float(np.abs(shares @ (a, b, c) - 1.0).max())
     facts["4 ranks are measured on 2 cores"] = "a quarter of the rows and whole vectors on each"
     n = 131_072
@@ -101,7 +118,9 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
     operators["2 ranks"] = Distributed(comm, own)
     if entries < n:
         empty = scipy.sparse.csr_array((half - half // 2, n), dtype=np.float32)
-        operators["4 ranks"] = Distributed(comm, scipy.sparse.vstack([own[: half // 2], empty], "csr"))
+        operators["4 ranks"] = Distributed(
+            comm, scipy.sparse.vstack([own[: half // 2], empty], "csr")
+        )
     mine, whole = np.zeros(half, np.float32), np.zeros(n, np.float32)
 
     def solve(A: Any) -> np.ndarray:
@@ -111,7 +130,9 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
         for _ in range(PRODUCTS):
             A.apply(x).device.finish()
 
-    actions: dict[str, Any] = {"exchange": lambda: [comm.Allgatherv(mine, whole) for _ in range(PRODUCTS)]}
+    actions: dict[str, Any] = {
+        "exchange": lambda: [comm.Allgatherv(mine, whole) for _ in range(PRODUCTS)]
+    }
     for who in ("no MPI", "1 rank", "2 ranks", "4 ranks"):
         A = operators.get(who)
         actions[f"product {who}"] = A and partial(product, A, A.device.upload(b))
@@ -124,10 +145,14 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
             each.max()
 
     for what, half_of in (("reading the same", read), ("triad", triad_of_half)):
-        actions[f"{what} 1 rank"] = comm.rank == 0 and (lambda half_of=half_of: (half_of(), half_of()))
+        actions[f"{what} 1 rank"] = comm.rank == 0 and (
+            lambda half_of=half_of: (half_of(), half_of())
+        )
         actions[f"{what} 2 ranks"] = lambda half_of=half_of: (half_of(), comm.Barrier())
     times = paired(comm, actions)
-    times |= {name: t / PRODUCTS for name, t in times.items() if name.startswith(("product", "exchange"))}
+    times |= {
+        name: t / PRODUCTS for name, t in times.items() if name.startswith(("product", "exchange"))
+    }
     answers = [solve(operators[who]) for who in ("2 ranks", "no MPI") if who in operators]
     return times | {
         "difference": float(np.linalg.norm(answers[0] - answers[-1]) / np.linalg.norm(answers[0]))

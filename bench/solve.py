@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A solve to 1 %: products and time, beside the Neumann series and GMRES of NumPy and SciPy.
 
-A closed box of 4056 pixels (dense) and a sparse R of 131072 pixels, 256 nonzeros a row in runs of 16, both of
-rho(R) = 0.8, where the paper's series still converges; a box with rho(R) = 4, where it does not; and 3 and 8
-right-hand sides at once. Ours is `ltcl.solve` as it is called, `auto`, transfers included; operators lie on
-the device and were surveyed before. Competitors get float32. Every solution is checked in float64.
+A closed box of 4056 pixels (dense) and a sparse R of 131072 pixels, 256 nonzeros a row in runs of
+16, both of rho(R) = 0.8, where the paper's series still converges; a box with rho(R) = 4, where it
+does not; and 3 and 8 right-hand sides at once. Ours is `ltcl.solve` as it is called, `auto`,
+transfers included; operators lie on the device and were surveyed before. Competitors get float32.
+Every solution is checked in float64.
 """
 
 from __future__ import annotations
@@ -85,7 +86,9 @@ def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
 
 def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
     R, identity = problem.R, scipy.sparse.eye_array(problem.R.shape[0]).astype(np.float32)
-    full = scipy.sparse.csr_array(identity + R) if scipy.sparse.issparse(R) else R + identity.toarray()
+    full = (
+        scipy.sparse.csr_array(identity + R) if scipy.sparse.issparse(R) else R + identity.toarray()
+    )
     first = 1e3 * ltcl.solve(problem.S, problem.b, rtol=RTOL).seconds  # builds kernels, tunes
     ours = [ltcl.solve(problem.S, problem.b, rtol=RTOL) for _ in range(2)][1]  # surveys S
     series, products = neumann(problem)
@@ -100,12 +103,19 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
         "gmres": lambda: scipy_gmres(problem, full),
     }
     times = {name: 1e3 * spent for name, spent in seconds(actions, repeats=REPEATS).items()}
-    loop, name = f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop", problem.name
+    loop, name = (
+        f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop",
+        problem.name,
+    )
     of_neumann, of_gmres = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
-    new = [Row.of_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (problem.b.ndim == 1)
+    new = [Row.of_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (
+        problem.b.ndim == 1
+    )
     return [
         *new,
-        Row.of_times(name, "Neumann's products", products, ours.products, "products", PRODUCTS_TARGET),
+        Row.of_times(
+            name, "Neumann's products", products, ours.products, "products", PRODUCTS_TARGET
+        ),
         Row.of_times(name, loop, times["neumann"], times["ours"], "ms", of_neumann),
         Row.of_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", of_gmres),
     ]
@@ -114,7 +124,9 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
 def main() -> None:
     given, facts = options(__doc__ or ""), {}
     R = matrix(2048, 32, 16) if given.smoke else matrix(131072, 256, 16)
-    R.data *= np.repeat(0.8 / R.sum(axis=1), np.diff(R.indptr)).astype(np.float32)  # row sums are rho(R)
+    R.data *= np.repeat(0.8 / R.sum(axis=1), np.diff(R.indptr)).astype(
+        np.float32
+    )  # row sums are rho(R)
     dense, S = box(given, 0.8), IdentityPlus(CSR(given.device, R))
     large = problem(f"sparse {R.shape[0]}, rho 0.8", R, S)
     rows = compare(dense, facts) + compare(large, facts)

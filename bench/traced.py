@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Deviations, denoising and `rtol="noise"` of path-traced transports, judged by independent measurements.
 
-Mitsuba traces (`scenes.tracing`) a corner, a box, and a box with blocks ten times each. Twice, one is judged
-by the mean of eight others, whose own errors are taken off all ratios; with the noise that T tells itself,
-and with that of the tenth. Deviations over errors: root mean squares over pixels, under white. Errors
-denoised and compressed, over those before: of ten patterns of each kind, and of bounces of one of each.
-Also, what no measurement mends: the bounces of one view, by its `first_bounce`, against those traced.
+Mitsuba traces (`scenes.tracing`) a corner, a box, and a box with blocks ten times each. Twice, one
+is judged by the mean of eight others, whose own errors are taken off all ratios; with the noise
+that T tells itself, and with that of the tenth. Deviations over errors: root mean squares over
+pixels, under white. Errors denoised and compressed, over those before: of ten patterns of each
+kind, and of bounces of one of each. Also, what no measurement mends: the bounces of one view, by
+its `first_bounce`, against those traced.
 """
 
 from __future__ import annotations
@@ -26,9 +27,14 @@ from denoise import QUANTITIES, patterns
 from scenes import tracing
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from tests.noise.measured import measure, noise_of, truth
+from tests.transport.noise.measured import measure, noise_of, truth
 
-GRID, PATHS, SEEDS, JUDGED = (32, 32), 2560, 10, 2  # as many paths an entry of T as in compression.py
+GRID, PATHS, SEEDS, JUDGED = (
+    (32, 32),
+    2560,
+    10,
+    2,
+)  # as many paths an entry of T as in compression.py
 OWN = 1.0 / (SEEDS - 1)  # share of the truth's own errors in the variance of those against it
 PARTS = ("direct", "bounce 1", "bounce 2", "bounce 3", "pattern", "appearance")
 LIMITS: dict[str, Any] = {
@@ -72,7 +78,9 @@ def errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     """Relative ones of `QUANTITIES`: T p of ten patterns of each kind; bounces of pictures of one of each."""
     kinds = patterns(T.grid)
     image = true @ np.stack([kind[0] for kind in kinds])
-    ours, exact = ([*(A @ kind for kind in kinds), *ltcl.separate(A, image, 3).bounces] for A in (T, true))
+    ours, exact = (
+        [*(A @ kind for kind in kinds), *ltcl.separate(A, image, 3).bounces] for A in (T, true)
+    )
     return norms(a - b for a, b in zip(ours, exact, strict=True)) / norms(exact)
 
 
@@ -100,19 +108,27 @@ def main() -> None:
             first, second, *others = measured[k:] + measured[:k]
             true = ltcl.Transport(np.mean([T.to_numpy() for T in others], axis=0), first.grid)
             for noise, values in zip((None, second), found.values(), strict=True):
-                values.append(judge(ltcl.Transport(first.to_numpy(), first.grid, noise=noise), true))
+                values.append(
+                    judge(ltcl.Transport(first.to_numpy(), first.grid, noise=noise), true)
+                )
         for way, values in found.items():
             *columns, raw, rows = (np.array(each) for each in zip(*values, strict=True))
             errors_of_T = zip(QUANTITIES, raw.max(axis=0), strict=True)
-            facts[f"{scene}: relative errors"] = ", ".join(f"{name} {x:.2%}" for name, x in errors_of_T)
+            facts[f"{scene}: relative errors"] = ", ".join(
+                f"{name} {x:.2%}" for name, x in errors_of_T
+            )
             facts[f"{scene}, {way}: bytes a row"] = float(rows.max())
             half += list((columns[1] <= 0.5).ravel())
             for (text, (names, least, most)), x in zip(LIMITS.items(), columns, strict=True):
                 cells = zip(names, x.min(axis=0), x.max(axis=0), strict=True)
                 listed = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in cells)
                 holds = bool(((least <= x) & (x <= most)).all())
-                claims.append(Claim(f"{scene}, {way}: {text}", listed, f"{least:g} to {most:g}", holds))
-    claims.append(Claim("denoised: at most half is left", f"{sum(half)} of {len(half)}", "all", all(half)))
+                claims.append(
+                    Claim(f"{scene}, {way}: {text}", listed, f"{least:g} to {most:g}", holds)
+                )
+    claims.append(
+        Claim("denoised: at most half is left", f"{sum(half)} of {len(half)}", "all", all(half))
+    )
     figures.conclude(given, "Path-traced transports", [] if given.smoke else claims, facts, Figure)
 
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Whether standard deviations of patterns and bounces are as large as errors, and what they cost.
 
-Five scenes are measured 200 times at each of three levels of noise: a floor of 1e-4, 1e-3 and 1e-2 of the
-median first bounce, and as much photon noise at that light. The pattern of a picture, not clipped, and its
-bounces 0 to 3 are compared with those of the T without noise, in float64. Of the errors 68 % should be within
-one standard deviation, 95 % within two. Cost: `std` over the task it belongs to, in seconds.
+Five scenes are measured 200 times at each of three levels of noise: a floor of 1e-4, 1e-3 and 1e-2
+of the median first bounce, and as much photon noise at that light. The pattern of a picture, not
+clipped, and its bounces 0 to 3 are compared with those of the T without noise, in float64. Of the
+errors 68 % should be within one standard deviation, 95 % within two. Cost: `std` over the task it
+belongs to, in seconds.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from _figures import Claim
 from _harness import options, seconds
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from tests.noise.measured import SCENES, measure, noise_of, truth
+from tests.transport.noise.measured import SCENES, measure, noise_of, truth
 
 LEVELS = (1e-4, 1e-3, 1e-2)
 NAMES = ("pattern", "bounce 0", "bounce 1", "bounce 2", "bounce 3")
-WANTED, MOST = (0.68, 0.95), (0.05, 0.03)  # within one and two deviations; by how much shares may differ
+WANTED, MOST = (
+    (0.68, 0.95),
+    (0.05, 0.03),
+)  # within one and two deviations; by how much shares may differ
 COST = 5.0  # times the task, at most
 
 
@@ -86,7 +90,9 @@ def claims(shares: dict[tuple[str, float], np.ndarray], ratios: dict[str, float]
             title = f"{name}: errors within {n + 1} standard deviation{'s' * n}"
             listed.append(Claim(title, text, f"{wanted:.0%} +- {most:.0%} in all cases", holds))
     for name, ratio in ratios.items():
-        listed.append(Claim(f"{name}: std over the task", f"{ratio:.1f}", f"at most {COST:g}", ratio <= COST))
+        listed.append(
+            Claim(f"{name}: std over the task", f"{ratio:.1f}", f"at most {COST:g}", ratio <= COST)
+        )
     return listed
 
 
@@ -97,10 +103,17 @@ def main() -> None:
     scenes, repetitions = (SCENES[:1], 2) if given.smoke else (SCENES, 200)
     shares = {(s, level): coverage(s, level, repetitions) for s in scenes for level in LEVELS}
     listed = claims(shares, costs(6 if given.smoke else 32, given.smoke))
-    facts: dict[str, Any] = {"repetitions": repetitions, "pixels": max(truth(s).shape[1] for s in scenes)}
+    facts: dict[str, Any] = {
+        "repetitions": repetitions,
+        "pixels": max(truth(s).shape[1] for s in scenes),
+    }
     for (scene, level), each in shares.items():
-        facts[f"{scene}, {level:g}: within 1 and 2"] = ", ".join(f"{a:.1%} {b:.1%}" for a, b in each)
-    figures.conclude(given, "Uncertainty, pixel by pixel", [] if given.smoke else listed, facts, Figure)
+        facts[f"{scene}, {level:g}: within 1 and 2"] = ", ".join(
+            f"{a:.1%} {b:.1%}" for a, b in each
+        )
+    figures.conclude(
+        given, "Uncertainty, pixel by pixel", [] if given.smoke else listed, facts, Figure
+    )
 
 
 if __name__ == "__main__":

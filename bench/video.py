@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Video: frames a second from decoded sRGB codes to the 8-bit codes of the projector, 256 x 512 in colour.
 
-T is as `ltcl.compress` makes it of a smooth scene: db2 wavelets on both sides, with a core of some thousand
-coarse coefficients, ten numbers a row. Frames drift slowly and are compensated one by one, and by eights
-as `ltcl.batch.compensate_frames` does, which is timed with its pictures on disk.
+T is as `ltcl.compress` makes it of a smooth scene: db2 wavelets on both sides, with a core of some
+thousand coarse coefficients, ten numbers a row. Frames drift slowly and are compensated one by one,
+and by eights as `ltcl.batch.compensate_frames` does, which is timed with its pictures on disk.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ NUMBERS, RTOL, BATCH = 10, 1e-2, 8
 SOLVES, KEPT = 60.0, 120.0  # frames a second
 TO_LINEAR = ltcl.images.from_srgb(np.arange(256, dtype=np.float32) / 255)
 STEPS = 4095  # of light between 0 and 1, of which each has a code
-TO_CODES = np.rint(255 * ltcl.images.to_srgb(np.linspace(0, 1, STEPS + 1, dtype=np.float32))).astype(np.uint8)
+TO_CODES = np.rint(
+    255 * ltcl.images.to_srgb(np.linspace(0, 1, STEPS + 1, dtype=np.float32))
+).astype(np.uint8)
 
 
 def transport(given: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> ltcl.Transport:
@@ -86,7 +88,9 @@ def main() -> None:
     for name, time in spent.items():
         rate, target = BATCH / time, KEPT if name.startswith("inverse") else SOLVES
         goal = None if "png" in name else 1.0
-        rows.append(Row(name, f"{target:g} frames/s", target, rate, "frames/s", rate / target, goal))
+        rows.append(
+            Row(name, f"{target:g} frames/s", target, rate, "frames/s", rate / target, goal)
+        )
     done = ltcl.compensate(T, TO_LINEAR[film(T, 1)[0]], rtol=RTOL, clamp=True)
     solutions = done.solution if isinstance(done.solution, tuple) else (done.solution,)
     facts = {

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The viewer in Chromium on the same machine: from a pointer or a slider to pixels of the canvas.
 
-T is that of `resolution131k.py`, 256 x 512 pixels in colour, in the numbers that pictures need to 1 %; it
-takes minutes to make, and is kept in ltcl's cache folder. The small one is made in the same way, of 48 x 96,
-more pixels than 64 x 64. Events are sent to the page's own elements; an answer counts when its canvas is
-drawn. A film of 30 frames a second is played with a kept inverse.
+T is that of `resolution131k.py`, 256 x 512 pixels in colour, in the numbers that pictures need to 1
+%; it takes minutes to make, and is kept in ltcl's cache folder. The small one is made in the same
+way, of 48 x 96, more pixels than 64 x 64. Events are sent to the page's own elements; an answer
+counts when its canvas is drawn. A film of 30 frames a second is played with a kept inverse.
 
-Chromium is asked by its protocol, for results only: Playwright has it copy each frame of a socket to its own
-process, which takes as long as all the rest.
+Chromium is asked by its protocol, for results only: Playwright has it copy each frame of a socket
+to its own process, which takes as long as all the rest.
 """
 
 from __future__ import annotations
@@ -38,13 +38,19 @@ from _harness import Options, options
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.scenes import landscape
+from ltcl.show.window import Window, play
 from ltcl.viewer.answers import Scene
-from ltcl.viewer.window import Window, play
 
 FLAGS = ["--headless=new", "--remote-debugging-port=0", "--window-size=1280,900", "--no-sandbox"]
 FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
 FLAGS += ["--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"]
-PROBE_MS, PAINT, SLIDE, PLAY, FIRST = 60.0, 25.0, 30.0, 24.0, 3.0  # targets; frames a second, seconds
+PROBE_MS, PAINT, SLIDE, PLAY, FIRST = (
+    60.0,
+    25.0,
+    30.0,
+    24.0,
+    3.0,
+)  # targets; frames a second, seconds
 SMALL_MS, FPS, PATIENCE = 20.0, 30.0, 60.0
 MOVES, FRAMES, STARTS = 100, 150, 3
 PROBE = """async (count) => {
@@ -100,7 +106,9 @@ class Chromium(contextlib.AbstractContextManager):
         names = ("chromium", "chromium-browser", "google-chrome")
         program = next(filter(None, map(shutil.which, names)), "chromium")
         self._closed = contextlib.ExitStack()
-        folder = Path(self._closed.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+        folder = Path(
+            self._closed.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
+        )
         words = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
         process = subprocess.Popen(words, stderr=subprocess.DEVNULL)  # noqa: S603 - ours
         self._closed.callback(process.wait)
@@ -110,8 +118,12 @@ class Chromium(contextlib.AbstractContextManager):
             if time.monotonic() > end:
                 raise TimeoutError(f"{program} does not start")
             time.sleep(0.05)
-        with urllib.request.urlopen(f"http://127.0.0.1:{port.read_text().split()[0]}/json/list") as answer:
-            url = next(page["webSocketDebuggerUrl"] for page in json.load(answer) if page["type"] == "page")
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{port.read_text().split()[0]}/json/list"
+        ) as answer:
+            url = next(
+                page["webSocketDebuggerUrl"] for page in json.load(answer) if page["type"] == "page"
+            )
         self._socket, self._asked = self._closed.enter_context(connect(url, max_size=None)), 0
 
     def __exit__(self, *_: object) -> None:
@@ -133,7 +145,9 @@ class Chromium(contextlib.AbstractContextManager):
     def evaluate(self, function: str, *arguments: Any) -> Any:
         """What a JavaScript function of the page returns, awaited."""
         call = f"({function})({', '.join(map(json.dumps, arguments))})"
-        found = self._ask("Runtime.evaluate", expression=call, awaitPromise=True, returnByValue=True)
+        found = self._ask(
+            "Runtime.evaluate", expression=call, awaitPromise=True, returnByValue=True
+        )
         if "exceptionDetails" in found:
             raise RuntimeError(found["exceptionDetails"])
         return found["result"].get("value")
@@ -174,7 +188,8 @@ def first_picture(page: Chromium, T: ltcl.Transport, folder: Path) -> float:
 def touch(page: Chromium, T: ltcl.Transport, given: Options) -> tuple[float, float, float, float]:
     """The 95th percentile of ms from pointer to column; frames a second of painting and of sliders.
 
-    And the viewer's own ms of a processor for a column, which other work on the machine hardly changes.
+    And the viewer's own ms of a processor for a column, which other work on the machine hardly
+    changes.
     """
     seconds, moves = (0.5, 5) if given.smoke else (5.0, MOVES)
     with ltcl.view(T, {"landscape": landscape(*T.grid)}, open_browser=False) as viewer:
@@ -202,7 +217,9 @@ def playing(page: Chromium, T: ltcl.Transport, folder: Path, given: Options) -> 
     rules: Any = {"rtol": video.RTOL, "inverse": ltcl.invert(T, video.RTOL)}
     with Window("film", open_browser=False) as window:
         page.open(f"{window.url}#projector")
-        return play(Scene(T, "T", {}, None), open_frames(folder / "film.mkv"), window, 1.0, nothing, **rules)
+        return play(
+            Scene(T, "T", {}, None), open_frames(folder / "film.mkv"), window, 1.0, nothing, **rules
+        )
 
 
 def nothing(*_: Any, **__: Any) -> None:
@@ -225,7 +242,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name, Chromium() as page:
         probe, painting, sliding, busy = touch(page, large, given)
         small_probe, small_painting, small_sliding, small_busy = touch(page, small, given)
-        starts = [first_picture(page, large, Path(name)) for _ in range(1 if given.smoke else STARTS)]
+        starts = [
+            first_picture(page, large, Path(name)) for _ in range(1 if given.smoke else STARTS)
+        ]
         film = playing(page, large, Path(name), given)
     first, often = float(np.median(starts)), 1e3 / SMALL_MS
     size, small_size = ("{} x {}".format(*T.grid) for T in (large, small))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Steps of random walks over the rows of R, beside a walker in Numba.
 
-R has 131072 pixels and 100 nonzeros a row at random places. Walks start at every pixel, go on with chance
-1/2 (m = 1/3), and score at every step. Both draw by |R_ij| and alias tables, Numba in a `prange` over pixels.
-One walk for three colours is measured beside three walks, of R whose rows have albedos of their own in each
-colour and whose entries differ by a tenth; its steps count for all three. Walks are checked against a float64
-solution.
+R has 131072 pixels and 100 nonzeros a row at random places. Walks start at every pixel, go on with
+chance 1/2 (m = 1/3), and score at every step. Both draw by |R_ij| and alias tables, Numba in a
+`prange` over pixels. One walk for three colours is measured beside three walks, of R whose rows
+have albedos of their own in each colour and whose entries differ by a tenth; its steps count for
+all three. Walks are checked against a float64 solution.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ GO_ON = 0.5
 STEPS = 1.0 / (1.0 - GO_ON)  # of a walk, in the mean
 
 
-def numba_walker(R: Any, b: np.ndarray, made: Tables, samples: int) -> Callable[[], np.ndarray] | None:
+def numba_walker(
+    R: Any, b: np.ndarray, made: Tables, samples: int
+) -> Callable[[], np.ndarray] | None:
     """The same by alias tables, or None where Numba is not installed (the extra `bench` brings it)."""
     if "numba" in missing():
         return None
@@ -72,7 +74,10 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
         host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
         Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
     b, lengths = random.random((n, 3), dtype=np.float32), Lengths.geometric(GO_ON, -1.0)
-    of_light = [(linked(Rs, (1.0, 1.0, 1.0)), b), *((tables(M), l) for M, l in zip(Rs, b.T, strict=True))]
+    of_light = [
+        (linked(Rs, (1.0, 1.0, 1.0)), b),
+        *((tables(M), l) for M, l in zip(Rs, b.T, strict=True)),
+    ]
     walkers = [(Walker(made, lengths, 0), given.device.upload(light)) for made, light in of_light]
 
     def walk(some: list[Any]) -> list[Any]:
@@ -87,20 +92,30 @@ def main() -> None:
     given = options(__doc__ or "")
     n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
     R, b = matrix(n, per_row, 1), np.random.default_rng(2).random(n, dtype=np.float32)
-    values = np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz)  # a fifth negative; row sums around 0.45
+    values = np.random.default_rng(0).uniform(
+        -0.3, 1.2, R.nnz
+    )  # a fifth negative; row sums around 0.45
     R.data = (values / per_row).astype(np.float32)
     made, light, pixels = Tables(CSR(given.device, R)), given.device.upload(b), np.arange(n)
     walker = Walker(made, Lengths.geometric(GO_ON, -1.0), 0)
-    actions: dict[str, Callable[[], Any]] = {"ours": lambda: walker.rows(light, pixels, samples).mean}
+    actions: dict[str, Callable[[], Any]] = {
+        "ours": lambda: walker.rows(light, pixels, samples).mean
+    }
     if (theirs := numba_walker(R, b, made, samples)) is not None:
         actions["Numba alias"] = theirs
-    exact = scipy.sparse.linalg.bicgstab(scipy.sparse.eye_array(n) + R.astype(float), b, rtol=1e-8)[0] - b
+    exact = (
+        scipy.sparse.linalg.bicgstab(scipy.sparse.eye_array(n) + R.astype(float), b, rtol=1e-8)[0]
+        - b
+    )
     for name, action in actions.items():  # nobody is timed doing less
         if abs(float(np.mean(action() - exact))) > 5.0 / (n * samples) ** 0.5:
             raise SystemExit(f"the walks of {name} do not lead to the solution")
     rate = {name: samples * n * STEPS / time / 1e6 for name, time in seconds(actions).items()}
     ours = rate.pop("ours")
-    rows = [Row("steps of walks", who, peer, ours, "M/s", ours / peer, TARGET) for who, peer in rate.items()]
+    rows = [
+        Row("steps of walks", who, peer, ours, "M/s", ours / peer, TARGET)
+        for who, peer in rate.items()
+    ]
     facts = {
         "pixels": n,
         "nonzeros": R.nnz,

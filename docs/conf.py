@@ -17,7 +17,10 @@ from sphinx.application import Sphinx
 import ltcl
 
 DOCS = Path(__file__).resolve().parent
-sys.path += [str(DOCS), str(DOCS.parent / "bench")]  # gallery_figures; what the paper's figures share with it
+sys.path += [
+    str(DOCS),
+    str(DOCS.parent / "bench"),
+]  # gallery_figures; what the paper's figures share with it
 
 project = "ltcl"
 author = "ltcl developers"
@@ -36,7 +39,8 @@ extensions = [
 templates_path = ["templates"]
 default_role = "py:obj"  # `compensate` in a docstring is a link
 nitpicky = False  # types in docstrings are words, not names
-# Sphinx-gallery reads these, and writes pages below `auto_`; one on times would load scripts from elsewhere.
+# Sphinx-gallery reads these, and writes pages below `auto_`; one on times would load scripts from
+# elsewhere.
 exclude_patterns = ["tutorials", "examples", "**sg_execution_times.rst"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """For sphinx-gallery: every figure that a block of an example leaves in a variable, drawn without pyplot.
 
-Each picture in a figure is saved, too, not to be shown but as a thumbnail: of a first figure with three
-pictures `sphinx_gallery_thumbnail_number` is 1 for all of it and 2 to 4 for these.
+Each picture in a figure is saved, too, not to be shown but as a thumbnail: of a first figure with
+three pictures `sphinx_gallery_thumbnail_number` is 1 for all of it and 2 to 4 for these.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def scrape(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any])
                 if picture.get_array().ndim == 3:
                     values = picture.to_rgba(picture.get_array(), bytes=True, norm=False)
                     Image.fromarray(values).save(next(block_vars["image_path_iterator"]))
-    return figure_rst(paths, gallery_conf["src_dir"], ", ".join(filter(None, titles)).replace("\n", " "))
+    return figure_rst(
+        paths, gallery_conf["src_dir"], ", ".join(filter(None, titles)).replace("\n", " ")
+    )
 
 
 def _get_sg_image_scraper() -> Callable[..., str]:

@@ -56,7 +56,11 @@ def fields() -> str:
     """A section for each command, then one for each part that several have: fields, types, meanings."""
     parts = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
     program: Any = typer.main.get_command(app)
-    named = {label: words for name, each in program.commands.items() for label, words in _names(name, each)}
+    named = {
+        label: words
+        for name, each in program.commands.items()
+        for label, words in _names(name, each)
+    }
     lines = []
     for name, schema in sorted(parts.items(), key=lambda part: [*named, part[0]].index(part[0])):
         title = f"ltcl {named[name]}" if name in named else _words(name)
@@ -70,7 +74,9 @@ def fields() -> str:
 def _names(name: str, command: Any) -> list[tuple[str, str]]:
     """Parts of the schema, and words of the command line, of a command and those below it."""
     inner = getattr(command, "commands", {}).items()
-    return [(f"{name}-{part}", f"{name} {part}") for part, each in inner if not each.hidden] or [(name, name)]
+    return [(f"{name}-{part}", f"{name} {part}") for part, each in inner if not each.hidden] or [
+        (name, name)
+    ]
 
 
 def _rows(schema: dict[str, Any], path: str, parts: dict[str, Any]) -> Iterator[str]:
@@ -85,8 +91,13 @@ def _rows(schema: dict[str, Any], path: str, parts: dict[str, Any]) -> Iterator[
     for name, field in schema.get("properties", {}).items():
         place = f"{path}.{name}".removeprefix(".")
         maybe = "" if name in required else ", not always there"
-        text = field.get("description") or parts[field["$ref"].split("/")[-1]]["description"].split(". ")[0]
-        values = ", ".join(f"`{value}`" for value in field.get("enum", ()) if isinstance(value, str))
+        text = (
+            field.get("description")
+            or parts[field["$ref"].split("/")[-1]]["description"].split(". ")[0]
+        )
+        values = ", ".join(
+            f"`{value}`" for value in field.get("enum", ()) if isinstance(value, str)
+        )
         text += f" One of {values}." * bool(values)
         yield f"| `{place}` | {_type(field)}{maybe} | {text} |"
         yield from _rows(field, place, parts)

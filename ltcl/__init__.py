@@ -1,35 +1,41 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """ltcl: inverse light transport on any OpenCL device.
 
-A projector lights a concave, coloured scene; light bounces before the camera sees it: picture = T pattern.
-ltcl undoes the bounces with matrix-vector products only.
+A projector lights a concave, coloured scene; light bounces before the camera sees it: picture = T
+pattern. ltcl undoes the bounces with matrix-vector products only.
 
-    T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40, sides=3).transport()
-    T = ltcl.acquire(rig, store="scan.zarr")   # any projector and camera; stopped and resumed at will
-    T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of N^2, pictures within 1 %
-    c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
-    b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
+    T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40,
+    sides=3).transport() T = ltcl.acquire(rig, store="scan.zarr")   # any projector and camera;
+    stopped and resumed at will T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of
+    N^2, pictures within 1 % c = ltcl.compensate(T, desired)            # c.pattern makes the wall
+    look like `desired` b = ltcl.separate(T, image)                # b.direct, b.bounces: each
+    bounce as its own picture
 
-After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport, IEEE PAMI
-2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL driver.
+After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport,
+IEEE PAMI 2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL
+driver.
 """
 
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from ltcl import errors
-from ltcl.analysis import Analysis, analyze
-from ltcl.compensation import Compensation, compensate
-from ltcl.compression import Compression, compress, invert
-from ltcl.denoising import denoise
+from ltcl.batch import cluster
 from ltcl.device import Device, list_devices, open_device
-from ltcl.relighting import relight
-from ltcl.separation import Separation, separate
 from ltcl.solvers import Inverse, Solution, Status, solve
 from ltcl.store import load, load_inverse, save, save_inverse
-from ltcl.transport import Transport
+from ltcl.tasks import compensation, compression
+from ltcl.tasks.analysis import Analysis, analyze
+from ltcl.tasks.compensation import Compensation, compensate
+from ltcl.tasks.compression import Compression, compress, invert
+from ltcl.tasks.denoising import denoise
+from ltcl.tasks.relighting import relight
+from ltcl.tasks.separation import Separation, separate
+from ltcl.transport import noise
+from ltcl.transport.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
@@ -73,6 +79,15 @@ __all__ = [
     "theory",
     "view",
 ]
+
+# What moved into folders keeps its public import path.
+_PUBLIC_PATHS = {
+    "ltcl.cluster": cluster,
+    "ltcl.compensation": compensation,
+    "ltcl.compression": compression,
+    "ltcl.noise": noise,
+}
+sys.modules.update(_PUBLIC_PATHS)
 
 _LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
 _FUNCTIONS = {"acquire": "acquisition", "view": "viewer"}

@@ -35,8 +35,14 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
             return array
     bad = np.argwhere(~np.isfinite(array)).tolist()
     if bad:
-        place = f", the first at {bad[0][0] if array.ndim == 1 else tuple(bad[0])}" if array.ndim else ""
-        raise InputError(f"{name} has {len(bad)} NaN or infinite value(s){place}; all must be finite")
+        place = (
+            f", the first at {bad[0][0] if array.ndim == 1 else tuple(bad[0])}"
+            if array.ndim
+            else ""
+        )
+        raise InputError(
+            f"{name} has {len(bad)} NaN or infinite value(s){place}; all must be finite"
+        )
     return array
 
 
@@ -49,7 +55,9 @@ def real(name: str, value: Any) -> np.ndarray:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise InputError(f"{name} is ragged; it must be a rectangular array of real numbers") from error
+        raise InputError(
+            f"{name} is ragged; it must be a rectangular array of real numbers"
+        ) from error
     if array.dtype.kind not in "fiub":
         wrong = "is None" if value is None else f"holds {array.dtype}"
         raise InputTypeError(f"{name} {wrong}; it must hold real numbers")
@@ -59,14 +67,20 @@ def real(name: str, value: Any) -> np.ndarray:
 def unmasked(name: str, value: Any) -> None:
     """Refuse an array with masked values, or a list of such rows: np.asarray would drop the mask."""
     rows = value if isinstance(value, (list, tuple)) else [value]
-    if masked := sum(int(np.ma.count_masked(row)) for row in rows if isinstance(row, np.ma.MaskedArray)):
-        raise InputTypeError(f"{name} has {masked} masked value(s); fill them first, as with .filled(0)")
+    if masked := sum(
+        int(np.ma.count_masked(row)) for row in rows if isinstance(row, np.ma.MaskedArray)
+    ):
+        raise InputTypeError(
+            f"{name} has {masked} masked value(s); fill them first, as with .filled(0)"
+        )
 
 
 def shape(name: str, array: np.ndarray, *allowed: tuple[int, ...]) -> np.ndarray:
     """Return `array` unchanged if its shape is one of `allowed`."""
     if array.shape not in allowed:
-        raise InputError(f"{name} has shape {array.shape}; it must be {' or '.join(map(str, allowed))}")
+        raise InputError(
+            f"{name} has shape {array.shape}; it must be {' or '.join(map(str, allowed))}"
+        )
     return array
 
 
@@ -134,7 +148,9 @@ def one_of(name: str, value: Any, allowed: Iterable[Any]) -> Any:
 def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     """Return `matrix` as a checked `csr_array` with sorted, unique indices."""
     if not scipy.sparse.issparse(matrix):
-        raise InputTypeError(f"{name} is a {type(matrix).__name__}; it must be a scipy.sparse array")
+        raise InputTypeError(
+            f"{name} is a {type(matrix).__name__}; it must be a scipy.sparse array"
+        )
     if matrix.ndim != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
     real(name, np.zeros(0, matrix.dtype))
@@ -144,7 +160,9 @@ def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     if matrix.format not in ("csr", "csc"):
         matrix = scipy.sparse.csr_array(matrix)
     shape = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
-    compressed(name, matrix.indptr, matrix.indices, matrix.data, shape)  # SciPy may read outside of arrays
+    compressed(
+        name, matrix.indptr, matrix.indices, matrix.data, shape
+    )  # SciPy may read outside of arrays
     result = scipy.sparse.csr_array(matrix)
     if not result.has_canonical_format:
         result = result.copy()
@@ -160,7 +178,9 @@ def compressed(
     for what, array in (("indptr", indptr), ("indices", indices), ("data", data)):
         kinds, of = ("iu", " of integers") if what != "data" else ("fiubc", "")
         if array.ndim != 1 or array.dtype.kind not in kinds:
-            raise InputError(f"{name}.{what} has shape {array.shape}, {array.dtype}; it must be a vector{of}")
+            raise InputError(
+                f"{name}.{what} has shape {array.shape}, {array.dtype}; it must be a vector{of}"
+            )
     if len(indptr) != rows + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
         start = f"{len(indptr)} entries from {indptr[0] if len(indptr) else 'none'}"
         raise InputError(f"{name}.indptr has {start}; it must have {rows + 1}, and must never fall")
@@ -169,7 +189,9 @@ def compressed(
         raise InputError(f"{name}.indptr ends at {indptr[-1]} with {counts}; the three must agree")
     if len(indices) and (indices.min() < 0 or indices.max() >= columns):
         worst = indices.min() if indices.min() < 0 else indices.max()
-        raise InputError(f"{name}.indices holds {worst}; column indices must be in 0..{columns - 1}")
+        raise InputError(
+            f"{name}.indices holds {worst}; column indices must be in 0..{columns - 1}"
+        )
     finite(f"{name}.data", data)
 
 
@@ -178,13 +200,19 @@ def host_memory() -> int:
     available = 1 << 62  # unknown: let the allocation itself decide
     with contextlib.suppress(AttributeError, OSError, ValueError):
         available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
+    with (
+        contextlib.suppress(OSError, KeyError, ValueError),
+        open("/proc/meminfo", encoding="ascii") as file,
+    ):
         fields = dict(line.split(":", 1) for line in file)
         available = int(fields["MemAvailable"].split()[0]) * 1024
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource  # not on Windows
 
-        for kind, column in ((resource.RLIMIT_AS, 0), (resource.RLIMIT_DATA, 5)):  # addresses; without files
+        for kind, column in (
+            (resource.RLIMIT_AS, 0),
+            (resource.RLIMIT_DATA, 5),
+        ):  # addresses; without files
             limit, _ = resource.getrlimit(kind)
             if limit != resource.RLIM_INFINITY:
                 with open("/proc/self/statm", encoding="ascii") as file:
@@ -198,7 +226,9 @@ def fits_host(what: str, needed: int, most: int = 1 << 62) -> None:
     if needed > most:
         raise MemoryLimitError(f"{what} needs {size(needed)}; it may take at most {size(most)}")
     if needed > (available := host_memory()):
-        raise MemoryLimitError(f"{what} needs {size(needed)}, but the host has {size(available)} free")
+        raise MemoryLimitError(
+            f"{what} needs {size(needed)}, but the host has {size(available)} free"
+        )
 
 
 def shown(value: Any) -> str:

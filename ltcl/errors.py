@@ -14,7 +14,11 @@ class LtclError(Exception):
     """Base of every exception that ltcl raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), self.args, self.__dict__  # else Dask makes a FileError by `ValueError.__new__`
+        return (
+            type(self),
+            self.args,
+            self.__dict__,
+        )  # else Dask makes a FileError by `ValueError.__new__`
 
 
 class InputError(LtclError, ValueError):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Output that is there whole or not at all, and input files that are files.
 
-A hidden temporary on the same disk is written, flushed and renamed, which is atomic. Its name tells host and
-process: the next writer in a folder removes those of processes that were killed (not on Windows).
+A hidden temporary on the same disk is written, flushed and renamed, which is atomic. Its name tells
+host and process: the next writer in a folder removes those of processes that were killed (not on
+Windows).
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from typing import Any
 from ltcl import checks
 from ltcl.errors import FileError, InputTypeError, LtclError
 
-fcntl: Any = None if os.name == "nt" else importlib.import_module("fcntl")  # Windows: nothing is locked
+fcntl: Any = (
+    None if os.name == "nt" else importlib.import_module("fcntl")
+)  # Windows: nothing is locked
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _TEMPORARY = re.compile(rf"\..*-{_HOST}-(\d{{1,9}})-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
 
@@ -42,7 +45,13 @@ def input_file(path: Any) -> Path:
     except OSError as error:
         raise _refusal(path, "cannot be read", error) from error
     if not stat.S_ISREG(status.st_mode) or not status.st_size:
-        kind = "a folder" if path.is_dir() else "empty" if stat.S_ISREG(status.st_mode) else "no regular file"
+        kind = (
+            "a folder"
+            if path.is_dir()
+            else "empty"
+            if stat.S_ISREG(status.st_mode)
+            else "no regular file"
+        )
         raise FileError(f"{path}: is {kind}; it must be a file with content")
     return path
 
@@ -54,7 +63,9 @@ def as_path(path: Any, name: str = "path") -> Path:
     try:
         return Path(path)
     except TypeError:
-        raise InputTypeError(f"{name} is {checks.shown(path)}; it must be a str or a path") from None
+        raise InputTypeError(
+            f"{name} is {checks.shown(path)}; it must be a str or a path"
+        ) from None
 
 
 def unknown_extension(path: Path) -> str:
@@ -66,12 +77,15 @@ def unknown_extension(path: Path) -> str:
 def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file under a temporary name; put it at `path` only when the block ends well.
 
-    The temporary is next to `path`, its extension in lower case (SciPy appends .mtx to .MTX). Missing parents
-    are made, removed on failure; links followed, permissions stay. FileError: no file, OSError in the block.
+    The temporary is next to `path`, its extension in lower case (SciPy appends .mtx to .MTX).
+    Missing parents are made, removed on failure; links followed, permissions stay. FileError: no
+    file, OSError in the block.
     """
     with _written(path) as target:
         if target.exists() and not target.is_file():
-            raise FileError(f"{path}: is a folder, or no regular file; a file cannot be written there")
+            raise FileError(
+                f"{path}: is a folder, or no regular file; a file cannot be written there"
+            )
         temporary = _temporary(target.parent, target.stem, target.suffix.lower())
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -89,8 +103,8 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 def fill_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
     """Fill a temporary folder; put it at `path` only when the block ends well.
 
-    Into an existing folder files are moved one by one, and others stay; with `replace` the new folder takes
-    its place (see `restore`). Parents, links, errors: see `replace_file`.
+    Into an existing folder files are moved one by one, and others stay; with `replace` the new
+    folder takes its place (see `restore`). Parents, links, errors: see `replace_file`.
     """
     with _written(path) as target:
         if target.exists() and not target.is_dir():
@@ -133,7 +147,9 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield
     except BlockingIOError:
-        raise FileError(f"{folder}: another run writes there; wait for it, or give another folder") from None
+        raise FileError(
+            f"{folder}: another run writes there; wait for it, or give another folder"
+        ) from None
     finally:
         if fcntl:
             os.close(handle)
@@ -151,7 +167,9 @@ def sweep(folder: Path) -> None:
                 os.kill(int(owner[1]), 0)  # asks, and does nothing
             except ProcessLookupError:
                 place = folder / owner[0]
-                shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
+                shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(
+                    missing_ok=True
+                )
 
 
 def _temporary(folder: Path, stem: str, suffix: str = "") -> Path:

@@ -55,8 +55,8 @@ def device(private_cache: Path) -> Device:
 def launched_as(device: Device, kind: str) -> Device:
     """The same hardware; kernels are launched as on a "cpu" or a "gpu".
 
-    Only tests run the launches of a GPU on a CPU. These kernels are built without optimization, which takes
-    two thirds of the time of compiling.
+    Only tests run the launches of a GPU on a CPU. These kernels are built without optimization,
+    which takes two thirds of the time of compiling.
     """
     other = Device(device.description)
     other.kind, kernel = kind, other.kernel

@@ -13,7 +13,10 @@ from jsonschema import Draft202012Validator
 
 PAGES = Path(__file__).resolve().parents[1] / "docs" / "reference"
 SCHEMA = json.loads((PAGES / "json-schema.json").read_text(encoding="utf-8"))
-HIDDEN = {"acquire-resume": "acquire-run", "acquire-finalize": "acquire-run"}  # names of earlier versions
+HIDDEN = {
+    "acquire-resume": "acquire-run",
+    "acquire-finalize": "acquire-run",
+}  # names of earlier versions
 
 
 @functools.cache

@@ -16,13 +16,17 @@ UNIT = 2.0**-24  # largest relative error of rounding to float32
 _LEAVES = 4096  # work-items among which the dot product spreads its rows, where there are that many
 
 
-def csr_matvec(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+def csr_matvec(
+    pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray
+) -> np.ndarray:
     """A x; x is (N,) or (N, k)."""
     matrix = (np.asarray(values, np.float64), columns, pointers)
     return scipy.sparse.csr_array(matrix, shape=(len(pointers) - 1, len(x))) @ x
 
 
-def tile_matvec(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+def tile_matvec(
+    pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray
+) -> np.ndarray:
     """A x; columns are the first of each tile, values (tiles, width)."""
     width = values.shape[1]
     places = columns[:, None] + np.arange(width)
@@ -91,12 +95,16 @@ def relax_windows(M: np.ndarray, block: int, panel: int, *, inverses: bool) -> n
     """The first entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
     i = np.arange(len(M))
     edges = np.stack([i - i % panel, i - i % block if inverses else i], axis=1)
-    before = np.cumsum(np.pad(M != 0, ((0, 0), (1, 0))), axis=1)  # entries of a row, left of each column
+    before = np.cumsum(
+        np.pad(M != 0, ((0, 0), (1, 0))), axis=1
+    )  # entries of a row, left of each column
     starts = np.cumsum(before[:, -1]) - before[:, -1]
     return starts[:, None] + np.take_along_axis(before, edges, axis=1)
 
 
-def block_gauss_seidel(S: np.ndarray, x, b, block: int, sweeps: int = 1, omega: float = 1.0) -> np.ndarray:
+def block_gauss_seidel(
+    S: np.ndarray, x, b, block: int, sweeps: int = 1, omega: float = 1.0
+) -> np.ndarray:
     """Sweeps of block Gauss-Seidel as in a textbook, block after block in place."""
     x = np.array(x, np.float64)
     for start in [*range(0, len(x), block)] * sweeps:
@@ -110,7 +118,9 @@ def sor(S: np.ndarray, x, b, omega: float = 1.0, sweeps: int = 1) -> np.ndarray:
     return block_gauss_seidel(S, x, b, 1, sweeps, omega)
 
 
-def southwell_step(S: np.ndarray, parts: int, x: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def southwell_step(
+    S: np.ndarray, parts: int, x: np.ndarray, r: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """x and r, (N, k), after the largest residual of each part was made zero."""
     edges = np.arange(parts + 1) * len(S) // parts
     picked = np.array([a + np.argmax(np.abs(r[a:b]), axis=0) for a, b in itertools.pairwise(edges)])
@@ -132,7 +142,9 @@ def philox(counters: np.ndarray, seed: int) -> np.ndarray:
     return np.stack(c, axis=1).astype(np.uint32)
 
 
-def walk_tables(columns: np.ndarray, values: np.ndarray, n: int) -> tuple[int, np.float32, np.ndarray]:
+def walk_tables(
+    columns: np.ndarray, values: np.ndarray, n: int
+) -> tuple[int, np.float32, np.ndarray]:
     """Entries that count, |R_i|, and the chance to draw each column with each sign, (n, 2)."""
     sizes = np.abs(values.astype(np.float64))
     exact, chances = math.fsum(sizes), np.zeros((n, 2))
@@ -142,11 +154,14 @@ def walk_tables(columns: np.ndarray, values: np.ndarray, n: int) -> tuple[int, n
     return len(values), np.float32(exact), chances
 
 
-def walk(tables, steps, b, pixels, samples, seed: int, stream: int) -> tuple[np.ndarray, np.ndarray]:
+def walk(
+    tables, steps, b, pixels, samples, seed: int, stream: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, and ends (w,).
 
-    `tables` are records, entries, channels and links or None; column j of b is of channel j % channels. steps
-    are (L, 2) uint32. A walk scores b at every step; without b its weight where it ends, the adjoint.
+    `tables` are records, entries, channels and links or None; column j of b is of channel j %
+    channels. steps are (L, 2) uint32. A walk scores b at every step; without b its weight where it
+    ends, the adjoint.
     """
     records, entries, channels, links = tables
     row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
@@ -184,7 +199,9 @@ def walk_rows(tables, steps, b, pixels, samples, seed: int, stream: int, chunk: 
     scores, _ = walk(tables, steps, b, *which, seed, stream)
     scores = scores.reshape(len(pixels), count, -1).swapaxes(0, 1)
     chunks = [scores[start : start + chunk] for start in range(0, count, chunk)]
-    in_order = [np.stack([np.add.accumulate(part)[-1] for part in (c, c**2)], axis=-1) for c in chunks]
+    in_order = [
+        np.stack([np.add.accumulate(part)[-1] for part in (c, c**2)], axis=-1) for c in chunks
+    ]
     return np.stack(in_order, axis=1)
 
 
@@ -194,7 +211,9 @@ def walk_columns(tables, steps, source: int, samples, seed: int) -> tuple[np.nda
     return ends, scores[:, 0]
 
 
-def _draw(records: np.ndarray, entries: np.ndarray, word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _draw(
+    records: np.ndarray, entries: np.ndarray, word: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Column and sign in one number, and what weights are multiplied by, of one entry of each row."""
     count = records[:, 2].astype(np.uint64)
     start = records[:, 0].astype(np.uint64) | records[:, 1].astype(np.uint64) << np.uint64(32)
@@ -208,7 +227,9 @@ def _draw(records: np.ndarray, entries: np.ndarray, word: np.ndarray) -> tuple[n
     return target.astype(np.int64), factor
 
 
-def _linked(links: np.ndarray, records: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _linked(
+    links: np.ndarray, records: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Column, doubled, and three factors of the entries drawn; 0 of rows without."""
     start = records[:, 0].astype(np.int64) | records[:, 1].astype(np.int64) << 32
     full = records[:, 2] > 0
@@ -233,9 +254,13 @@ def form_factor_pairs(G: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray
 
 def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) -> np.ndarray:
     """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
-    centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
+    centre, right, down, normal = (
+        geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4)
+    )
     angle = np.arange(8) * np.pi / 4
-    place = np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # on a circle, in edges
+    place = (
+        np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    )  # on a circle, in edges
     points = [centre + u * right + v * down for u, v in place]
 
     def between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -297,7 +322,9 @@ def form_factor_visible(starts, ends, normals, blocks: np.ndarray) -> np.ndarray
     faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
     for a, b in zip(starts.astype(np.float64), ends.astype(np.float64), strict=True):
         d = b.T[None] - a.T[:, None]
-        facing = (np.einsum("mnc,cm->mn", d, normals) > 1e-6) & (np.einsum("mnc,cn->mn", d, normals) < -1e-6)
+        facing = (np.einsum("mnc,cm->mn", d, normals) > 1e-6) & (
+            np.einsum("mnc,cn->mn", d, normals) < -1e-6
+        )
         faced += facing
         count += facing & ~blocked(a.T[:, None], b.T[None], blocks)
     return np.divide(count, faced, out=np.ones_like(count), where=faced > 0)
@@ -314,10 +341,12 @@ def gamma(roundings: float) -> float:
 def product_error(matrix, x, scale: float = 1.0, add: np.ndarray | None = None) -> np.ndarray:
     """Largest error of float32 in each value of out = scale * (A x) + add, in whatever order it sums.
 
-    A sum of n products passes through n roundings at most, `scale` and `add` bring two each and a composed
-    operator a few more: gamma_(n + 8) (|scale| |A| |x| + |add|), Higham, section 3.5.
+    A sum of n products passes through n roundings at most, `scale` and `add` bring two each and a
+    composed operator a few more: gamma_(n + 8) (|scale| |A| |x| + |add|), Higham, section 3.5.
     """
-    magnitude = abs(scale) * (np.abs(np.asarray(matrix, np.float64)) @ np.abs(np.asarray(x, np.float64)))
+    magnitude = abs(scale) * (
+        np.abs(np.asarray(matrix, np.float64)) @ np.abs(np.asarray(x, np.float64))
+    )
     if add is not None:
         magnitude = magnitude + np.abs(add)
     return gamma(matrix.shape[1] + 8) * magnitude
@@ -326,8 +355,8 @@ def product_error(matrix, x, scale: float = 1.0, add: np.ndarray | None = None) 
 def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Largest error of float32 in `vector_dot` by trees, (k,).
 
-    Each work-item sums its rows in turn, then two trees add up the items and the groups: the number of
-    roundings a product passes through grows with rows / 4096, not with rows.
+    Each work-item sums its rows in turn, then two trees add up the items and the groups: the number
+    of roundings a product passes through grows with rows / 4096, not with rows.
     """
     roundings = np.ceil(len(x) / _LEAVES) + 2 * np.log2(_LEAVES) + 2
     return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))
@@ -341,7 +370,11 @@ def vector_dots(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray)
 def krylov_subtract(V, w, h, square: np.ndarray | None = None) -> np.ndarray:
     """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
     left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
-    return left if square is None else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
+    return (
+        left
+        if square is None
+        else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
+    )
 
 
 def krylov_cg(sums, previous, last, moves, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -403,8 +436,9 @@ def _free(lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray) ->
 def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
     """The orthonormal matrix that splits a side, already halved `level` times: approximation above details.
 
-    What is regular goes round in a circle of its own, however often the filters wrap around it. The last
-    sample stands for the pixels left over; joined to another by weights, it keeps a constant constant.
+    What is regular goes round in a circle of its own, however often the filters wrap around it. The
+    last sample stands for the pixels left over; joined to another by weights, it keeps a constant
+    constant.
     """
     size, rest = 2**level, pixels % 2**level
     n, regular = -(-pixels // size), pixels // size // 2
@@ -446,7 +480,10 @@ def pyramid_gather(x: np.ndarray) -> np.ndarray:
     h, w, k = x.shape
     sizes = [2**level for level in range((max(h, w) - 1).bit_length() + 1)]
     rows = [np.add.reduceat(np.asarray(x, np.float64), range(0, h, size), axis=0) for size in sizes]
-    cells = [np.add.reduceat(sums, range(0, w, size), axis=1) for sums, size in zip(rows, sizes, strict=True)]
+    cells = [
+        np.add.reduceat(sums, range(0, w, size), axis=1)
+        for sums, size in zip(rows, sizes, strict=True)
+    ]
     return np.concatenate([sums.reshape(-1, k) for sums in cells])
 
 

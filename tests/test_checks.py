@@ -21,7 +21,11 @@ from tests import gallery
 def csr(indptr, indices, data, shape=(2, 3)):
     """A csr_array as it stands, with nothing checked: as read from a spoilt file."""
     matrix = scipy.sparse.csr_array(shape)
-    matrix.indptr, matrix.indices, matrix.data = np.asarray(indptr), np.asarray(indices), np.asarray(data)
+    matrix.indptr, matrix.indices, matrix.data = (
+        np.asarray(indptr),
+        np.asarray(indices),
+        np.asarray(data),
+    )
     return matrix
 
 
@@ -34,7 +38,10 @@ P, I, X = [0, 1, 3], [0, 0, 2], [1.0, 2.0, 3.0]
 # The argument and the value that each refusal names.
 REFUSED: list[tuple[Callable[[str], object], str]] = [
     (lambda name: checks.finite(name, np.array([0, np.nan])), "1 NaN .* at 1;"),
-    (lambda name: checks.finite(name, np.array([[0, np.inf], [-np.inf, 0]])), r"2 NaN .* at \(0, 1\)"),
+    (
+        lambda name: checks.finite(name, np.array([[0, np.inf], [-np.inf, 0]])),
+        r"2 NaN .* at \(0, 1\)",
+    ),
     (lambda name: checks.shape(name, np.zeros(3), (4,), (4, 2)), r"\(3,\).*\(4,\) or \(4, 2\)"),
     *of(checks.grid, (1, 2, 3), 7, (2.5, 2), "44", (0, 4)),
     *of(checks.number, None, "1", True, np.nan),
@@ -67,7 +74,10 @@ REFUSED: list[tuple[Callable[[str], object], str]] = [
 ]
 WRONG_TYPES: list[tuple[Callable[[str], object], str]] = [
     (lambda name: checks.real(name, np.ma.masked_greater(np.arange(4.0), 2)), "1 masked"),
-    (lambda name: checks.real(name, [np.ma.masked_greater(np.arange(4.0), 2), np.ones(4)]), "1 masked"),
+    (
+        lambda name: checks.real(name, [np.ma.masked_greater(np.arange(4.0), 2), np.ones(4)]),
+        "1 masked",
+    ),
     *of(checks.real, "wall.png", None),
     (lambda name: checks.real(name, Path("wall.png")), "'wall.png'"),
     (lambda name: checks.real(name, ["a"]), "<U1"),
@@ -109,7 +119,13 @@ def test_no_product_drops_a_mask(device, times):
 
 @pytest.mark.parametrize(
     "array",
-    [np.full(4, 1e308), np.array([3e38, 3e38], np.float32), np.zeros(0), np.arange(3), np.ones(2, bool)],
+    [
+        np.full(4, 1e308),
+        np.array([3e38, 3e38], np.float32),
+        np.zeros(0),
+        np.arange(3),
+        np.ones(2, bool),
+    ],
 )
 def test_finite_numbers_pass_even_where_their_sum_does_not(array):
     assert checks.finite("b", array) is array
@@ -120,13 +136,21 @@ def test_finite_numbers_pass_even_where_their_sum_does_not(array):
 def test_every_sparse_format_becomes_a_canonical_csr_array(form, dtype):
     half, dense = dtype == "float16", (gallery.sparse(5, 7).toarray() * 100).astype(dtype)
     matrix = scipy.sparse.coo_array(dense.astype("float32" if half else dtype)).asformat(form)
-    if half and form in ("csr", "csc", "coo", "bsr", "dia"):  # the others compute with it themselves
+    if half and form in (
+        "csr",
+        "csc",
+        "coo",
+        "bsr",
+        "dia",
+    ):  # the others compute with it themselves
         matrix.data = matrix.data.astype(dtype)
     result = checks.csr("T", matrix)
     assert type(result) is scipy.sparse.csr_array
     np.testing.assert_array_equal(result.toarray(), dense)
     row = np.repeat(np.arange(5), np.diff(result.indptr))
-    assert np.all(np.diff(row * 7 + result.indices) > 0)  # by hand: SciPy remembers what it once saw
+    assert np.all(
+        np.diff(row * 7 + result.indices) > 0
+    )  # by hand: SciPy remembers what it once saw
 
 
 def test_disorder_is_seen_even_where_scipy_remembers_order():
@@ -148,7 +172,10 @@ def test_memory_is_what_a_limit_of_the_process_leaves():
     import resource
 
     before = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    used = (
+        int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        * resource.getpagesize()
+    )
     resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), before[1]))
     try:
         assert checks.host_memory() <= 64 << 20

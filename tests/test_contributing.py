@@ -30,7 +30,9 @@ def test_pages_for_contributors_name_what_exists(page: Path) -> None:
         assert second in getattr(command, "commands", {second: None}), (first, second)
     links = [target.partition("#")[0] for target in re.findall(r"\]\((?!https?:)([^)]+)\)", text)]
     files = re.findall(r"`((?:ltcl|kernels|tests|bench|docs|\.ci)/[\w./*]+)`", text)
-    assert [file for file in [*links, *files] if "NAME" not in file and not (ROOT / file).exists()] == []
+    assert [
+        file for file in [*links, *files] if "NAME" not in file and not (ROOT / file).exists()
+    ] == []
 
 
 def test_issue_templates_have_a_name_and_say_what_they_are_for() -> None:
@@ -45,7 +47,9 @@ def test_issue_templates_have_a_name_and_say_what_they_are_for() -> None:
 def test_the_rig_of_the_page_scans(device, tmp_path, monkeypatch) -> None:
     """With a projector and a camera that are one virtual rig."""
     monkeypatch.chdir(tmp_path)
-    (code,) = re.findall(r"```py\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text("utf-8"), re.DOTALL)
+    (code,) = re.findall(
+        r"```py\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text("utf-8"), re.DOTALL
+    )
     corner = ltcl.scenes.dihedral(8, albedo=(0.7, 0.6, 0.5))
     room = VirtualRig(corner.transport(device=device), corner.grid, bits=16)
 

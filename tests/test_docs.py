@@ -12,7 +12,10 @@ import pytest
 import ltcl
 
 NAMES = [module.name for module in pkgutil.walk_packages(ltcl.__path__, "ltcl.")]
-MODULES = ["ltcl", *sorted(name for name in NAMES if not name.endswith(".__main__"))]  # that runs the program
+MODULES = [
+    "ltcl",
+    *sorted(name for name in NAMES if not name.endswith(".__main__")),
+]  # that runs the program
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -24,7 +27,8 @@ def test_the_examples_of(name, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["Transport", "acquire", "analyze", "compensate", "invert", "relight", "separate", "solve"]
+    "name",
+    ["Transport", "acquire", "analyze", "compensate", "invert", "relight", "separate", "solve"],
 )
 def test_the_public_tasks_have_an_example(name):
     examples = doctest.DocTestFinder(recurse=False).find(getattr(ltcl, name))

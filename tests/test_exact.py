@@ -37,7 +37,9 @@ def one_channel(device, channel=1, keep=0.5, f=None):
 
 def pair(device, channels=(1,), keep=0.5):
     """A compressed transport, grey or in colour, and the exact one."""
-    matrices, _, true = zip(*(one_channel(device, channel, keep) for channel in channels), strict=True)
+    matrices, _, true = zip(
+        *(one_channel(device, channel, keep) for channel in channels), strict=True
+    )
     f = F[1] if channels == (1,) else F
     exact = [S * F[channel] for S, channel in zip(true, channels, strict=True)]
     return ltcl.Transport(matrices, GRID, f), ltcl.Transport(exact, GRID, f, device=device)
@@ -82,7 +84,9 @@ def test_results_tell_of_which_T_they_are(device, task):
     assert checks.upwards(C.error) in repr(alone)
     assert task(C, desired, exact=T).transport_error == 0.0
     if task is ltcl.compensate:
-        missed = np.linalg.norm(T @ alone.pattern - alone.appearance) / np.linalg.norm(alone.appearance)
+        missed = np.linalg.norm(T @ alone.pattern - alone.appearance) / np.linalg.norm(
+            alone.appearance
+        )
         assert 0.0 < missed <= C.error
 
 
@@ -94,9 +98,14 @@ def test_tasks_beside_the_exact_one(device, channels, rtol, close):
     desired = T @ rng.uniform(0.2, 0.8, GRID)  # within the bounds
     ours = ltcl.compensate(C, desired, exact=T, rtol=rtol)
     theirs = ltcl.compensate(T, desired, method="direct")
-    np.testing.assert_allclose(ours.pattern, theirs.pattern, rtol=0, atol=close)  # rtol is of the norm
+    np.testing.assert_allclose(
+        ours.pattern, theirs.pattern, rtol=0, atol=close
+    )  # rtol is of the norm
     image = T @ rng.uniform(0.2, 0.8, GRID)
-    ours, theirs = ltcl.separate(C, image, 2, exact=T, rtol=rtol), ltcl.separate(T, image, 2, method="direct")
+    ours, theirs = (
+        ltcl.separate(C, image, 2, exact=T, rtol=rtol),
+        ltcl.separate(T, image, 2, method="direct"),
+    )
     np.testing.assert_allclose(ours.direct, theirs.direct, rtol=max(close, 1e-5))
     np.testing.assert_allclose(ours.bounces, theirs.bounces, atol=max(close, 1e-5))
     assert ours.reciprocity_defect == theirs.reciprocity_defect < 1e-6
@@ -111,10 +120,15 @@ def test_beyond_the_projector(device):
     desired = rng.uniform(0.0, 3.0, GRID)
     alone, matrix = ltcl.compensate(C, desired, rtol=C.error), C.operators[0].to_dense()
     assert alone.clipped > 0.0
-    missed = np.linalg.norm(desired.ravel() - matrix @ alone.pattern.ravel()) / np.linalg.norm(desired)
+    missed = np.linalg.norm(desired.ravel() - matrix @ alone.pattern.ravel()) / np.linalg.norm(
+        desired
+    )
     assert alone.error == pytest.approx(missed, rel=1e-3)
     assert alone.gap <= C.error
-    ours, theirs = ltcl.compensate(C, desired, exact=T, rtol=1e-4), ltcl.compensate(T, desired, rtol=1e-4)
+    ours, theirs = (
+        ltcl.compensate(C, desired, exact=T, rtol=1e-4),
+        ltcl.compensate(T, desired, rtol=1e-4),
+    )
     assert ours.error == pytest.approx(theirs.error, abs=2e-4)
 
 
@@ -128,7 +142,11 @@ def test_what_does_not_lie_beside(device, small_device):
         (ltcl.Transport(matrix, (7, 6)), InputError, r"exact has grid \(7, 6\).*\(6, 7\)"),
         (ltcl.Transport(matrix, GRID, first_bounce=2 * F[1]), InputError, "exact.*first bounce"),
         (ltcl.Transport(matrix[:12], GRID, camera_grid=(3, 4)), InputError, "one grid"),
-        (ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device), InputError, "device"),
+        (
+            ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device),
+            InputError,
+            "device",
+        ),
     ]
     for exact, kind, says in wrong:
         for task in (ltcl.compensate, ltcl.separate):
@@ -144,7 +162,9 @@ def test_what_does_not_lie_beside(device, small_device):
 def test_analysis_by_products(device):
     """What needs the sight of entries is unknown; the rest is that of the exact T up to what was dropped."""
     ours, theirs = (ltcl.analyze(one).channels[0] for one in pair(device, keep=0.999))
-    assert np.isnan([ours.norm_inf, ours.energy.negative_entries, ours.products["gauss_seidel"]]).all()
+    assert np.isnan(
+        [ours.norm_inf, ours.energy.negative_entries, ours.products["gauss_seidel"]]
+    ).all()
     for name in ("spectral_radius", "negative_bounce", "reciprocity_defect"):
         assert getattr(ours, name) == pytest.approx(getattr(theirs, name), abs=1e-2)
     for name in ("bounce_highest", "albedo_from_columns"):
@@ -155,7 +175,9 @@ def test_analysis_by_products(device):
 def test_tasks_accept_a_T_without_any_bound(device):
     """Infinite: nothing is known of solutions, so that only exact= helps; relighting and checks go on."""
     R = two_sided(device, SCENES[1].R, 0.5)
-    C = ltcl.Transport(ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1]), GRID, first_bounce=F[1])
+    C = ltcl.Transport(
+        ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1]), GRID, first_bounce=F[1]
+    )
     T = pair(device)[1]
     with pytest.raises(InputError, match="inf"):
         ltcl.compensate(C, np.ones(GRID))

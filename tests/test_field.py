@@ -77,12 +77,16 @@ def test_bounces_of_the_corner_are_powers_of_its_matrix(modules, scenes) -> None
     p = scene.photographs["patterns"]
     light = exact.first_bounce[:, None] * p.reshape(8, -1).T
     for k, found in enumerate(np.moveaxis(scene.bounces("second", p), 1, 0)):
-        np.testing.assert_allclose(found.reshape(8, -1).T, light, atol=2e-3 * light.max(), err_msg=str(k))
+        np.testing.assert_allclose(
+            found.reshape(8, -1).T, light, atol=2e-3 * light.max(), err_msg=str(k)
+        )
         light = exact.A @ light
 
 
 @pytest.mark.parametrize("name", ["corner", "coloured"])
-def test_a_method_that_writes_the_truth_has_no_error(modules, scenes, name, method, tmp_path) -> None:
+def test_a_method_that_writes_the_truth_has_no_error(
+    modules, scenes, name, method, tmp_path
+) -> None:
     scene, scoring = scenes[name], modules["scoring"]
     p = scene.photographs["patterns"]
     np.savez(tmp_path / "truth.npz", patterns=p, bounces=scene.bounces("second", p))
@@ -117,7 +121,10 @@ def test_scores_of_wrong_results_follow_closed_forms(modules, scenes) -> None:
     )
     np.testing.assert_allclose(scores["compensation"], 0.25, atol=2e-3)
     assert scores["patterns within std"] == [pytest.approx(np.mean(p[p > 0] > 0.4)), 1.0]
-    assert scores["bounces within std"] == [pytest.approx(0.683, abs=0.02), pytest.approx(0.954, abs=0.01)]
+    assert scores["bounces within std"] == [
+        pytest.approx(0.683, abs=0.02),
+        pytest.approx(0.954, abs=0.01),
+    ]
     too_bright = scoring.judge(scene, {"patterns": p + 9.0})
     white = scoring.judge(scene, {"patterns": np.ones_like(p)})
     assert too_bright == white  # a projector has no more
@@ -137,7 +144,10 @@ def test_scores_of_wrong_results_follow_closed_forms(modules, scenes) -> None:
         (["np.save(out / 'patterns', np.load(targets) * np.nan)"], r"patterns\.npy .* finite"),
         (["np.save(out / 'patterns', np.array([None]), allow_pickle=True)"], "Object arrays"),
         (
-            ["np.save(out / 'patterns', np.load(targets))", "(out / 'photographs.txt').write_text('few')"],
+            [
+                "np.save(out / 'patterns', np.load(targets))",
+                "(out / 'photographs.txt').write_text('few')",
+            ],
             "few",
         ),
         (["import time; time.sleep(60)"], "longer than 5 s"),
@@ -200,6 +210,8 @@ def test_the_table_of_the_page_is_that_of_the_record(modules) -> None:
 def test_the_method_on_the_page_runs(modules, scenes, tmp_path) -> None:
     (tmp_path / "mine.py").write_text(re.findall(r"```py\n(.*?)```", PAGE, re.DOTALL)[0])
     for scene in scenes.values():
-        scores = modules["scoring"].run(shlex.join([sys.executable, str(tmp_path / "mine.py")]), scene)
+        scores = modules["scoring"].run(
+            shlex.join([sys.executable, str(tmp_path / "mine.py")]), scene
+        )
         assert max(scores["compensation"]) < 0.01
         assert "bounce 0" not in scores

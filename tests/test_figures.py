@@ -59,11 +59,17 @@ def test_a_claim_passes_only_when_it_is_as_expected(
 
 
 def test_a_failed_claim_ends_the_bench_and_is_written(figures: Any, given: Any) -> None:
-    good, bad = figures.Claim("a", "1", "1", np.bool_(True)), figures.Claim("b", "3", "below 2", False)
+    good, bad = (
+        figures.Claim("a", "1", "1", np.bool_(True)),
+        figures.Claim("b", "3", "below 2", False),
+    )
     with pytest.raises(SystemExit) as end:
         conclude(figures, given, good, bad)
     assert end.value.code == 1
-    assert [one["verdict"] for one in json.loads(given.json.read_text())["claims"]] == ["holds", "FAILS"]
+    assert [one["verdict"] for one in json.loads(given.json.read_text())["claims"]] == [
+        "holds",
+        "FAILS",
+    ]
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -91,7 +97,9 @@ def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any
     for way in found.values():
         l_d = way.run()
         assert np.linalg.norm(l_d - truth) <= 1e-2 * np.linalg.norm(truth)
-        assert way.error == pytest.approx(np.linalg.norm(l_d - truth) / np.linalg.norm(truth), rel=1e-3)
+        assert way.error == pytest.approx(
+            np.linalg.norm(l_d - truth) / np.linalg.norm(truth), rel=1e-3
+        )
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

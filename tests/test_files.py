@@ -22,7 +22,8 @@ ENDINGS = [ValueError(), KeyboardInterrupt(), SystemExit(), FULL, ELSEWHERE]
 def everything(folder: Path) -> dict[str, bytes | None]:
     """Names below `folder`, hidden ones too, with the content of files."""
     return {
-        str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in sorted(folder.rglob("*"))
+        str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None
+        for p in sorted(folder.rglob("*"))
     }
 
 
@@ -36,7 +37,9 @@ def refused(path: Path, block: Callable[[], object], *says: str) -> None:
     assert all(word in text for word in says)
 
 
-def write(manager: Any, path: Path, files: dict[str, str], ending: BaseException | None = None) -> None:
+def write(
+    manager: Any, path: Path, files: dict[str, str], ending: BaseException | None = None
+) -> None:
     """Write the one file, or `files` into the folder, and then raise `ending`."""
     with manager(path) as temporary:
         for name, text in files.items():
@@ -71,7 +74,12 @@ def test_a_new_folder_appears_whole_and_joins_an_earlier_one(tmp_path):
         assert not path.exists()
     assert everything(tmp_path).keys() == {"a", "a/report", "a/report/one.txt", "a/report/mine.txt"}
     write(fill_folder, path, {"one.txt": "new", "sub/two.txt": "2"})
-    assert everything(path) == {"mine.txt": b"stays", "one.txt": b"new", "sub": None, "sub/two.txt": b"2"}
+    assert everything(path) == {
+        "mine.txt": b"stays",
+        "one.txt": b"new",
+        "sub": None,
+        "sub/two.txt": b"2",
+    }
 
 
 @pytest.mark.parametrize("existing", [False, True])
@@ -83,7 +91,11 @@ def test_nothing_changes_when_the_block_fails(tmp_path, manager, ending, existin
         write(manager, path, {"one.txt": "old"})
     before = everything(tmp_path)
     if ending is FULL:
-        refused(path, lambda: write(manager, path, {"one.txt": "half"}, ending), "No space left on device")
+        refused(
+            path,
+            lambda: write(manager, path, {"one.txt": "half"}, ending),
+            "No space left on device",
+        )
     else:
         with pytest.raises(type(ending)):
             write(manager, path, {"one.txt": "half"}, ending)
@@ -92,7 +104,10 @@ def test_nothing_changes_when_the_block_fails(tmp_path, manager, ending, existin
 
 @pytest.mark.parametrize(
     ("manager", "name"),
-    [(replace_file, name) for name in ("folder", "file/below.png", "file/a/b.png", "x" * 300 + ".png", "\0")]
+    [
+        (replace_file, name)
+        for name in ("folder", "file/below.png", "file/a/b.png", "x" * 300 + ".png", "\0")
+    ]
     + [(fill_folder, name) for name in ("file", "file/below", "x" * 300, "\0")],
 )
 def test_places_that_cannot_hold_it_are_refused(tmp_path, manager, name):

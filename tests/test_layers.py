@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The house: imports point down only, pyopencl stays inside `ltcl.device`, sizes and ways keep their budgets.
+"""Imports point down only, pyopencl stays inside `ltcl.device`, and the ways of data stay short.
 
 The syntax tree of every file is walked, so imports inside functions count as well; those under
-`if TYPE_CHECKING:` never run and do not count. A unit is what stands directly in `ltcl/`.
+`if TYPE_CHECKING:` never run and do not count. The layers are in `tests/house.py`.
 """
 
 from __future__ import annotations
@@ -14,94 +14,115 @@ from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
-
 from tests import house
 
-PACKAGE = Path(__file__).resolve().parents[1] / "ltcl"
-
-# Low to high; a new unit of ltcl must be placed here.
-LAYERS: list[set[str]] = [
-    {"errors"},
-    {"checks", "linker"},
-    {"files"},
-    {"images", "device"},
-    {"operators", "layout", "cluster"},
-    {"theory"},
-    {"solvers"},
-    {"diagnostics", "first_bounce", "noise"},
-    {"transport"},
-    {"uncertainty"},
-    {"verdict"},
-    {"compensation", "compression", "separation", "relighting", "analysis", "denoising"}
-    | {"scenes", "store", "acquisition", "report"},
-    {"plots"},
-    {"batch", "demo", "viewer"},
-    {"cli"},
-    {"__init__", "__main__"},
-]
-RANK = {unit: rank for rank, units in enumerate(LAYERS) for unit in units}
-SIDEWAYS = {("analysis", "report"), ("acquisition", "store")}  # the imports allowed within one layer
-NEVER = {(a, b) for a in ("acquisition", "images", "store") for b in ("device", "operators")}
+RANK = {unit: rank for rank, units in enumerate(house.LAYERS) for unit in units}
+FLOORS = {
+    "acquisition",
+    "batch",
+    "cli",
+    "demo",
+    "device",
+    "images",
+    "interop",
+    "operators",
+    "plots",
+    "scenes",
+    "show",
+    "solvers",
+    "store",
+    "tasks",
+    "theory",
+    "transport",
+    "viewer",
+}
+FILES = {"__init__.py", "__main__.py", "checks.py", "errors.py", "files.py"}
 
 
-def imported(tree: ast.AST, modules: set[str]) -> Iterator[tuple[int, str]]:
-    """Line and dotted name of what a module imports when it runs."""
+def imported_names(tree: ast.AST, modules: set[str]) -> Iterator[tuple[int, str]]:
+    """Line and dotted name of each module that a file imports when it runs."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             continue
         if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+            for alias in node.names:
+                yield node.lineno, alias.name
         elif isinstance(node, ast.ImportFrom):
             base = "." * node.level + (node.module or "")
-            names = {f"{base}.{alias.name}" for alias in node.names} - {"ltcl.__version__"}  # a constant
-            yield from ((node.lineno, name if name in modules else base) for name in names)
-        yield from imported(node, modules)
+            for alias in node.names:
+                name = f"{base}.{alias.name}"
+                if name == "ltcl.__version__":  # a constant
+                    continue
+                yield node.lineno, name if name in modules else base
+        yield from imported_names(node, modules)
 
 
-def dotted(path: str) -> str:
-    """`device/kernel.py` -> `ltcl.device.kernel`; `device/__init__.py` -> `ltcl.device`."""
-    parts = ["ltcl", *path.removesuffix(".py").split("/")]
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+def module_name(path: Path) -> str:
+    """`ltcl/device/kernels.py` -> `ltcl.device.kernels`; `.../__init__.py` is its folder."""
+    parts = ["ltcl", *path.relative_to(house.PACKAGE).with_suffix("").parts]
+    if parts[-1] == "__init__":
+        parts.pop()
+    return ".".join(parts)
 
 
-def forbidden(importer: str, target: str) -> str | None:
-    """Why unit `importer` must not import the dotted name `target`, if so."""
-    top, *rest = target.split(".")
+def unit_of(module: str) -> str:
+    """The unit of ltcl that a module belongs to."""
+    parts = module.split(".")[1:]
+    if not parts:
+        return "__init__"
+    first_two = ".".join(parts[:2])
+    return first_two if first_two in RANK else parts[0]
+
+
+def reason_against(importer: str, target: str) -> str | None:
+    """Why a module must not import `target`, if there is a reason."""
+    top = target.split(".")[0]
+    unit = unit_of(importer)
     if not top:
         return "imports are by full names"
-    if top == "pyopencl" and importer != "device":
+    if top == "pyopencl" and unit != "device":
         return "only ltcl/device imports pyopencl"
-    unit = rest[0] if rest else "__init__"  # which stands above all its parts
-    if top != "ltcl" or unit == importer:
+    if top != "ltcl":
         return None
-    if (importer, unit) in NEVER:
-        return f"{importer} stays free of {unit}"
-    if RANK[unit] >= RANK[importer] and (importer, unit) not in SIDEWAYS:
-        return f"{unit} (layer {RANK[unit]}) is not below {importer} (layer {RANK[importer]})"
+    other = unit_of(target)
+    if other == unit:
+        return None
+    if unit in house.WITHOUT_DEVICE and other in house.DEVICE_UNITS:
+        return f"{unit} stays free of {other}"
+    if RANK[other] >= RANK[unit] and (unit, other) not in house.SIDEWAYS:
+        return f"{other} (layer {RANK[other]}) is not below {unit} (layer {RANK[unit]})"
     return None
 
 
+def test_ltcl_holds_its_files_and_floors_alone() -> None:
+    entries = {path.name for path in house.PACKAGE.iterdir() if path.name != "__pycache__"}
+    assert entries - FLOORS == FILES | {"py.typed"}
+
+
 def test_imports_of_ltcl_point_down() -> None:
-    files = {dotted(path.relative_to(PACKAGE).as_posix()): path for path in PACKAGE.rglob("*.py")}
-    lines, graph = [], {}
+    files = {module_name(path): path for path in house.PACKAGE.rglob("*.py")}
+    violations = []
+    graph: dict[str, set[str]] = {}
     for name, path in files.items():
-        for line, target in imported(ast.parse(path.read_text(encoding="utf-8")), set(files)):
-            if reason := forbidden([*name.split("."), "__init__"][1], target):
-                lines.append(f"{path}:{line} imports {target}: {reason}")
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for line, target in imported_names(tree, set(files)):
+            reason = reason_against(name, target)
+            if reason is not None:
+                violations.append(f"{path}:{line} imports {target}: {reason}")
             graph.setdefault(name, set()).add(target)
-    assert lines == []
+    assert violations == []
     TopologicalSorter(graph).prepare()  # raises for a circle
 
 
 def test_import_of_ltcl_is_light() -> None:
     code = "import sys, ltcl; print(*{'pyopencl', 'matplotlib', 'cv2'}.intersection(sys.modules))"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=house.PACKAGE.parent
+    )
     assert run.returncode == 0, run.stderr
     assert run.stdout.split() == []
 
 
-@pytest.mark.parametrize("count", [house.sizes, house.ways])
-def test_parts_and_ways_do_not_grow_beyond_their_budgets_or_what_they_reached(count) -> None:
-    for name, (size, budget, *files) in count().items():
-        assert size <= budget, (name, files)
+def test_ways_of_data_stay_short() -> None:
+    for name, (length, limit, files) in house.ways().items():
+        assert length <= limit, (name, files)

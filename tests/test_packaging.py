@@ -19,8 +19,12 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 def test_the_version_is_that_of_the_package_and_the_changelog_knows_it() -> None:
     assert "version" in PROJECT["project"]["dynamic"]
     source = (ROOT / PROJECT["tool"]["hatch"]["version"]["path"]).read_text(encoding="utf-8")
-    assert re.findall(r'^__version__ = "(\d+\.\d+\.\d+\S*)"$', source, re.MULTILINE) == [ltcl.__version__]
-    headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.findall(r'^__version__ = "(\d+\.\d+\.\d+\S*)"$', source, re.MULTILINE) == [
+        ltcl.__version__
+    ]
+    headings = re.findall(
+        r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert ltcl.__version__ in headings[0]
 
 
@@ -44,7 +48,10 @@ def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
     """Its schema is checked by `.ci/run`."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert (citation["cff-version"], citation["type"]) == ("1.2.0", "software")
-    assert (citation["version"], citation["license"]) == (ltcl.__version__, PROJECT["project"]["license"])
+    assert (citation["version"], citation["license"]) == (
+        ltcl.__version__,
+        PROJECT["project"]["license"],
+    )
     (paper,) = citation["references"]
     readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
     assert f"*{paper['title']}*, {paper['journal']}, {paper['year']}" in readme

@@ -22,15 +22,22 @@ FILES = [path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py
 PYTHON, ERRORS, ENVIRONMENT = (
     (PAGES / f"{name}.md").read_text("utf-8") for name in ("python", "errors", "environment")
 )
-PUBLIC = ["ltcl", *(f"ltcl.{name}" for name in ltcl.__all__ if inspect.ismodule(getattr(ltcl, name)))]
-PUBLIC += [f"ltcl.{name}" for name in ("compensation", "compression", "demo", "device", "noise", "store")]
+PUBLIC = [
+    "ltcl",
+    *(f"ltcl.{name}" for name in ltcl.__all__ if inspect.ismodule(getattr(ltcl, name))),
+]
+PUBLIC += [
+    f"ltcl.{name}" for name in ("compensation", "compression", "demo", "device", "noise", "store")
+]
 PUBLIC += [f"ltcl.acquisition.{name}" for name in ("geometry", "radiometry", "rigs", "scanning")]
 
 
 def public(module: types.ModuleType) -> list[str]:
     """Its names; of a module without a list of them, its classes."""
     own = [
-        name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__
+        name
+        for name, value in vars(module).items()
+        if getattr(value, "__module__", "") == module.__name__
     ]
     return getattr(module, "__all__", own)
 
@@ -45,11 +52,12 @@ def test_every_public_name_is_on_the_page_of_python() -> None:
     listed = re.findall(r"^   (ltcl\.[\w.]+)$", PYTHON, re.MULTILINE)
     assert len(listed) == len(set(listed))
     objects = {id(resolve(name)) for name in listed}
-    for module in map(importlib.import_module, PUBLIC):
+    for place in PUBLIC:
+        module = importlib.import_module(place)
         for name in public(module):
             value = getattr(module, name)
-            is_there = id(value) in objects or f"`{module.__name__}.{name}`" in PYTHON
-            assert is_there or inspect.ismodule(value), f"{module.__name__}.{name}"
+            is_there = id(value) in objects or f"`{place}.{name}`" in PYTHON
+            assert is_there or inspect.ismodule(value), f"{place}.{name}"
 
 
 EXAMPLES = "\n".join(re.findall(r"```pycon\n(.*?)```", PYTHON, re.DOTALL))
@@ -61,9 +69,13 @@ def test_every_public_name_has_an_example() -> None:
     for name in re.findall(r"^   (ltcl\.[\w.]+)$", PYTHON, re.MULTILINE):
         own = resolve(name)
         inner = vars(own).values() if inspect.isclass(own) else ()
-        documents = [inspect.getdoc(each) or "" for each in (own, *inner) if hasattr(each, "__doc__")]
+        documents = [
+            inspect.getdoc(each) or "" for each in (own, *inner) if hasattr(each, "__doc__")
+        ]
         shown = re.search(rf"\b{name.rpartition('.')[2]}\b", EXAMPLES)
-        if not (shown or name.startswith("ltcl.errors.") or any(">>>" in text for text in documents)):
+        if not (
+            shown or name.startswith("ltcl.errors.") or any(">>>" in text for text in documents)
+        ):
             without.append(name)
     assert without == []
 
@@ -115,7 +127,11 @@ def test_the_schema_describes_every_field() -> None:
         for name, field in schema.get("properties", {}).items():
             assert field.get("description") or "$ref" in field, f"{path}.{name}"
             walk(field, f"{path}.{name}")
-        for each in (schema.get("items"), schema.get("additionalProperties"), *schema.get("anyOf", ())):
+        for each in (
+            schema.get("items"),
+            schema.get("additionalProperties"),
+            *schema.get("anyOf", ()),
+        ):
             if isinstance(each, dict):
                 walk(each, path)
         assert "properties" not in schema or schema["additionalProperties"] is False, path
@@ -131,6 +147,8 @@ def test_the_schema_describes_every_field() -> None:
 def test_generated_pages_have_all_commands(page, monkeypatch) -> None:
     monkeypatch.syspath_prepend(str(PAGES.parent))
     text = importlib.import_module("generated").PAGES[f"reference/{page}"]()
-    commands = [name for name in SCHEMA["$defs"] if f"`ltcl {name.replace('-', ' ')}`" in json.dumps(SCHEMA)]
+    commands = [
+        name for name in SCHEMA["$defs"] if f"`ltcl {name.replace('-', ' ')}`" in json.dumps(SCHEMA)
+    ]
     assert len(commands) > 15
     assert [name for name in commands if f"\n## ltcl {name.replace('-', ' ')}\n" not in text] == []

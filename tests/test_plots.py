@@ -76,5 +76,9 @@ def test_an_analysis_shows_every_channel_and_method(device) -> None:
     analysis = ltcl.analyze(ltcl.scenes.box(3, albedo=0.8).transport(device=device))
     left, right = plots.analysis({"a": analysis, "b": analysis}).axes
     assert [label.get_text() for label in left.get_yticklabels()] == ["a", "b"]
-    assert [label.get_text() for label in right.get_yticklabels()] == list(analysis.channels[0].products)
-    assert [text.get_text().strip() for text in right.texts].count("diverges") == 4  # jacobi, neumann; twice
+    assert [label.get_text() for label in right.get_yticklabels()] == list(
+        analysis.channels[0].products
+    )
+    assert [text.get_text().strip() for text in right.texts].count(
+        "diverges"
+    ) == 4  # jacobi, neumann; twice

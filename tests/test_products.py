@@ -33,7 +33,9 @@ def test_R_by_mirrors_is_that_of_the_corner(n: int, albedo: float) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (5, 7), (1100, 30)])
 @pytest.mark.parametrize("tolerance", [0.3, 0.01])
 @pytest.mark.parametrize("make", [np.array, scipy.sparse.csr_array])
-def test_no_more_is_kept_than_an_error_takes(shape: tuple[int, int], tolerance: float, make) -> None:
+def test_no_more_is_kept_than_an_error_takes(
+    shape: tuple[int, int], tolerance: float, make
+) -> None:
     bench, rng = importlib.import_module("_coefficients"), np.random.default_rng(5)
     dense = (rng.choice([-1, 1], shape) * 2.0 ** -rng.uniform(0, 20, shape)).astype(np.float32)
     x = rng.random(shape[1])

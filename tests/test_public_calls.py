@@ -39,7 +39,9 @@ def compressed(device: Device, **options: Any) -> float:
 
 def inverted(device: Device) -> float:
     T = SCENE.transport(device=device)
-    return apart(T @ ltcl.compensate(T, DESIRED, inverse=ltcl.invert(T, 0.02), rtol=0.02).pattern, DESIRED)
+    return apart(
+        T @ ltcl.compensate(T, DESIRED, inverse=ltcl.invert(T, 0.02), rtol=0.02).pattern, DESIRED
+    )
 
 
 def streamed(device: Device) -> float:
@@ -67,20 +69,31 @@ def compensated(device: Device, scale: float = 1.0, **options: Any) -> ltcl.Comp
 # Each gives an error, and the most it may be.
 CALLS: dict[str, tuple[Callable[[Device], float], float]] = {
     "compensate": (lambda device: compensated(device).error, 0.02),
-    "compensate brightly": (lambda device: compensated(device, 9, gain="auto", loss=0.5).clipped, 1.0),
+    "compensate brightly": (
+        lambda device: compensated(device, 9, gain="auto", loss=0.5).clipped,
+        1.0,
+    ),
     "compensate within bounds": (lambda device: compensated(device, bounds=(0.3, 0.5)).error, 1.0),
     "separate": (separated, 1e-5),
     "relight": (relit, 1e-5),
-    "analyze": (lambda device: ltcl.analyze(SCENE.transport(device=device)).channels[0].spectral_radius, 2.0),
+    "analyze": (
+        lambda device: ltcl.analyze(SCENE.transport(device=device)).channels[0].spectral_radius,
+        2.0,
+    ),
     "matrix iteration": (
-        lambda device: matrix_series(SCENE.transport(device=device).interreflection, rtol=1e-3).residual,
+        lambda device: (
+            matrix_series(SCENE.transport(device=device).interreflection, rtol=1e-3).residual
+        ),
         1e-3,
     ),
     "compress": (compressed, 0.06),
     "compress by rows": (lambda device: compressed(device, basis="haar rows"), 0.06),
     "invert": (inverted, 0.05),
     "form factors": (streamed, 1e-4),
-    **{f"solve by {name}": (lambda device, name=name: residual(device, name), 0.3) for name in METHODS},
+    **{
+        f"solve by {name}": (lambda device, name=name: residual(device, name), 0.3)
+        for name in METHODS
+    },
 }
 
 

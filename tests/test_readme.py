@@ -55,7 +55,9 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     first, _, others = block(r"```py\n(.*?)```", COMPRESSION).partition("\n")
     assert first.startswith("C = ltcl.compress(T, rtol=1e-2)")  # which the shell has done
     exec(others, names | {"C": ltcl.load("small.npz")})  # noqa: S102
-    for command in block(r"tells what else could stand there:\s+```sh\n(.*?)```", ACQUISITION).splitlines():
+    for command in block(
+        r"tells what else could stand there:\s+```sh\n(.*?)```", ACQUISITION
+    ).splitlines():
         _run(command, capsys)
     exec(from_photographs, names)  # noqa: S102
     rig = names["rig"]

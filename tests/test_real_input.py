@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A transport traced by an independent renderer, with the true bounces: ../shared/data/transport-dihedral.
 
-What may be expected of the bounces, from what is known of the file (README.md there): F is wrong by e, 0.93 %
-for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a corner whose form factors sum to
-less than one; noise is n of the picture, in `bounces.npz`, and 0.15 % of T p.
+What may be expected of the bounces, from what is known of the file (README.md there): F is wrong by
+e, 0.93 % for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a corner whose
+form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and 0.15 % of T p.
 
 With F' = (1 + d) F the solve gives b_0' = (1 + d) b_0, and to first order of d, X = S^-1 = I - A,
 
@@ -100,4 +100,6 @@ def test_a_texture_within_reach_is_reproduced(transports, how):
     assert c.clipped == 0.0
     assert np.linalg.norm(matrix @ c.pattern - target) <= 0.01 * np.linalg.norm(target)
     uncompensated = matrix @ (target / T.first_bounce)
-    assert np.linalg.norm(uncompensated - target) > 0.1 * np.linalg.norm(target)  # there was something to do
+    assert np.linalg.norm(uncompensated - target) > 0.1 * np.linalg.norm(
+        target
+    )  # there was something to do

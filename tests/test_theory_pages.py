@@ -44,7 +44,9 @@ def exists(name: str) -> bool:
 
 def test_every_name_of_the_table_of_symbols_exists() -> None:
     table = DUALITY.partition("## Symbols")[2].partition("\n## ")[0]
-    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| $") or "(15)" in line]
+    rows = [
+        line.split(" | ") for line in table.splitlines() if line.startswith("| $") or "(15)" in line
+    ]
     names = [name for row in rows for name in re.findall(r"`([\w.]+)`", row[2])]
     assert len(rows) > 20
     assert all(re.findall(r"`", row[2]) for row in rows)
@@ -93,7 +95,11 @@ def of_beyond() -> Iterator[str]:
     products, launches = Record("methods").content["products"], Record("launches")
     relax = [
         Record("relax").row(question=question, competitor="one product")["ratio"]
-        for question in ("runs of 16, strips of 63", "random, strips of 63", "dense 4096, strips of 8")
+        for question in (
+            "runs of 16, strips of 63",
+            "random, strips of 63",
+            "dense 4096, strips of 8",
+        )
     ]
     yield from map(str, (*steps(launches, "chebyshev"), *steps(launches, "gmres")))
     yield from (str(steps(launches, method)[0]) for method in ("cg", "bicgstab"))
@@ -101,11 +107,15 @@ def of_beyond() -> Iterator[str]:
     yield str(steps(launches, "richardson")[0])
     assert products["jacobi"] == products["neumann"]
     assert products["gauss_seidel"] == products["sor"]
-    order = "chebyshev gmres cg bicgstab gauss_seidel block_gauss_seidel southwell richardson jacobi"
+    order = (
+        "chebyshev gmres cg bicgstab gauss_seidel block_gauss_seidel southwell richardson jacobi"
+    )
     for method in order.split():
         yield from (str(count) for count in products[method].values() if count != "diverged")
     yield f"{Record('walk').facts['steps, M/s']:.1f}"
-    gather = Record("fig8").claim("30 samples a pixel suffice", r"error ([\d.]+%), without ([\d.]+%)")
+    gather = Record("fig8").claim(
+        "30 samples a pixel suffice", r"error ([\d.]+%), without ([\d.]+%)"
+    )
     yield from reversed([*gather])
     yield f"{Record('dense4k').row(competitor='LU kept, float32 (ours: an inverse kept)')['ratio']:.1f}"
     large = Record("resolution131k-xeon")
@@ -124,7 +134,10 @@ def of_beyond() -> Iterator[str]:
     (worst,) = Record("compression").claim("held pictures", r"([\d.]+)")
     yield f"{float(worst):.2f}"
     yield from map(str, steps(launches, "bounded"))
-    within = [re.findall(r"([\d.]+)% ([\d.]+)%", str(fact)) for fact in Record("uncertainty").facts.values()]
+    within = [
+        re.findall(r"([\d.]+)% ([\d.]+)%", str(fact))
+        for fact in Record("uncertainty").facts.values()
+    ]
     for deviations in zip(*(pair for fact in within for pair in fact), strict=True):
         yield from (f"{end(map(float, deviations)):.1f}%" for end in (min, max))
 
@@ -140,7 +153,8 @@ def of_one_camera() -> Iterator[str]:
     traced = Record("traced").facts
     yield percent(traced["corner: bounces of one view, off"]["exact"], 2)
     yield from (
-        percent(traced[f"{scene}: bounces of one view, off"]["exact"], 1) for scene in ("box", "blocks")
+        percent(traced[f"{scene}: bounces of one view, off"]["exact"], 1)
+        for scene in ("box", "blocks")
     )
     gloss = Record("gloss")
     off = {share: [*of_share(gloss, share)] for share in (0.1, 0.2, 0.4)}
@@ -151,7 +165,9 @@ def of_one_camera() -> Iterator[str]:
             yield from gloss.claim("compensation is exact of any gloss", r"(.*)")
     yield from (percent(min(off[0.4][0])), percent(max(off[0.4][0])), percent(min(off[0.4][1])))
     yield from gloss.claim("later bounces are no worse", r"in (\d+ of \d+) scenes")
-    yield from reversed([*Record("fig6").claim("one camera's", r"= ([\d.]+), of the light field ([\d.]+)")])
+    yield from reversed(
+        [*Record("fig6").claim("one camera's", r"= ([\d.]+), of the light field ([\d.]+)")]
+    )
     yield from gloss.claim("negative light in bounce 1", r"is ([\d.]+) to ([\d.]+) times")
     yield from gloss.claim("the warning of section 8.4", r"in (\d+ of \d+) scenes")
     yield from gloss.claim("and not without gloss", r"in (\d+ of \d+) scenes")
@@ -164,7 +180,9 @@ def of_share(gloss: Record, share: float) -> Iterator[tuple[float, ...]]:
 
 
 @pytest.mark.parametrize(
-    ("page", "figures"), [(BEYOND, of_beyond), (ONE_CAMERA, of_one_camera)], ids=["beyond", "one camera"]
+    ("page", "figures"),
+    [(BEYOND, of_beyond), (ONE_CAMERA, of_one_camera)],
+    ids=["beyond", "one camera"],
 )
 def test_figures_in_bold_are_those_of_the_records(page: str, figures: Any) -> None:
     quoted = re.findall(r"\*\*(.+?)\*\*", page)

@@ -25,7 +25,11 @@ SOLVES: dict[str, tuple[Any, np.ndarray, dict[str, Any]]] = {
     "sparse": (scipy.sparse.csr_array(np.eye(N) + _R * (_R > 0.02)), _B, {}),
     "columns of all sizes": (_S, np.outer(_B, [0.0, 1e-38, 1e-300, 1e38]), {}),
     "largest numbers": (_S, np.full(N, np.finfo(np.float32).max), {}),
-    "triangular, far start": (np.eye(N) + np.triu(np.full((N, N), 10.0), 1), _B, {"x0": np.full(N, 1e6)}),
+    "triangular, far start": (
+        np.eye(N) + np.triu(np.full((N, N), 10.0), 1),
+        _B,
+        {"x0": np.full(N, 1e6)},
+    ),
     "grows fast": (np.eye(N) * 1e30, _B, {}),
     "singular": (np.ones((N, N)), _B, {}),
     "zero": (np.zeros((N, N)), _B, {}),

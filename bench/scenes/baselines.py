@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Methods to compare with: `python bench/scenes/baselines.py NAME TRANSPORT TARGETS OUT`.
 
-All solve S x = l, S = T diag(F)^-1 = I + R: the pattern of a target l is x / F, its bounces are b_0 = S^-1 l,
-l <- l - b_0, b_1 = S^-1 l, and so on (eq. 27). They differ in S^-1.
+All solve S x = l, S = T diag(F)^-1 = I + R: the pattern of a target l is x / F, its bounces are b_0
+= S^-1 l, l <- l - b_0, b_1 = S^-1 l, and so on (eq. 27). They differ in S^-1.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ def iteration(T: np.ndarray, out: Path) -> Solver:
             if (off := np.linalg.norm(residual) / np.linalg.norm(l)) <= RTOL:
                 return x
             x = x + residual
-        raise SystemExit(f"the iteration does not converge: {ITERATIONS} leave a residual of {off:.2g}")
+        raise SystemExit(
+            f"the iteration does not converge: {ITERATIONS} leave a residual of {off:.2g}"
+        )
 
     return F, solve
 
@@ -98,7 +100,10 @@ def by_ltcl(compress: bool, transport: Path, l: np.ndarray, out: Path) -> None:
         shown = [out / "compensate" / f"{k}_pattern{end}.exr" for k in range(len(l))]
         split = [[out / "separate" / str(k) / part for part in parts] for k in range(len(l))]
         np.save(out / f"patterns{name}.npy", np.stack([ltcl.images.read(path) for path in shown]))
-        np.save(out / f"bounces{name}.npy", [[ltcl.images.read(path) for path in each] for each in split])
+        np.save(
+            out / f"bounces{name}.npy",
+            [[ltcl.images.read(path) for path in each] for each in split],
+        )
 
 
 METHODS: dict[str, Callable[[Path, np.ndarray, Path], None]] = {

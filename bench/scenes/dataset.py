@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The files of a scene: two measurements of T by bounces, and photographs of patterns that T never saw.
 
-README.md tells the format. A traced scene comes of Mitsuba; a simulated one, for machines without LLVM, of
-ltcl's form factors: T_k = A^k F, each measurement with noise of its own.
+README.md tells the format. A traced scene comes of Mitsuba; a simulated one, for machines without
+LLVM, of ltcl's form factors: T_k = A^k F, each measurement with noise of its own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ SIMULATED = {
     "coloured": lambda n: scenes.trihedral(n, albedo=tracing.TRACED["coloured"].albedo),
 }
 PATTERNS = ("white", "smooth", "landscape", "text", "checkerboard", "stripes", "pixel", "pixel 2")
-SIZE, PATHS, SAMPLES = 64, 2560, 10_000  # pixels; paths a camera pixel of the first T, of a photograph
+SIZE, PATHS, SAMPLES = (
+    64,
+    2560,
+    10_000,
+)  # pixels; paths a camera pixel of the first T, of a photograph
 _BETTER = 4  # times the paths: the second measurement, which judges
 _NOISE = 1e-3  # of what is simulated
 
@@ -39,10 +43,16 @@ def patterns(grid: tuple[int, int], channels: int) -> np.ndarray:
     (h, w), (y, x) = grid, np.indices(grid)
     page = np.zeros(grid, np.uint8)
     for line in range(10, h + 8, 11):
-        cv2.putText(page, "light bounces"[line % 5 :], (1, line), cv2.FONT_HERSHEY_PLAIN, 0.7, (255,))
-    pixels = [(y == row) & (x == column) for row, column in ((h // 4, w // 4), (h // 2, w // 2 + 1))]
+        cv2.putText(
+            page, "light bounces"[line % 5 :], (1, line), cv2.FONT_HERSHEY_PLAIN, 0.7, (255,)
+        )
+    pixels = [
+        (y == row) & (x == column) for row, column in ((h // 4, w // 4), (h // 2, w // 2 + 1))
+    ]
     smooth = 0.5 + 0.4 * np.sin(7 * x / w + 4 * y / h)
-    photograph = cv2.resize(scenes.landscape(480, 480).mean(axis=2), (w, h), interpolation=cv2.INTER_AREA)
+    photograph = cv2.resize(
+        scenes.landscape(480, 480).mean(axis=2), (w, h), interpolation=cv2.INTER_AREA
+    )
     boards = (x * 8 // w + y * 8 // h) % 2, x % 2
     values = np.stack([np.ones(grid), smooth, photograph, page / 255, *boards, *pixels])
     values = (0.8 * values).astype(np.float32)
@@ -102,7 +112,9 @@ def found(data: Path) -> dict[str, Scene]:
     return {name: Scene(data / name) for name in NAMES if (data / name / "scene.json").exists()}
 
 
-def trace(folder: Path, name: str, size: int = SIZE, paths: int = PATHS, samples: int = SAMPLES) -> None:
+def trace(
+    folder: Path, name: str, size: int = SIZE, paths: int = PATHS, samples: int = SAMPLES
+) -> None:
     """A scene of `tracing.TRACED`, with Mitsuba, size x size pixels."""
     start, grid, traced = time.process_time(), (size, size), tracing.TRACED[name]
     p = patterns(grid, traced.channels)

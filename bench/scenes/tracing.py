@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """T of a scene by bounces, and photographs of it, of an independent renderer: Mitsuba 3 traces.
 
-Nothing here uses an inverse. Paths of `trace` begin in a camera pixel i. Every vertex is connected to the
-projector, whose pixel j shines there: what it reflects towards the path is a sample of T[i, j], of the bounce
-that the vertex is. So one pass yields whole rows. `photographs` are Mitsuba's own, by its path integrator and
-its projector. Camera and projector are one pinhole; pixel j of the projector gives irradiance 1 on a plane at
-distance 1. Mitsuba's wavefronts need LLVM: `unavailable` says why they do not run.
+Nothing here uses an inverse. Paths of `trace` begin in a camera pixel i. Every vertex is connected
+to the projector, whose pixel j shines there: what it reflects towards the path is a sample of T[i,
+j], of the bounce that the vertex is. So one pass yields whole rows. `photographs` are Mitsuba's
+own, by its path integrator and its projector. Camera and projector are one pinhole; pixel j of the
+projector gives irradiance 1 on a plane at distance 1. Mitsuba's wavefronts need LLVM: `unavailable`
+says why they do not run.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ _DEPTH = 64  # vertices of a path
 _SIZE, _SURE = 1 << 22, 4  # paths at once; vertices before Russian roulette
 _VARIANT = "llvm_ad_rgb"
 # Middle, half of the sides, and degrees around y.
-_BLOCKS = ((-0.2, -0.2, 0.35), (0.14, 0.3, 0.14), 20.0), ((0.2, -0.35, 0.65), (0.15, 0.15, 0.15), -17.0)
+_BLOCKS = (
+    ((-0.2, -0.2, 0.35), (0.14, 0.3, 0.14), 20.0),
+    ((0.2, -0.35, 0.65), (0.15, 0.15, 0.15), -17.0),
+)
 _FRONT = ((0.5, -0.5, 1), (-1, 0, 0), (0, 1, 0))  # closes the box
 
 
@@ -33,7 +37,8 @@ _FRONT = ((0.5, -0.5, 1), (-1, 0, 0), (0, 1, 0))  # closes the box
 class Traced:
     """Walls, their albedo (one, or (walls, 3) in colour), and where the pinhole is on the z axis.
 
-    `tangent` is of half the frame, which walls fill; `roughness` above 0 coats the walls with a glossy layer.
+    `tangent` is of half the frame, which walls fill; `roughness` above 0 coats the walls with a
+    glossy layer.
     """
 
     about: str
@@ -78,13 +83,21 @@ TRACED = {
     "coloured": Traced("three walls, red, green and white", SCENES["trihedral"], _PAINTS, 0.226),
     "box": Traced("a box without its front, albedo 0.7", SCENES["box"], 0.7, 0.2499),
     "blocks": Traced(
-        "a box without its front, two blocks in it, albedo 0.6", SCENES["box"], 0.6, 0.2499, blocks=_BLOCKS
+        "a box without its front, two blocks in it, albedo 0.6",
+        SCENES["box"],
+        0.6,
+        0.2499,
+        blocks=_BLOCKS,
     ),
     "glossy": Traced(
         "two walls, albedo 0.6 below a glossy coat", SCENES["dihedral"], 0.6, 0.1666, roughness=0.2
     ),
     "closed": Traced(
-        "a closed box, albedo 0.7, seen from a pinhole in it", (*SCENES["box"], _FRONT), 0.7, 1.0, eye=0.98
+        "a closed box, albedo 0.7, seen from a pinhole in it",
+        (*SCENES["box"], _FRONT),
+        0.7,
+        1.0,
+        eye=0.98,
     ),
 }
 
@@ -107,7 +120,8 @@ def version() -> str:
 def trace(name: str, grid: tuple[int, int], paths: int, seed: int) -> np.ndarray:
     """T by bounces (`BOUNCES`, N, N) float32 of a scene of `TRACED`, in colour (`BOUNCES`, 3, N, N).
 
-    Their sum is T. A camera pixel sends at least so many `paths`. Seeds give independent measurements.
+    Their sum is T. A camera pixel sends at least so many `paths`. Seeds give independent
+    measurements.
     """
     import mitsuba as mi
 
@@ -118,7 +132,11 @@ def trace(name: str, grid: tuple[int, int], paths: int, seed: int) -> np.ndarray
     tangent, channels = traced.tangent, traced.channels
     world, (h, w), n = mi.load_dict(traced.describe(mi)), grid, grid[0] * grid[1]
     T = dr.zeros(mi.Float, BOUNCES * channels * n * n)
-    eye, context, random = mi.Point3f(0.0, 0.0, traced.eye), mi.BSDFContext(), np.random.default_rng(seed)
+    eye, context, random = (
+        mi.Point3f(0.0, 0.0, traced.eye),
+        mi.BSDFContext(),
+        np.random.default_rng(seed),
+    )
     passes = -(-paths * n // _SIZE)
     count = math.ceil(math.sqrt(paths / passes)) ** 2
     for _ in range(passes):
@@ -139,7 +157,11 @@ def trace(name: str, grid: tuple[int, int], paths: int, seed: int) -> np.ndarray
             u, v = 0.5 + 0.5 * ways.x / (far * tangent), 0.5 - 0.5 * ways.y / (far * tangent)
             lit = active & (far > 0.0) & (u >= 0.0) & (u < 1.0) & (v >= 0.0) & (v < 1.0)
             lit &= ~world.ray_test(hit.spawn_ray_to(eye), lit)
-            j = i if k == 0 else dr.minimum(mi.UInt32(v * h), h - 1) * w + dr.minimum(mi.UInt32(u * w), w - 1)
+            j = (
+                i
+                if k == 0
+                else dr.minimum(mi.UInt32(v * h), h - 1) * w + dr.minimum(mi.UInt32(u * w), w - 1)
+            )
             value = weight * bsdf.eval(context, hit, hit.to_local(-dr.normalize(ways)), lit)
             value *= dr.norm(ways) / far**3  # irradiance across the ray, of 1 at distance 1
             for channel in range(channels):
@@ -164,8 +186,8 @@ def trace(name: str, grid: tuple[int, int], paths: int, seed: int) -> np.ndarray
 def photographs(name: str, patterns: np.ndarray, samples: int, seed: int) -> np.ndarray:
     """Pictures of the scene under each of the patterns, (K, h, w) or (K, h, w, 3) in [0, 1], of its shape.
 
-    Rendered by Mitsuba's path integrator and projector emitter. In a scene without colour three patterns are
-    rendered at once, as red, green and blue.
+    Rendered by Mitsuba's path integrator and projector emitter. In a scene without colour three
+    patterns are rendered at once, as red, green and blue.
     """
     import mitsuba as mi
 
@@ -175,8 +197,14 @@ def photographs(name: str, patterns: np.ndarray, samples: int, seed: int) -> np.
         filled = np.zeros((-(-count // 3) * 3, h, w), np.float32)
         filled[:count] = patterns
         patterns = np.moveaxis(filled.reshape(-1, 3, h, w), 1, -1)
-    there = mi.ScalarTransform4f().look_at(origin=[0, 0, traced.eye], target=[0, 0, 0], up=[0, 1, 0])
-    pinhole = {"to_world": there, "fov": math.degrees(2 * math.atan(traced.tangent)), "fov_axis": "x"}
+    there = mi.ScalarTransform4f().look_at(
+        origin=[0, 0, traced.eye], target=[0, 0, 0], up=[0, 1, 0]
+    )
+    pinhole = {
+        "to_world": there,
+        "fov": math.degrees(2 * math.atan(traced.tangent)),
+        "fov_axis": "x",
+    }
     film = {
         "type": "hdrfilm",
         "component_format": "float32",
@@ -195,7 +223,9 @@ def photographs(name: str, patterns: np.ndarray, samples: int, seed: int) -> np.
         projector = {"type": "projector", **pinhole, "irradiance": texture, "scale": 1.0 / math.pi}
         lit = {"projector": projector, "sensor": sensor}
         scene = mi.load_dict(traced.describe(mi) | lit | {"integrator": integrator})
-        pictures.append(np.array(mi.render(scene, spp=samples, seed=mi.UInt32(seed * len(patterns) + k))))
+        pictures.append(
+            np.array(mi.render(scene, spp=samples, seed=mi.UInt32(seed * len(patterns) + k)))
+        )
     image = np.stack(pictures)
     return image if traced.channels == 3 else np.moveaxis(image, -1, 1).reshape(-1, h, w)[:count]
 

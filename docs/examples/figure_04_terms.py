@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Figure 4: the series takes the bounces out
-==========================================
+"""Figure 4: the series takes the bounces out ==========================================
 
-A closed box with a red and a green wall. Each term of the inverse series takes away more of the light that
-bounced: the first takes too much, the second gives some of it back, and so on. What is left in the end is
-the direct light.
+A closed box with a red and a green wall. Each term of the inverse series takes away more of the
+light that bounced: the first takes too much, the second gives some of it back, and so on. What is
+left in the end is the direct light.
 
-``bench/fig4.py`` computes and draws it, and checks what the paper says about it with 16 patches along a
-wall; here are 8.
+``bench/fig4.py`` computes and draws it, and checks what the paper says about it with 16 patches
+along a wall; here are 8.
 """
 
 import fig4

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Figure 5: when the series converges
-===================================
+"""Figure 5: when the series converges ===================================
 
-The paper's series needs walls that are not too bright, or a box that is open. Chebyshev's iteration, which
-ltcl uses, undoes the same boxes in about ten steps, whatever the walls.
+The paper's series needs walls that are not too bright, or a box that is open. Chebyshev's
+iteration, which ltcl uses, undoes the same boxes in about ten steps, whatever the walls.
 
 ``bench/fig5.py`` computes and draws it, there with 16 patches along a wall, here with 6.
 """

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Figure 7: time over resolution
-==============================
+"""Figure 7: time over resolution ==============================
 
-How long it takes to find the direct light of a picture, from 128 to 131 072 pixels, with an error of at
-most 1 %. A matrix inverse by the series is the slowest way; two sides in wavelets, on which ltcl's
-compressed transports rest, is the fastest.
+How long it takes to find the direct light of a picture, from 128 to 131 072 pixels, with an error
+of at most 1 %. A matrix inverse by the series is the slowest way; two sides in wavelets, on which
+ltcl's compressed transports rest, is the fastest.
 
-These are measured times: this page draws the record of ``bench/fig7.py``, ``bench/results/fig7.json``.
+These are measured times: this page draws the record of ``bench/fig7.py``,
+``bench/results/fig7.json``.
 """
 
 import json

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Figure 9: every bounce as a picture
-===================================
+"""Figure 9: every bounce as a picture ===================================
 
-Green light falls on the left wall only. The first bounce is on the right wall, the second on the left one,
-and so on: no flat wall lights itself. Below, a glossy board stands in the corner; its highlight is in the
-direct light alone.
+Green light falls on the left wall only. The first bounce is on the right wall, the second on the
+left one, and so on: no flat wall lights itself. Below, a glossy board stands in the corner; its
+highlight is in the direct light alone.
 
-``bench/fig9.py`` computes and draws it, there with 24 and 14 patches along a wall, here with 12 and 5.
+``bench/fig9.py`` computes and draws it, there with 24 and 14 patches along a wall, here with 12 and
+5.
 """
 
 import fig9

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Figure 10: every pixel lights every other
-=========================================
+"""Figure 10: every pixel lights every other =========================================
 
-A picture on a corner of two coloured walls, the pattern that makes it, and its light by bounces. T is never
-formed: its rows are compressed as they come.
+A picture on a corner of two coloured walls, the pattern that makes it, and its light by bounces. T
+is never formed: its rows are compressed as they come.
 
-``bench/resolution131k.py`` does this for 131 072 pixels; here are 2048, by the same code. The record of the
-large one stands in :doc:`../auto_tutorials/6_large`.
+``bench/resolution131k.py`` does this for 131 072 pixels; here are 2048, by the same code. The
+record of the large one stands in :doc:`../auto_tutorials/6_large`.
 """
 
 import ltcl

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-A camera of more pixels
-=======================
+"""A camera of more pixels =======================
 
-The camera has more pixels than the projector: T is then not square, and has no inverse. ltcl finds the
-pattern whose picture is closest to the wanted one, as the camera sees it.
+The camera has more pixels than the projector: T is then not square, and has no inverse. ltcl finds
+the pattern whose picture is closest to the wanted one, as the camera sees it.
 """
 
 import ltcl
@@ -22,7 +20,11 @@ result = ltcl.compensate(T, wanted)
 print(f"error {result.error:.1%}: what is finer than a pixel of the projector cannot be had")
 
 figure = pictures(
-    {"wanted, 30 x 60": wanted, "pattern, 10 x 20": result.pattern, "seen, 30 x 60": result.appearance}
+    {
+        "wanted, 30 x 60": wanted,
+        "pattern, 10 x 20": result.pattern,
+        "seen, 30 x 60": result.appearance,
+    }
 )
 
 # sphinx_gallery_thumbnail_number = 4

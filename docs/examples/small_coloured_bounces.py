@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Light takes the colour of what it met
-=====================================
+"""Light takes the colour of what it met =====================================
 
-White light falls on one red wall. The first bounce makes the blue wall and the floor purple and red; each
-further one is redder.
+White light falls on one red wall. The first bounce makes the blue wall and the floor purple and
+red; each further one is redder.
 """
 
 import numpy as np
@@ -12,7 +10,9 @@ import numpy as np
 import ltcl
 from ltcl.plots import pictures
 
-corner = ltcl.scenes.box(14, sides=3, albedo=[(0.9, 0.25, 0.2), (0.45, 0.5, 0.9), (0.85, 0.85, 0.8)])
+corner = ltcl.scenes.box(
+    14, sides=3, albedo=[(0.9, 0.25, 0.2), (0.45, 0.5, 0.9), (0.85, 0.85, 0.8)]
+)
 T = corner.transport(first_bounce="exact")
 
 pattern = np.zeros((14, 42, 3))
@@ -28,7 +28,11 @@ def view(light):
 
 
 figure = pictures(
-    {"seen": view(seen), "direct light": view(parts.direct), "all bounces": view(seen - parts.direct)},
+    {
+        "seen": view(seen),
+        "direct light": view(parts.direct),
+        "all bounces": view(seen - parts.direct),
+    },
     {
         f"bounce {k}\n{3**k} times as bright": view(3**k * light)
         for k, light in enumerate(parts.bounces, start=1)

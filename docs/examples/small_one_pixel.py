@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-One pixel alone
-===============
+"""One pixel alone ===============
 
-Random walks find the direct light of single pixels, without the others. Each value has a standard error;
-ask for a smaller one, and more walks are taken.
+Random walks find the direct light of single pixels, without the others. Each value has a standard
+error; ask for a smaller one, and more walks are taken.
 """
 
 import numpy as np
@@ -24,14 +22,20 @@ figure = Figure(figsize=(8, 4), facecolor=PAPER)
 axes = figure.add_axes((0.1, 0.15, 0.86, 0.75), facecolor=PAPER)
 counts = 4 ** np.arange(1, 9)
 for seed, colour in enumerate(("#5cc8ff", "#ffb347", "#8bd17c")):
-    solves = [ltcl.solve(S, b, "monte_carlo", pixels=[pixel], samples=int(n), seed=seed) for n in counts]
+    solves = [
+        ltcl.solve(S, b, "monte_carlo", pixels=[pixel], samples=int(n), seed=seed) for n in counts
+    ]
     values = [float(s.x[0]) for s in solves]
     errors = [float(s.standard_error[0]) for s in solves]
-    axes.errorbar(counts * 1.08**seed, values, errors, fmt="o", color=colour, capsize=3, label=f"seed {seed}")
+    axes.errorbar(
+        counts * 1.08**seed, values, errors, fmt="o", color=colour, capsize=3, label=f"seed {seed}"
+    )
 axes.axhline(truth, color=INK, ls=":", label="exact")
 axes.set_xscale("log")
 axes.set_xlabel("walks", color=FAINT)
-axes.set_title("direct light of one pixel, with its standard error", color=INK, loc="left", fontsize=11)
+axes.set_title(
+    "direct light of one pixel, with its standard error", color=INK, loc="left", fontsize=11
+)
 axes.grid(color=GRID)
 axes.tick_params(colors=FAINT)
 axes.spines[:].set_visible(False)

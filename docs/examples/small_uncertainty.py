@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-How sure is a bounce?
-=====================
+"""How sure is a bounce? =====================
 
-A measured T is noisy, and so are the bounces that are found with it. ``std`` says by how much, pixel by
-pixel. Here the truth is known: where ltcl says one standard deviation, about two thirds of the errors are
-within it.
+A measured T is noisy, and so are the bounces that are found with it. ``std`` says by how much,
+pixel by pixel. Here the truth is known: where ltcl says one standard deviation, about two thirds of
+the errors are within it.
 """
 
 import numpy as np
@@ -17,7 +15,9 @@ corner = ltcl.scenes.dihedral(14, albedo=0.75)
 true = corner.transport().to_numpy()
 random = np.random.default_rng(0)
 measured, again = (true + 3e-4 * random.normal(size=true.shape) for _ in range(2))
-T = ltcl.Transport(measured, corner.grid, noise=ltcl.Transport(again, corner.grid))  # two measurements tell
+T = ltcl.Transport(
+    measured, corner.grid, noise=ltcl.Transport(again, corner.grid)
+)  # two measurements tell
 
 white = (true @ np.ones(len(true))).reshape(corner.grid)
 parts = ltcl.separate(T, white, bounces=2)

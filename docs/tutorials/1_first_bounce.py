@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Your first bounce of light
-==========================
+"""Your first bounce of light ==========================
 
-Ten minutes, no hardware. You throw a picture into the corner of a room, see why it looks wrong, and let
-ltcl find the pattern that makes it look right. Then you take the light apart, bounce by bounce.
+Ten minutes, no hardware. You throw a picture into the corner of a room, see why it looks wrong, and
+let ltcl find the pattern that makes it look right. Then you take the light apart, bounce by bounce.
 
-You need ltcl (``pip install ltcl``) and a little Python. Each block below can be copied into a Python
-prompt or a notebook, in this order.
+You need ltcl (``pip install ltcl``) and a little Python. Each block below can be copied into a
+Python prompt or a notebook, in this order.
 """
 
 # %%
 # A corner, and a picture for it
 # ------------------------------
 #
-# ltcl can compute rooms. This one is the corner of a room: a red wall, a yellow wall and a pink floor. Each
-# has 16 x 16 small squares, *pixels* of the projector. The numbers are the red, green and blue light that a
-# wall gives back.
+# ltcl can compute rooms. This one is the corner of a room: a red wall, a yellow wall and a pink
+# floor. Each has 16 x 16 small squares, *pixels* of the projector. The numbers are the red, green
+# and blue light that a wall gives back.
 
 import ltcl
 from ltcl.plots import pictures
@@ -40,8 +38,8 @@ figure = pictures({"the picture": photo, "on the walls": view(wanted)}, width=64
 # What happens without ltcl
 # -------------------------
 #
-# A projector now throws just this picture. ``transport`` knows what each pixel of the projector does to
-# each pixel of the walls; ``@`` sends a pattern through it.
+# A projector now throws just this picture. ``transport`` knows what each pixel of the projector
+# does to each pixel of the walls; ``@`` sends a pattern through it.
 
 transport = corner.transport()
 as_it_is = transport @ wanted
@@ -49,9 +47,9 @@ as_it_is = transport @ wanted
 figure = pictures({"wanted": view(wanted), "seen": view(as_it_is)}, width=640)
 
 # %%
-# Two things went wrong. The walls have colours. And they light each other: light that meets the red wall
-# goes on to the floor and to the other wall, and makes them red, too. Most of it collects where the walls
-# meet.
+# Two things went wrong. The walls have colours. And they light each other: light that meets the red
+# wall goes on to the floor and to the other wall, and makes them red, too. Most of it collects
+# where the walls meet.
 #
 # What happens with ltcl
 # ----------------------
@@ -60,20 +58,24 @@ result = ltcl.compensate(transport, wanted, gain="auto")
 print(f"error {result.error:.1%}, at {result.gain:.0%} of the brightness")
 
 then = result.appearance / result.gain
-figure = pictures({"throw this pattern": view(result.pattern), "and this is seen": view(then)}, width=640)
+figure = pictures(
+    {"throw this pattern": view(result.pattern), "and this is seen": view(then)}, width=640
+)
 
 # %%
-# The pattern is green and blue where the walls are red, and darker where other walls will add their light.
+# The pattern is green and blue where the walls are red, and darker where other walls will add their
+# light.
 #
-# ``gain="auto"`` makes the picture as bright as the projector can. It is darker than the one that we asked
-# for, as a red wall gives back little blue. Here both are drawn with the same brightness.
+# ``gain="auto"`` makes the picture as bright as the projector can. It is darker than the one that
+# we asked for, as a red wall gives back little blue. Here both are drawn with the same brightness.
 #
 # The first bounce
 # ----------------
 #
-# Look at the wrong picture again. Some of its light has met one wall: from the projector to the wall, from
-# the wall to your eye. This is the *direct light*. Other light has met two walls (one bounce), three walls
-# (two bounces), and so on. A camera sees only their sum. ltcl takes the sum apart:
+# Look at the wrong picture again. Some of its light has met one wall: from the projector to the
+# wall, from the wall to your eye. This is the *direct light*. Other light has met two walls (one
+# bounce), three walls (two bounces), and so on. A camera sees only their sum. ltcl takes the sum
+# apart:
 
 parts = ltcl.separate(transport, as_it_is, bounces=3)
 
@@ -84,8 +86,8 @@ for number, light in enumerate(parts.bounces, start=1):
 figure = pictures(shown)
 
 # %%
-# The direct light has all of the detail. Each bounce is smoother and redder than the one before it, since
-# red is the colour that these walls give back best.
+# The direct light has all of the detail. Each bounce is smoother and redder than the one before it,
+# since red is the colour that these walls give back best.
 #
 # Nothing was lost: the parts add up to the picture.
 
@@ -96,8 +98,8 @@ print(f"largest difference: {abs(total - as_it_is).max():.1g}")
 # A room with less light between its walls
 # ----------------------------------------
 #
-# Now the parts can be put together in another way. This is the same picture with all bounces switched off,
-# and with the first one made three times stronger.
+# Now the parts can be put together in another way. This is the same picture with all bounces
+# switched off, and with the first one made three times stronger.
 
 no_bounce = parts.direct
 strong = parts.direct + 3 * parts.bounces[0]
@@ -116,14 +118,14 @@ figure = pictures(
 # ===================  ======================  =================================================
 # in this page         in the paper            what it is
 # ===================  ======================  =================================================
-# ``transport``        T                       picture = T pattern; a column for each projector pixel
-# ``result.pattern``   p                       the pattern, so that T p is the picture that you want
-# ``parts.direct``     l\ :sub:`d`             the direct light
-# ``parts.bounces``    A l\ :sub:`d`, ...      bounce 1, bounce 2 and so on
-# ===================  ======================  =================================================
+# ``transport``        T                       picture = T pattern; a column for each projector
+# pixel ``result.pattern``   p                       the pattern, so that T p is the picture that
+# you want ``parts.direct``     l\ :sub:`d`             the direct light ``parts.bounces``    A l\
+# :sub:`d`, ...      bounce 1, bounce 2 and so on ===================  ======================
+# =================================================
 #
 # Where to go on: :doc:`with a matrix that you have <2_my_matrix>`, :doc:`with a corner of your own
-# <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser with
-# sliders. ``ltcl demo`` makes the pictures of this page with more pixels.
+# <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser
+# with sliders. ``ltcl demo`` makes the pictures of this page with more pixels.
 
 # sphinx_gallery_thumbnail_number = 9

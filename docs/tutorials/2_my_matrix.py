@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-I have a matrix
-===============
+"""I have a matrix ===============
 
-You have measured or computed light transport yourself, and it is in a file. This page reads it, asks
-whether it is good enough, and uses it: with its noise, and with pixels that no light reaches.
+You have measured or computed light transport yourself, and it is in a file. This page reads it,
+asks whether it is good enough, and uses it: with its noise, and with pixels that no light reaches.
 """
 
 # %%
@@ -12,12 +10,12 @@ whether it is good enough, and uses it: with its noise, and with pixels that no 
 # -----------------
 #
 # One matrix T for each colour. Column j is the picture that the camera sees when projector pixel j alone is
-# lit with light of 1, unrolled row by row. The picture is on the same grid as the projector, so T is
-# square. The numbers are *linear* light: twice the light, twice the number. Undo the gamma of the camera
-# first.
+# lit with light of 1, unrolled row by row. The picture is on the same grid as the projector, so T
+# is square. The numbers are *linear* light: twice the light, twice the number. Undo the gamma of
+# the camera first.
 #
-# We make such a file here: two white walls that meet in a corner, 12 x 24 pixels. To be like a measured one
-# it has noise, and three projector pixels miss the walls.
+# We make such a file here: two white walls that meet in a corner, 12 x 24 pixels. To be like a
+# measured one it has noise, and three projector pixels miss the walls.
 
 import tempfile
 from pathlib import Path
@@ -43,15 +41,16 @@ scipy.io.savemat(folder / "T.mat", {"LTM": measured})
 # Read it
 # -------
 #
-# An ``.npy`` file holds the numbers only. The grid, height and width, you have to tell. A ``.mat`` file has
-# names in it: without ``variable=`` ltcl looks for ``LTM``.
+# An ``.npy`` file holds the numbers only. The grid, height and width, you have to tell. A ``.mat``
+# file has names in it: without ``variable=`` ltcl looks for ``LTM``.
 
 T = ltcl.load(folder / "T.npy", grid=(12, 24))
 same = ltcl.load(folder / "T.mat", grid=(12, 24))
 print(T.shape, T.grid, np.abs(T.to_numpy() - same.to_numpy()).max())
 
 # %%
-# A wrong grid is the most common mistake. Rows of T are then smooth on another grid, and ltcl says so:
+# A wrong grid is the most common mistake. Rows of T are then smooth on another grid, and ltcl says
+# so:
 
 import logging
 
@@ -66,11 +65,14 @@ print("\n".join(said))
 # Look at it
 # ----------
 #
-# A column of T is what one projector pixel lights. A row is where the light of one camera pixel comes from.
-# The largest number is the lit pixel itself; the rest, here 20 times as bright, is light that bounced.
+# A column of T is what one projector pixel lights. A row is where the light of one camera pixel
+# comes from. The largest number is the lit pixel itself; the rest, here 20 times as bright, is
+# light that bounced.
 
 pixel = 6 * 24 + 8
-column, row = (20 * T.to_numpy()[at].reshape(T.grid) for at in ((slice(None), pixel), (pixel, slice(None))))
+column, row = (
+    20 * T.to_numpy()[at].reshape(T.grid) for at in ((slice(None), pixel), (pixel, slice(None)))
+)
 white = T @ np.ones(T.grid)
 figure = pictures({"one column\n× 20": column, "one row\n× 20": row, "all pixels lit": 0.8 * white})
 
@@ -83,14 +85,15 @@ print(T.dark)
 # Is it good enough?
 # ------------------
 #
-# ``analyze`` answers in two sentences. They come from many numbers (:doc:`../reference/json` lists them).
+# ``analyze`` answers in two sentences. They come from many numbers (:doc:`../reference/json` lists
+# them).
 
 analysis = ltcl.analyze(T)
 print(analysis.verdict.text)
 
 # %%
-# Here it finds fault with bounces: noise can make one a little negative, which no light is. And it names
-# the part of the picture where the three pixels are.
+# Here it finds fault with bounces: noise can make one a little negative, which no light is. And it
+# names the part of the picture where the three pixels are.
 #
 # How large the noise is was not told: it is estimated from T itself, where T should be smooth.
 
@@ -104,14 +107,16 @@ wanted = 0.5 * corner.sample(ltcl.scenes.landscape(240, 480)[..., 1]) + 0.2
 result = ltcl.compensate(T, wanted, gain="auto")
 print(f"error {result.error:.1%} at {result.gain:.0%} of the brightness")
 lights = {"wanted": wanted, "pattern": result.pattern, "seen": result.appearance / result.gain}
-figure = pictures({name: corner.view(light, size=320, supersample=2) for name, light in lights.items()})
+figure = pictures(
+    {name: corner.view(light, size=320, supersample=2) for name, light in lights.items()}
+)
 
 # %%
 # How sure are bounces?
 # ---------------------
 #
-# Noise of T makes the bounces uncertain, and the more so the later the bounce. ``std`` has a number for
-# each pixel. Read it before you believe a small bounce.
+# Noise of T makes the bounces uncertain, and the more so the later the bounce. ``std`` has a number
+# for each pixel. Read it before you believe a small bounce.
 
 parts = ltcl.separate(T, white, bounces=3)
 for number, (light, std) in enumerate(zip(parts.bounces, parts.std.bounces, strict=True), start=1):
@@ -121,8 +126,8 @@ for number, (light, std) in enumerate(zip(parts.bounces, parts.std.bounces, stri
 # Less noise
 # ----------
 #
-# ``denoise`` makes use of what is known about light: what pixel i sends to j, pixel j sends to i, and far
-# from the direct light T is smooth.
+# ``denoise`` makes use of what is known about light: what pixel i sends to j, pixel j sends to i,
+# and far from the direct light T is smooth.
 
 better = ltcl.denoise(T)
 
@@ -150,7 +155,7 @@ ltcl.save(folder / "T.npz", better)
 #    # a photograph of the scene in linear light, or what 'compensate' has made
 #    ltcl separate T.npz out/picture_appearance.exr --out out
 #
-# Formats and their limits stand in :doc:`../reference/formats`; noise, dark pixels and deviations in
-# :doc:`../guide/noise`.
+# Formats and their limits stand in :doc:`../reference/formats`; noise, dark pixels and deviations
+# in :doc:`../guide/noise`.
 
 # sphinx_gallery_thumbnail_number = 7

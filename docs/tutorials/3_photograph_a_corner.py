@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-Photograph your own corner
-==========================
+"""Photograph your own corner ==========================
 
-With any projector, and a camera or phone that can hold its settings. ltcl tells you what to project and how
-long to expose; you take the photographs; ltcl checks each of them and makes the transport of your corner.
+With any projector, and a camera or phone that can hold its settings. ltcl tells you what to project
+and how long to expose; you take the photographs; ltcl checks each of them and makes the transport
+of your corner.
 
-There is a :doc:`checklist to print <../checklist>`. This page does the whole thing once, with a small
-simulated corner in place of yours, and then makes every mistake, to show what ltcl says.
+There is a :doc:`checklist to print <../checklist>`. This page does the whole thing once, with a
+small simulated corner in place of yours, and then makes every mistake, to show what ltcl says.
 """
 
 # %%
@@ -22,9 +21,9 @@ simulated corner in place of yours, and then makes every mistake, to show what l
 # 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes does.
 # 4. Install what shows patterns on a projector, ``python -m pip install ".[projector]"``, and for raw files
 #    ``".[camera]"``. Let the projector extend the desktop of your computer, not mirror it.
-# 5. Make a folder ``scan``, with a file ``acquisition.toml`` in it. It says how many pixels you want, and
-#    which exposures your camera has, in seconds: 0.0167 is 1/60 s. Without that line ltcl asks for any
-#    time, such as 0.0783 s. Begin with few pixels; the time grows with their number.
+# 5. Make a folder ``scan``, with a file ``acquisition.toml`` in it. It says how many pixels you
+# want, and which exposures your camera has, in seconds: 0.0167 is 1/60 s. Without that line ltcl
+# asks for any time, such as 0.0783 s. Begin with few pixels; the time grows with their number.
 #
 # .. code-block:: toml
 #
@@ -52,22 +51,22 @@ simulated corner in place of yours, and then makes every mistake, to show what l
 #    ltcl acquire run scan --take CARD
 #
 # The last command also writes the next patterns. So you repeat the second and the third, six to eight times:
-# ltcl first needs to see white and black to know how long to expose, then stripes to know where each pixel
-# lands, then the patterns of the scan. ``ltcl acquire run scan`` can be stopped at any time, and goes on
-# where it was.
+# ltcl first needs to see white and black to know how long to expose, then stripes to know where
+# each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be stopped at any
+# time, and goes on where it was.
 #
 # * Each pattern on the list needs one photograph, with the exposure that stands there, in that order.
 # * ``--take`` copies new files in the order of the numbers in their names. Older ones may stay in CARD. There
-#   must be as many new ones as are missing: delete those that are too many. Of a camera that saves a raw and
-#   a JPEG file of each photograph, leave the raw ones only.
-# * A photograph that is refused: delete it in ``scan/photographs``, and in CARD. Then ``ltcl acquire run
-#   scan`` asks for it again, and ``ltcl show scan`` shows its pattern alone.
+# must be as many new ones as are missing: delete those that are too many. Of a camera that saves a
+# raw and a JPEG file of each photograph, leave the raw ones only. * A photograph that is refused:
+# delete it in ``scan/photographs``, and in CARD. Then ``ltcl acquire run scan`` asks for it again,
+# and ``ltcl show scan`` shows its pattern alone.
 #
 # At the end
 # ----------
 #
-# ``ltcl acquire run scan`` ends with a report, whose last line says what the measurement is good for. Do not
-# move projector and camera: the walls can now be given any picture.
+# ``ltcl acquire run scan`` ends with a report, whose last line says what the measurement is good
+# for. Do not move projector and camera: the walls can now be given any picture.
 #
 # .. code-block:: sh
 #
@@ -75,15 +74,16 @@ simulated corner in place of yours, and then makes every mistake, to show what l
 #    ltcl show shown/picture_pattern.png
 #    ltcl separate scan/transport.zarr shown/picture_appearance.exr --out shown
 #
-# The pattern has one pixel for each of ``projector_grid``. ``ltcl show`` makes them as large as they were in
-# the scan, and puts them in the same place; another program would not. ``shown/separate.png`` has the
-# bounces of light.
+# The pattern has one pixel for each of ``projector_grid``. ``ltcl show`` makes them as large as
+# they were in the scan, and puts them in the same place; another program would not.
+# ``shown/separate.png`` has the bounces of light.
 #
 # The same in Python, with a stand-in for you
 # -------------------------------------------
 #
-# ``camera`` is a corner of two white walls with a camera in front. ``photographer`` does what you would do:
-# look at the list, show the pattern, take the photograph, save it under the name on the list.
+# ``camera`` is a corner of two white walls with a camera in front. ``photographer`` does what you
+# would do: look at the list, show the pattern, take the photograph, save it under the name on the
+# list.
 
 import html
 import io
@@ -100,8 +100,12 @@ from ltcl.errors import LtclError, PhotographMissing
 from ltcl.plots import pictures
 
 corner = ltcl.scenes.dihedral(4, albedo=0.7)
-place = camera_map(lambda x, y: ((x - 4) / 4, (y - 3) / 4), (22, 38), corner.grid)  # 4 of its pixels to one
-camera = VirtualRig(corner.transport(), corner.grid, camera_grid=(22, 38), camera_map=place, ambient=0.01)
+place = camera_map(
+    lambda x, y: ((x - 4) / 4, (y - 3) / 4), (22, 38), corner.grid
+)  # 4 of its pixels to one
+camera = VirtualRig(
+    corner.transport(), corner.grid, camera_grid=(22, 38), camera_map=place, ambient=0.01
+)
 
 
 def photographer(folder, rig):
@@ -122,7 +126,9 @@ def scan(folder, photographer=None):
         except PhotographMissing as missing:
             if photographer is None:
                 raise
-            print(f"{missing.missing:3} photographs, the first: {str(missing).partition(': ')[2][:47]} ...")
+            print(
+                f"{missing.missing:3} photographs, the first: {str(missing).partition(': ')[2][:47]} ..."
+            )
             photographer(folder, rig)
 
 
@@ -130,8 +136,8 @@ folder = Path(tempfile.mkdtemp()) / "scan"
 T = scan(folder, photographer)
 
 # %%
-# These are some of the photographs. The small dots of light are single pixels of the projector; the dim
-# light around them has bounced, and is what the scan is about.
+# These are some of the photographs. The small dots of light are single pixels of the projector; the
+# dim light around them has bounced, and is what the scan is about.
 
 names = sorted((folder / "photographs").iterdir())
 shown = {"white": 1, "stripes, to find places": 20, "one pixel, short": 60, "one pixel, long": 61}
@@ -151,9 +157,9 @@ setup = Setup.of(folder / "T.zarr")
 print(f"pictures by T are wrong by {error:.2%}")
 
 # %%
-# Now a picture goes onto the walls: a bright band across the corner. ``background`` is the light of the
-# room, which was measured, too. ``setup.codes`` are what the projector must be fed, by its measured
-# response.
+# Now a picture goes onto the walls: a bright band across the corner. ``background`` is the light of
+# the room, which was measured, too. ``setup.codes`` are what the projector must be fed, by its
+# measured response.
 
 wanted = np.full(corner.grid, 0.35) * T.first_bounce.mean()
 wanted[1:3] *= 2
@@ -163,7 +169,11 @@ print(f"error {result.error:.2%}")
 before = ltcl.images.from_srgb(camera.photograph(wanted / wanted.max(), 1.0) / 255)
 after = ltcl.images.from_srgb(camera.photograph(setup.codes(result.pattern), 1.0) / 255)
 figure = pictures(
-    {"wanted": wanted / wanted.max(), "projected as it is": before, "the pattern of ltcl projected": after}
+    {
+        "wanted": wanted / wanted.max(),
+        "projected as it is": before,
+        "the pattern of ltcl projected": after,
+    }
 )
 
 # %%
@@ -171,9 +181,9 @@ figure = pictures(
 # --------------------------------------
 #
 # For each line of the table the photographs were copied, and one mistake made in them. The message is what
-# ltcl really said when this page was built. ltcl compares each group of photographs with what it knows
-# already before it keeps them, so nothing is lost. Some mistakes can only be seen with the photographs of the
-# next round. Exchange or delete what is named, and run the same command again.
+# ltcl really said when this page was built. ltcl compares each group of photographs with what it
+# knows already before it keeps them, so nothing is lost. Some mistakes can only be seen with the
+# photographs of the next round. Exchange or delete what is named, and run the same command again.
 #
 # The code is long, as there are many mistakes. The table is below it.
 
@@ -222,7 +232,9 @@ MISTAKES = {
     "the button pressed twice": lambda files: files[72].write_bytes(files[70].read_bytes()),
     "a light switched on": change(75, lambda image: np.minimum(image + LAMP, 255).astype(np.uint8)),
     "the camera was touched": moved,
-    "JPEG in place of raw or PNG": lambda files: [change(k, as_jpeg)(files) for k in range(40, 109)],
+    "JPEG in place of raw or PNG": lambda files: [
+        change(k, as_jpeg)(files) for k in range(40, 109)
+    ],
     "automatic exposure": auto_exposure,
     "the camera turned": change(71, np.rot90),
     "one name for two files": lambda files: files[70].with_suffix(".tif").write_bytes(b""),
@@ -255,7 +267,7 @@ for name, mistake in MISTAKES.items():
 table
 
 # %%
-# Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no person at
-# all; what to do with T is in :doc:`2_my_matrix`.
+# Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no
+# person at all; what to do with T is in :doc:`2_my_matrix`.
 
 # sphinx_gallery_thumbnail_number = 9

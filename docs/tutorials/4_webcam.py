@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-A webcam and a second display
-=============================
+"""A webcam and a second display =============================
 
-A projector on the second output, a webcam on a cable: ltcl shows the patterns and takes the photographs
-itself. It measures how long a picture takes from one to the other, and checks each frame for old and
-half-changed pictures.
+A projector on the second output, a webcam on a cable: ltcl shows the patterns and takes the
+photographs itself. It measures how long a picture takes from one to the other, and checks each
+frame for old and half-changed pictures.
 """
 
 # %%
 # The real one
 # ------------
 #
-# Install the extras: ``pip install "ltcl[camera,projector]"``. Put this into ``scan/acquisition.toml``:
+# Install the extras: ``pip install "ltcl[camera,projector]"``. Put this into
+# ``scan/acquisition.toml``:
 #
 # .. code-block:: toml
 #
@@ -33,19 +32,19 @@ half-changed pictures.
 #    ltcl acquire run scan
 #    ltcl view scan               # in another terminal: watch it in the browser while it runs
 #
-# On Linux ltcl switches the automatics of the webcam off, or refuses a camera whose automatics stay on.
-# Elsewhere fix the exposure with the camera's own program, and tell ltcl: ``seconds = 0.033`` under
-# ``[rig.camera]``.
+# On Linux ltcl switches the automatics of the webcam off, or refuses a camera whose automatics stay
+# on. Elsewhere fix the exposure with the camera's own program, and tell ltcl: ``seconds = 0.033``
+# under ``[rig.camera]``.
 #
 # The loop, with a camera of your own
 # -----------------------------------
 #
-# Your hardware is another one? Any object will do that has these three: ``projector_grid``, ``channels`` (1
-# or 3), and ``photograph(codes, seconds)``. It shows the codes, numbers from 0 to 1 on the grid, waits,
-# exposes, and gives the image back as the camera made it.
+# Your hardware is another one? Any object will do that has these three: ``projector_grid``,
+# ``channels`` (1 or 3), and ``photograph(codes, seconds)``. It shows the codes, numbers from 0 to 1
+# on the grid, waits, exposes, and gives the image back as the camera made it.
 #
-# This one has no hardware: it asks a simulated corner. Put the two lines of your display and of your camera
-# there.
+# This one has no hardware: it asks a simulated corner. Put the two lines of your display and of
+# your camera there.
 
 import tempfile
 from pathlib import Path
@@ -82,14 +81,17 @@ class MyRig:
 rig = MyRig()
 store = Path(tempfile.mkdtemp()) / "corner.zarr"
 T = ltcl.acquire(rig, geometry="aligned", strategy="hadamard", store=store)
-print(f"{len(rig.photographs)} photographs; T is {T.shape[0]} x {T.shape[1]} in {T.channels} colours")
+print(
+    f"{len(rig.photographs)} photographs; T is {T.shape[0]} x {T.shape[1]} in {T.channels} colours"
+)
 
 # %%
-# ``geometry="aligned"`` says that camera and projector have the same pixels, as here. Leave it out for a
-# real camera: then stripes (Gray code) tell which pixel of the camera sees which one of the projector.
+# ``geometry="aligned"`` says that camera and projector have the same pixels, as here. Leave it out
+# for a real camera: then stripes (Gray code) tell which pixel of the camera sees which one of the
+# projector.
 #
-# These are four of the photographs. Patterns that light half of the pixels at a time give a better T than
-# single pixels, since every photograph has more light.
+# These are four of the photographs. Patterns that light half of the pixels at a time give a better
+# T than single pixels, since every photograph has more light.
 
 picked = np.linspace(len(rig.photographs) * 0.5, len(rig.photographs) - 1, 4).astype(int)
 figure = pictures({f"photograph {k}": rig.photographs[k] / 4095 for k in picked})
@@ -98,8 +100,8 @@ figure = pictures({f"photograph {k}": rig.photographs[k] / 4095 for k in picked}
 # Project with it
 # ---------------
 #
-# The wanted picture is compensated, turned into codes by the measured response of the projector, shown, and
-# photographed.
+# The wanted picture is compensated, turned into codes by the measured response of the projector,
+# shown, and photographed.
 
 setup = Setup.of(store)
 wanted = 0.2 + 0.6 * corner.sample(ltcl.scenes.landscape(240, 480))
@@ -120,14 +122,16 @@ def view(light):
     return corner.view(light * np.median(wanted) / np.median(light), size=320, supersample=2)
 
 
-figure = pictures({"wanted": view(wanted), "projected as it is": view(plain), "with ltcl": view(exact)})
+figure = pictures(
+    {"wanted": view(wanted), "projected as it is": view(plain), "with ltcl": view(exact)}
+)
 
 # %%
 # When it was interrupted
 # -----------------------
 #
-# All photographs are on disk. The same call again goes on with the next one, and gives the same T to the
-# last bit; what is finished is read, and takes no photograph:
+# All photographs are on disk. The same call again goes on with the next one, and gives the same T
+# to the last bit; what is finished is read, and takes no photograph:
 
 before = len(rig.photographs)
 T = ltcl.acquire(rig, geometry="aligned", strategy="hadamard", store=store)

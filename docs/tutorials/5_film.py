@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-A film onto a wall
-==================
+"""A film onto a wall ==================
 
 A film on two coloured walls that meet in a corner: every frame is compensated, all with the same
 brightness, so that nothing flickers. A run that was stopped goes on where it was.
@@ -12,8 +10,8 @@ brightness, so that nothing flickers. A run that was stopped goes on where it wa
 # -----------------
 #
 # The walls are computed here; yours come from :doc:`photographs <3_photograph_a_corner>` or from a
-# :doc:`file <2_my_matrix>`. The film is a dozen frames: the camera pans over a landscape. A folder of
-# numbered pictures is a film, and so is any video file, ``film.mp4``.
+# :doc:`file <2_my_matrix>`. The film is a dozen frames: the camera pans over a landscape. A folder
+# of numbered pictures is a film, and so is any video file, ``film.mp4``.
 
 import tempfile
 from pathlib import Path
@@ -35,18 +33,22 @@ for number in range(12):
 # Compensate it
 # -------------
 #
-# ``gain="auto"`` looks at eight frames, spread over the film, and takes the largest brightness that all of
-# them can have. To show how a run is stopped, this one does five frames only.
+# ``gain="auto"`` looks at eight frames, spread over the film, and takes the largest brightness that
+# all of them can have. To show how a run is stopped, this one does five frames only.
 
 patterns = folder / "patterns"
-first = ltcl.batch.compensate_frames(T, folder / "film", patterns, gain="auto", appearance=True, frames=5)
+first = ltcl.batch.compensate_frames(
+    T, folder / "film", patterns, gain="auto", appearance=True, frames=5
+)
 print(first.solved, "frames, brightness", round(first.gain, 3))
 
 # %%
-# After Ctrl-C, a power cut or, as here, a limit, ``resume=True`` goes on. It looks at what is there, does
-# the rest, and makes the same files as one run would have made.
+# After Ctrl-C, a power cut or, as here, a limit, ``resume=True`` goes on. It looks at what is
+# there, does the rest, and makes the same files as one run would have made.
 
-done = ltcl.batch.compensate_frames(T, folder / "film", patterns, gain="auto", appearance=True, resume=True)
+done = ltcl.batch.compensate_frames(
+    T, folder / "film", patterns, gain="auto", appearance=True, resume=True
+)
 print(done.solved, "frames more;", len(done.records), "in all, the worst with an error of", end=" ")
 print(f"{done.worst.error:.1%} ({done.worst.name})")
 
@@ -54,8 +56,8 @@ print(f"{done.worst.error:.1%} ({done.worst.name})")
 # Before and after
 # ----------------
 #
-# Each column is a frame of the film: first as it looks when it is projected as it is, then the pattern that
-# ltcl found, and what the walls look like under it.
+# Each column is a frame of the film: first as it looks when it is projected as it is, then the
+# pattern that ltcl found, and what the walls look like under it.
 
 
 def view(light):
@@ -73,9 +75,9 @@ for number in (0, 4, 8, 11):
 figure = pictures(*rows)
 
 # %%
-# The brightness is the same in all frames: it is one number for the film. Here is how much of each frame
-# was asked for and could not be had, because a pattern would have to be brighter than the projector, or
-# darker than black.
+# The brightness is the same in all frames: it is one number for the film. Here is how much of each
+# frame was asked for and could not be had, because a pattern would have to be brighter than the
+# projector, or darker than black.
 
 for record in done.records[::4]:
     print(f"{record.name}: error {record.error:.2%}, {record.clipped:.1%} of the pattern clipped")
@@ -94,15 +96,15 @@ for record in done.records[::4]:
 #    # or compensated while it plays, in a window for the projector (extra view)
 #    ltcl play film.mp4 T.npz
 #
-# A pattern has as many pixels as the projector's grid in T. ``ltcl show`` and ``ltcl play`` make each pixel
-# a square, where the scan had it. ``--video patterns.mkv`` writes a film for other programs: do not let them
-# smooth it when they enlarge it. Sound is left out.
+# A pattern has as many pixels as the projector's grid in T. ``ltcl show`` and ``ltcl play`` make
+# each pixel a square, where the scan had it. ``--video patterns.mkv`` writes a film for other
+# programs: do not let them smooth it when they enlarge it. Sound is left out.
 #
-# ``gain="auto"`` sees eight frames only. Where others ask for more light than there is, ltcl names the worst
-# frame; begin again in another folder with a ``--gain`` a little lower.
+# ``gain="auto"`` sees eight frames only. Where others ask for more light than there is, ltcl names
+# the worst frame; begin again in another folder with a ``--gain`` a little lower.
 #
-# ``ltcl play`` drops frames that would be late, and tells how many frames a second it reached. For a large
-# T make it fast first: ``ltcl compress``, then ``ltcl invert`` (:doc:`6_large`). Films over several
-# machines: :doc:`../guide/cluster`.
+# ``ltcl play`` drops frames that would be late, and tells how many frames a second it reached. For
+# a large T make it fast first: ``ltcl compress``, then ``ltcl invert`` (:doc:`6_large`). Films over
+# several machines: :doc:`../guide/cluster`.
 
 # sphinx_gallery_thumbnail_number = 10

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-131 072 pixels and more
-=======================
+"""131 072 pixels and more =======================
 
-T has as many numbers as the projector has pixels, times as many as the camera has. With 131 072 pixels, 256
-x 512, these are 1.7e10 numbers, 69 GB for each colour. This page shows, with a small T, how ltcl makes that
-small; and what was measured with the large one.
+T has as many numbers as the projector has pixels, times as many as the camera has. With 131 072
+pixels, 256 x 512, these are 1.7e10 numbers, 69 GB for each colour. This page shows, with a small T,
+how ltcl makes that small; and what was measured with the large one.
 """
 
 # %%
@@ -29,12 +27,14 @@ print(f"{N} pixels: {4 * N**2 / 1e6:.0f} MB;  131072 pixels: {4 * 131072**2 / 1e
 # Compress
 # --------
 #
-# Bounced light is smooth. So most of T can be said with few numbers, as a photograph can be said with a
-# small JPEG. ``rtol=0.01`` asks that pictures lose at most 1 %; ltcl measures it on pictures that it has
-# not seen before.
+# Bounced light is smooth. So most of T can be said with few numbers, as a photograph can be said
+# with a small JPEG. ``rtol=0.01`` asks that pictures lose at most 1 %; ltcl measures it on pictures
+# that it has not seen before.
 
 C = ltcl.compress(T, rtol=0.01)
-print(f"{T.nbytes / 1e6:.1f} MB became {C.nbytes / 1e6:.2f} MB; pictures lose at most {C.error:.2%}")
+print(
+    f"{T.nbytes / 1e6:.1f} MB became {C.nbytes / 1e6:.2f} MB; pictures lose at most {C.error:.2%}"
+)
 
 # %%
 # A compressed T is used in the same way as the other one, and is faster.
@@ -67,8 +67,8 @@ refined = ltcl.compensate(C, wanted, gain=0.9 * small.gain, exact=T, rtol=1e-4)
 print(f"error {refined.error:.3%}")
 
 # %%
-# Where the same T is used for very many pictures, invert it once. From then on each picture takes one
-# product.
+# Where the same T is used for very many pictures, invert it once. From then on each picture takes
+# one product.
 
 inverse = ltcl.invert(C, rtol=0.02)
 again = ltcl.compensate(C, wanted, gain=small.gain, inverse=inverse, rtol=0.02)
@@ -78,9 +78,9 @@ print(f"error {again.error:.2%}")
 # What was measured with 131 072 pixels
 # -------------------------------------
 #
-# ``bench/resolution131k.py`` makes a corner of 256 x 512 pixels in colour, of which each lights all of the
-# other wall. Its rows stream by and are compressed as they come; T itself is never there. This is its
-# record, read when this page was built:
+# ``bench/resolution131k.py`` makes a corner of 256 x 512 pixels in colour, of which each lights all
+# of the other wall. Its rows stream by and are compressed as they come; T itself is never there.
+# This is its record, read when this page was built:
 
 record = json.loads(Path("../../bench/results/resolution131k-xeon-pocl3.0.json").read_text())
 facts = record["facts"]
@@ -88,7 +88,9 @@ bounces, patterns = (
     float(size) / 1e6 for size in facts["bytes of T, for bounces and for patterns"].split(",")
 )
 print(record["device"], "- 2 cores\n")
-print(f"T in full                 {facts['bytes of R, were it dense'] / 1e9:8.0f} GB in three colours")
+print(
+    f"T in full                 {facts['bytes of R, were it dense'] / 1e9:8.0f} GB in three colours"
+)
 print(f"compressed, for bounces   {bounces:8.1f} MB")
 print(f"compressed, for patterns  {patterns:8.1f} MB")
 print(f"to compress it            {facts['compressing A, s'] / 60:8.1f} minutes")
@@ -100,11 +102,11 @@ for claim in record["claims"][:4]:
 # Where to go from here
 # ---------------------
 #
-# - T is in a file larger than memory: ``ltcl.compress("T.npy")`` reads it in blocks (:doc:`../guide/scale`).
-# - T is larger than memory and must stay exact: ``ltcl.load`` leaves it on the disk (:doc:`../guide/scale`).
-# - Several GPUs in one machine: ``device="all"``, or a process for each (:doc:`../guide/scale`).
-# - A film, or many scenes, and several machines: ``--cluster`` (:doc:`../guide/cluster`).
-# - One solve over many machines: :doc:`../guide/mpi`.
-# - T comes from walls that you know: ``ltcl.scenes.FormFactor`` computes it in each product.
+# - T is in a file larger than memory: ``ltcl.compress("T.npy")`` reads it in blocks
+# (:doc:`../guide/scale`). - T is larger than memory and must stay exact: ``ltcl.load`` leaves it on
+# the disk (:doc:`../guide/scale`). - Several GPUs in one machine: ``device="all"``, or a process
+# for each (:doc:`../guide/scale`). - A film, or many scenes, and several machines: ``--cluster``
+# (:doc:`../guide/cluster`). - One solve over many machines: :doc:`../guide/mpi`. - T comes from
+# walls that you know: ``ltcl.scenes.FormFactor`` computes it in each product.
 
 # sphinx_gallery_thumbnail_number = 3

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""
-From SciPy and PyLops
-=====================
+"""From SciPy and PyLops =====================
 
-The operators of ltcl are SciPy's ``LinearOperator``: whatever takes one of these takes them. And SciPy's
-matrices and operators can be used in ltcl.
+The operators of ltcl are SciPy's ``LinearOperator``: whatever takes one of these takes them. And
+SciPy's matrices and operators can be used in ltcl.
 """
 
 # %%
 # The parts of T
 # --------------
 #
-# ``T.systems`` holds one operator S for each colour, on the device. A picture is T p = S F p with the
-# diagonal F, so that S undoes nothing but bounces: its diagonal is about 1.
+# ``T.systems`` holds one operator S for each colour, on the device. A picture is T p = S F p with
+# the diagonal F, so that S undoes nothing but bounces: its diagonal is about 1.
 
 import numpy as np
 import pylops
@@ -25,20 +23,24 @@ from ltcl.plots import pictures
 corner = ltcl.scenes.dihedral(16, albedo=0.8)
 T = corner.transport()
 (S,) = T.systems
-print(type(S).__mro__[0].__name__, S.shape, S.dtype, isinstance(S, scipy.sparse.linalg.LinearOperator))
+print(
+    type(S).__mro__[0].__name__, S.shape, S.dtype, isinstance(S, scipy.sparse.linalg.LinearOperator)
+)
 
 # %%
 # In SciPy
 # --------
 #
-# NumPy in, NumPy out. ``S @ x``, ``S.T``, sums and products of operators, ``gmres``, ``svds``, ``eigs``:
-# all run the products on the device.
+# NumPy in, NumPy out. ``S @ x``, ``S.T``, sums and products of operators, ``gmres``, ``svds``,
+# ``eigs``: all run the products on the device.
 
 picture = T @ (0.2 + 0.8 * corner.sample(ltcl.scenes.landscape(240, 480)[..., 0]))
 b = picture.ravel()
 
 steps = []
-x, failed = scipy.sparse.linalg.gmres(S, b, rtol=1e-4, callback=steps.append, callback_type="pr_norm")
+x, failed = scipy.sparse.linalg.gmres(
+    S, b, rtol=1e-4, callback=steps.append, callback_type="pr_norm"
+)
 ours = ltcl.solve(S, b, "gmres", rtol=1e-4)  # without a name: up to 512 pixels a factorization
 print(f"SciPy's GMRES: {len(steps)} steps; ltcl's: {ours.products} products")
 print(f"difference {np.linalg.norm(x - ours.x) / np.linalg.norm(x):.1e}")
@@ -54,9 +56,9 @@ print(np.sort(values)[::-1].round(3))
 # ---------
 #
 # ``pylops.aslinearoperator`` takes it, and it can be joined with the operators of PyLops. Here something
-# stands before the wall, and hides two fifths of the picture from the camera. A restriction keeps the
-# pixels that are seen; a second derivative makes the answer smooth where nothing is known. ltcl alone does
-# not do that.
+# stands before the wall, and hides two fifths of the picture from the camera. A restriction keeps
+# the pixels that are seen; a second derivative makes the answer smooth where nothing is known. ltcl
+# alone does not do that.
 
 A = pylops.aslinearoperator(S)
 rows, columns = np.mgrid[: corner.grid[0], : corner.grid[1]]
@@ -89,8 +91,8 @@ figure = pictures(
 # ------------------
 #
 # ``ltcl.solve`` takes NumPy arrays, ``scipy.sparse`` matrices and any ``LinearOperator``; so does
-# ``ltcl.Transport``. A sparse matrix goes to the device. A ``LinearOperator`` stays where it is: each
-# product calls it.
+# ``ltcl.Transport``. A sparse matrix goes to the device. A ``LinearOperator`` stays where it is:
+# each product calls it.
 
 rows = scipy.sparse.random_array((500, 500), density=0.02, rng=np.random.default_rng(1))
 system = scipy.sparse.eye_array(500) + 0.1 * rows
@@ -107,8 +109,8 @@ for name, operator in {
 # Which is faster?
 # ----------------
 #
-# A vector that comes from NumPy has to be brought to the device for each product, and back. ``ltcl.solve``
-# leaves all of its vectors there. So use SciPy's or PyLops' solvers for what ltcl lacks, and ltcl's for
-# what it has. Measured ratios are in the README.
+# A vector that comes from NumPy has to be brought to the device for each product, and back.
+# ``ltcl.solve`` leaves all of its vectors there. So use SciPy's or PyLops' solvers for what ltcl
+# lacks, and ltcl's for what it has. Measured ratios are in the README.
 
 # sphinx_gallery_thumbnail_number = 2

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From photographs to a transport: what drives projectors and cameras, and what their pictures say.
 
-task         acquire and finalize, by a `rig`: virtual, rendered, photographed by a person, on a cable (rigs/)
-calibrate    what is measured once (`session`, radiometry/, geometry/); its record, `calibration`
-scanning/    which pixels are lit when, and T from the pictures; plan before, report after
-agreement    photographs that deviate from what others show are refused by number; `anchor`: did it move?
-project      an acquisition as a folder with an acquisition.toml
+task         acquire and finalize, by a `rig`: virtual, rendered, photographed by a person, on a
+cable (rigs/) calibrate    what is measured once (`session`, radiometry/, geometry/); its record,
+`calibration` scanning/    which pixels are lit when, and T from the pictures; plan before, report
+after agreement    photographs that deviate from what others show are refused by number; `anchor`:
+did it move? project      an acquisition as a folder with an acquisition.toml
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
@@ -30,5 +30,13 @@ from ltcl.acquisition.scanning.report import Report
 from ltcl.acquisition.task import acquire, finalize
 
 __all__ = ["Calibration", "Correspondence", "Project", "Report", "Rig", "Setup", "Shots"]
-__all__ += ["Display", "FolderRig", "GPhoto2Camera", "LiveRig", "MitsubaRig", "OpenCVCamera", "VirtualRig"]
+__all__ += [
+    "Display",
+    "FolderRig",
+    "GPhoto2Camera",
+    "LiveRig",
+    "MitsubaRig",
+    "OpenCVCamera",
+    "VirtualRig",
+]
 __all__ += ["acquire", "camera_map", "finalize"]

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Whether photographs show the light that is already known, in units of the noise of the camera.
 
-Of linear values x_k above black after t_k seconds under one pattern, of variance v_k, each photograph is
-compared with the radiance L of the others, at pixels where neither is saturated:
+Of linear values x_k above black after t_k seconds under one pattern, of variance v_k, each
+photograph is compared with the radiance L of the others, at pixels where neither is saturated:
 
     z_k = (x_k - t_k L) / sqrt(v_k + t_k^2 v_L),    L = sum_j x_j t_j / v_j / sum_j t_j^2 / v_j
 
-v is noise, (2 % of x)^2 for inexact exposures and response curves, and for the level of black (0.1 % of full
-scale)^2 and (3 electrons)^2: cameras without an offset clip the noise there, which bends their curves. A
-photograph deviates where the mean of min(z^2, 100) is above 2.5, two pixels left out that may be defects; of
-fewer than 8 pixels, where it is above 27.5. Or where the sum of t_k L (x_k - t_k L) over pixels exceeds 5 of
-its standard deviations: an exposure is wrong, and each pixel alone is dim. In the same way a photograph is
-compared with an earlier one (`known`), and sums of patterns and their inverses with each other.
+v is noise, (2 % of x)^2 for inexact exposures and response curves, and for the level of black (0.1
+% of full scale)^2 and (3 electrons)^2: cameras without an offset clip the noise there, which bends
+their curves. A photograph deviates where the mean of min(z^2, 100) is above 2.5, two pixels left
+out that may be defects; of fewer than 8 pixels, where it is above 27.5. Or where the sum of t_k L
+(x_k - t_k L) over pixels exceeds 5 of its standard deviations: an exposure is wrong, and each pixel
+alone is dim. In the same way a photograph is compared with an earlier one (`known`), and sums of
+patterns and their inverses with each other.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.errors import AcquisitionError
 
 _SCALE, _FLOOR = 0.02, 0.001  # systematic errors: of light, of full scale
-_ELECTRONS = 3.0  # of light: error of the level of black, of a camera of at least `_LEAST` at full scale
+_ELECTRONS = (
+    3.0  # of light: error of the level of black, of a camera of at least `_LEAST` at full scale
+)
 _LEAST = 300.0  # fewer are measured only where photographs of one pattern differ
 _DIM = 3.0  # times that light: what pixels below have of this error, they have in common
 _BIAS = 0.2  # of the noise without light: common error of all pixels there
@@ -90,14 +93,17 @@ def find_deviation(
     """
     if known is None:
         return _deviation(_Light.of(samples, seconds, sensor), len(samples))
-    return _deviation(_Light.of(samples, seconds, sensor, known[0]).with_known(*known), len(samples))
+    return _deviation(
+        _Light.of(samples, seconds, sensor, known[0]).with_known(*known), len(samples)
+    )
 
 
 class Record:
     """Photographs of a calibration, at some pixels, to be compared when its noise is known."""
 
     def __init__(self) -> None:
-        # Codes, seconds, samples and number of the photographs of one pattern (bytes) and of one exposure.
+        # Codes, seconds, samples and number of the photographs of one pattern (bytes) and of one
+        # exposure.
         self._groups: dict[bytes | float, list[tuple[Any, ...]]] = defaultdict(list)
 
     def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
@@ -120,7 +126,9 @@ class Record:
                 else _in_inverses(codes, samples, sensor)
             )
             if deviation is not None:
-                findings.append((numbers[max(deviation.suspects)], deviation.describe(numbers, name)))
+                findings.append(
+                    (numbers[max(deviation.suspects)], deviation.describe(numbers, name))
+                )
         if findings:
             raise AcquisitionError(f"{min(findings)[1]}; {ADVICE}")
 
@@ -160,7 +168,9 @@ class _Light(NamedTuple):
     few: np.ndarray
 
     @classmethod
-    def of(cls, samples: Sequence[np.ndarray], seconds: Any, sensor: Sensor, L: Any = None) -> _Light:
+    def of(
+        cls, samples: Sequence[np.ndarray], seconds: Any, sensor: Sensor, L: Any = None
+    ) -> _Light:
         """`L`: radiance (n, c), where it is known; that of all photographs determines their noise if not.
 
         By its own value each pixel would have the less noise the darker it is by chance.
@@ -169,7 +179,9 @@ class _Light(NamedTuple):
         codes = np.stack(samples)
         curve = codes if codes.shape[2] > 1 else codes[..., 0]
         x = response.linear(curve).reshape(codes.shape) - offset
-        limit = np.broadcast_to(_RANGE * (noise.saturation - np.asarray(offset)), (len(x), 1, x.shape[2]))
+        limit = np.broadcast_to(
+            _RANGE * (noise.saturation - np.asarray(offset)), (len(x), 1, x.shape[2])
+        )
         t = np.asarray(seconds, np.float64)[:, None, None]
         if L is None:
             usable = x < limit
@@ -205,7 +217,9 @@ class _Light(NamedTuple):
         total = np.sum(weight * t, axis=0)
         known = total > 0
         total = np.where(known, total, 1.0)
-        L, bias = (np.sum(weight * values, axis=0) / total for values in (np.where(usable, x, 0.0), bias))
+        L, bias = (
+            np.sum(weight * values, axis=0) / total for values in (np.where(usable, x, 0.0), bias)
+        )
         return L, 1.0 / total, bias, known
 
     def scores(self) -> np.ndarray:
@@ -223,7 +237,9 @@ class _Light(NamedTuple):
             near = use & (z2 < _CLIP)
             s = bias + t * bias_L + few * (t * whole < _DIM * few)
             w, d, s = ((t * whole)[near], (x - t * L)[near], s[near])
-            together = (w @ d) ** 2 / max(w**2 @ variance[near] + (_SCALE * w @ w) ** 2 + (w @ s) ** 2, 1e-30)
+            together = (w @ d) ** 2 / max(
+                w**2 @ variance[near] + (_SCALE * w @ w) ** 2 + (w @ s) ** 2, 1e-30
+            )
             result[k] = max(z2[use].sum() / max(allowed, 1.0), together / _SINGLE)
         return result
 
@@ -242,7 +258,9 @@ class _Light(NamedTuple):
                 return "is too bright nearly everywhere: another light was on, or the exposure was too long"
             if abs(gain - 1.0) > 3 * _SCALE:
                 return f"is {gain:.2g} times as bright as the others of its pattern"
-        return "deviates from the others of its pattern: another pattern, or the camera or scene moved"
+        return (
+            "deviates from the others of its pattern: another pattern, or the camera or scene moved"
+        )
 
 
 def _deviation(light: _Light, count: int) -> Deviation | None:
@@ -253,7 +271,10 @@ def _deviation(light: _Light, count: int) -> Deviation | None:
     worst = sorted(np.argsort(-scores[:count])[:_SUSPECTS].tolist())
     for a, b in combinations(worst, 2):
         order = [{a: b, b: a}.get(k, k) for k in every]
-        if light.seconds[a] != light.seconds[b] and light._replace(seconds=light.seconds[order]).agrees():
+        if (
+            light.seconds[a] != light.seconds[b]
+            and light._replace(seconds=light.seconds[order]).agrees()
+        ):
             return Deviation((a, b), "are exchanged", exchanged=True)
     alone = [k for k in worst if light.without(k).agrees()]
     if count < len(every) or count < 3:
@@ -261,4 +282,6 @@ def _deviation(light: _Light, count: int) -> Deviation | None:
     since = next((k for k in every[1:] if not light.at(every[: k + 1]).agrees()), count - 1)
     if alone:
         return Deviation(tuple(sorted({*alone, since})), light.cause(alone[0]))
-    return Deviation((since,), "and those after it deviate: the camera or scene moved, or the light changed")
+    return Deviation(
+        (since,), "and those after it deviate: the camera or scene moved, or the light changed"
+    )

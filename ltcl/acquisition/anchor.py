@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A pattern of blocks that is photographed in the calibration, and again after each batch of a scan.
 
-Where it does not show the same light as before (`agreement`), something moved during the batch, or the light
-changed. From which pattern on, the batch shows at the edges of its patterns: with a picture y and white w,
-both less ambient light, and the pattern p on the camera's pixels, least squares give the movement d of
+Where it does not show the same light as before (`agreement`), something moved during the batch, or
+the light changed. From which pattern on, the batch shows at the edges of its patterns: with a
+picture y and white w, both less ambient light, and the pattern p on the camera's pixels, least
+squares give the movement d of
 
     p y / w = p s (p + d . grad p)
 

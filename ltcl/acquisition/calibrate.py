@@ -8,12 +8,13 @@
     projector    uniform codes: light of each channel, and how colours mix
     anchor       a pattern that is photographed again during the scan: did anything move?
 
-Each pattern of a scan is photographed at the exposure of white, for the pixels that it lights, and at one
-`_LONGER` times as long, if ambient light allows, for weak light; by an automatic rig also at the geometric
-mean: T p of 64 x 64 pixels then has a relative error of 0.40 % instead of 0.46 %.
+Each pattern of a scan is photographed at the exposure of white, for the pixels that it lights, and
+at one `_LONGER` times as long, if ambient light allows, for weak light; by an automatic rig also at
+the geometric mean: T p of 64 x 64 pixels then has a relative error of 0.40 % instead of 0.46 %.
 
-Known limit: the unit of light is what the response reaches at the last code, for which nothing else stands.
-A colour that the scene hardly reflects is photographed for longer, so that its curve reaches that code too.
+Known limit: the unit of light is what the response reaches at the last code, for which nothing else
+stands. A colour that the scene hardly reflects is photographed for longer, so that its curve
+reaches that code too.
 """
 
 from __future__ import annotations
@@ -42,26 +43,38 @@ logger = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 
 _WHITE = 0.7  # of the linear range, for the brightest pixels under white
-_LONGER = 64.0  # times the exposure of white: beyond, a photograph costs more time than its light is worth
+# times the exposure of white: beyond, a photograph costs more time than its light is worth
+_LONGER = 64.0
 _AMBIENT = 0.3  # of the linear range, which ambient light takes at the longest exposure
 _LAST_CODE = 0.995  # of full scale: as good as the last code
 _FIRST = 1 / 60  # seconds
-_DIM, _BRIGHT = 0.3, 0.95  # codes of the brightest pixels under white, outside of which another probe follows
+_DIM, _BRIGHT = (
+    0.3,
+    0.95,
+)  # codes of the brightest pixels under white, outside of which another probe follows
 _BRIGHTEST = 0.999  # quantile of the pixels that is to be bright
 _HOT = 0.1  # of the pixels: more at the last code under black, and the exposure is too long
-_QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so that weights are finite
-_SPAN = 16.0  # ratio of the longest exposure for the response to that of white, and of that to the shortest
+_QUIETEST = (
+    1e-6  # of full scale: the read noise of a camera without any, so that weights are finite
+)
+# ratio of the longest exposure for the response to that of white, and of that to the shortest
+_SPAN = 16.0
 _MORE = 4  # more of them at most, each twice as long, where a colour stays dark
 _SATURATED = 0.05  # of the pixels: as many reach the last code in each colour
 _RAMPS = 4  # at most
 _REPEATS = 2  # at least: two photographs determine noise
 _PROBES, _MOST_PROBES = 2, 10  # of the exposure: mostly, at most
 _CAMERA_PIXELS = 9  # to one of the projector's, where a plan is made before the first photograph
-_LAMP, _CERTAIN = 0.01, 5.0  # of full scale, of black: T p moves by less than 1 %; standard deviations
+_LAMP, _CERTAIN = (
+    0.01,
+    5.0,
+)  # of full scale, of black: T p moves by less than 1 %; standard deviations
 _PATTERN = 0.1  # of full scale: what is brighter may be another pattern, as `agreement` tells
 _SIGNIFICANT = 3.0  # standard deviations of noise that white must be above
 _UNEVEN = 0.1  # relative deviation of a projector's curve from pixel to pixel, which is allowed
-_ALIKE = 0.9  # correlation of a picture of blocks with their pattern: 0.98 and more in the right map
+_ALIKE = (
+    0.9  # correlation of a picture of blocks with their pattern: 0.98 and more in the right map
+)
 _DIRECT = 0.5  # of what white shows at a pixel is its own light, at least, in most scenes
 
 
@@ -69,8 +82,8 @@ _DIRECT = 0.5  # of what white shows at a pixel is its own light, at least, in m
 class _Effort:
     """Numbers of photographs: exposures for the response, camera pixels in the ramps of each, uniform codes.
 
-    Monotone cubics through the codes, none the inverse of another, deviate from sRGB, a power of 2.2 and film
-    by at most 0.02 % of white (root mean square), or 0.3 % by hand.
+    Monotone cubics through the codes, none the inverse of another, deviate from sRGB, a power of
+    2.2 and film by at most 0.02 % of white (root mean square), or 0.3 % by hand.
     """
 
     bracket: int
@@ -82,23 +95,32 @@ class _Effort:
         count = min(-(-self.ramp_pixels // camera_pixels), _RAMPS)
         codes = np.linspace(0.0, 1.0, max(grid), dtype=np.float32)
         shifted = [np.roll(codes, k * len(codes) // count) for k in range(count)]
-        return [np.broadcast_to(r if grid[1] >= grid[0] else r[:, None], grid).copy() for r in shifted]
+        return [
+            np.broadcast_to(r if grid[1] >= grid[0] else r[:, None], grid).copy() for r in shifted
+        ]
 
     def repeats(self, frames: int, camera_pixels: float) -> int:
         """Of black and white; a person's are shared by the camera pixels of a projector pixel."""
-        return max(_REPEATS, math.ceil(frames / max(camera_pixels, 1.0)) if self is _BY_HAND else frames)
+        return max(
+            _REPEATS, math.ceil(frames / max(camera_pixels, 1.0)) if self is _BY_HAND else frames
+        )
 
     def requests(
         self, grid: tuple[int, int], channels: int, repeats: int, times: Sequence[Sequence[float]]
     ) -> list[list[Request]]:
         """Blocks, black, white, uniform codes of each channel, and blocks again: nothing moved in between.
 
-        `times` are those of black, of which the first is the exposure of white, of white, and of the scan.
+        `times` are those of black, of which the first is the exposure of white, of white, and of
+        the scan.
         """
         (dark, bright, scan), white = times, np.ones(grid, np.float32)
         blocks = [(anchor.pattern(grid), t) for t in sorted({scan[0], scan[-1]})]
         single = {t for t in bright if self is _BY_HAND and t != dark[0]}
-        lit = [white] if channels == 1 else [white[..., None] * c for c in np.eye(3, dtype=np.float32)]
+        lit = (
+            [white]
+            if channels == 1
+            else [white[..., None] * c for c in np.eye(3, dtype=np.float32)]
+        )
         codes = self.codes if channels == 1 else (*self.codes, 1.0)
         return [
             blocks[:1],
@@ -114,7 +136,11 @@ _BY_HAND = _Effort(5, 1 << 10, (0.07, 0.2, 0.38, 0.68, 0.9))
 
 
 def photographs(
-    grid: tuple[int, int], channels: int = 1, frames: int = 16, aligned: bool = False, by_hand: bool = False
+    grid: tuple[int, int],
+    channels: int = 1,
+    frames: int = 16,
+    aligned: bool = False,
+    by_hand: bool = False,
 ) -> int:
     """How many photographs `measure` takes without a known response, give or take probes of the exposure.
 
@@ -126,8 +152,13 @@ def photographs(
     effort, camera_pixels = _BY_HAND if by_hand else _AUTOMATIC, 1 if aligned else _CAMERA_PIXELS
     ramps = effort.bracket * len(effort.ramps(grid, camera_pixels * grid[0] * grid[1]))
     stripes = 0 if aligned else GrayCode(grid).count - 2  # without black and white
-    repeats, times = effort.repeats(frames, camera_pixels), ((2.0, 3.0), (1.0, 2.0, 3.0), (2.0, 3.0))
-    return _PROBES + ramps + stripes + sum(map(len, effort.requests(grid, channels, repeats, times)))
+    repeats, times = (
+        effort.repeats(frames, camera_pixels),
+        ((2.0, 3.0), (1.0, 2.0, 3.0), (2.0, 3.0)),
+    )
+    return (
+        _PROBES + ramps + stripes + sum(map(len, effort.requests(grid, channels, repeats, times)))
+    )
 
 
 def measure(
@@ -143,18 +174,22 @@ def measure(
 ) -> Calibration:
     """Measure a set-up, with as many photographs as `photographs` says.
 
-    The camera must resolve blocks of `side`; `log` has photographs of an earlier run; the others, and errors,
-    are as in `ltcl.acquire`.
+    The camera must resolve blocks of `side`; `log` has photographs of an earlier run; the others,
+    and errors, are as in `ltcl.acquire`.
 
     >>> from ltcl.acquisition import VirtualRig
-    >>> calibration = measure(Shots(VirtualRig(np.eye(64) / 2, (8, 8), bits=12)), geometry="aligned")
+    >>> calibration = measure(
+    ...     Shots(VirtualRig(np.eye(64) / 2, (8, 8), bits=12)), geometry="aligned"
+    ... )
     >>> bool(abs(calibration.white.value - 0.5).max() < 0.02), calibration.resampling.seen.all()
     (True, np.True_)
     """
     by_hand, aligned = getattr(shots.rig, "keeps_photographs", False), geometry == "aligned"
     options = {"channels": shots.channels, "frames": frames, "aligned": aligned, "by_hand": by_hand}
     expected, effort = photographs(shots.grid, **options), _BY_HAND if by_hand else _AUTOMATIC
-    session = CaptureSession(shots, log, lambda done: progress("calibration", done, max(done, expected)))
+    session = CaptureSession(
+        shots, log, lambda done: progress("calibration", done, max(done, expected))
+    )
 
     seconds = _bright_white(session)
     _check_geometry(shots, geometry)
@@ -166,7 +201,9 @@ def measure(
     longest = _longest(session, seconds)
     scan = _for_scan(shots, seconds, longest) if exposures is None else _offered(shots, exposures)
 
-    repeats = effort.repeats(frames, len(np.unique(R.weights.indices)) / max(np.count_nonzero(R.seen), 1))
+    repeats = effort.repeats(
+        frames, len(np.unique(R.weights.indices)) / max(np.count_nonzero(R.seen), 1)
+    )
     bright = _offered(shots, [seconds / 2, seconds, longest])
     times = sorted({seconds, longest}), bright, scan
     before, dark, bright, *uniform, after = session.take(
@@ -189,7 +226,11 @@ def measure(
     with acquisition_error("the projector"):
         channels = [[ambient, *each] for each in pictures]
         projector = radiometry.projector_response([0.0, *effort.codes, 1.0], channels)
-        M = None if shots.channels == 1 else radiometry.mixing([each[-1] for each in pictures], ambient)
+        M = (
+            None
+            if shots.channels == 1
+            else radiometry.mixing([each[-1] for each in pictures], ambient)
+        )
     blocks = session.merge([*before, *after])
     _check_map(session, R, stripes, (blocks - ambient).value, white.value)
     R = R.ascertained(white.value, white.valid)
@@ -206,7 +247,8 @@ def _offered(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
 def bracket(shortest: float, longest: float, count: int) -> tuple[float, ...]:
     """`count` exposures, ascending, in steps of which every second is longer by the golden ratio.
 
-    No period divides them: powers of one number do not determine a response (`radiometry.response`).
+    No period divides them: powers of one number do not determine a response
+    (`radiometry.response`).
 
     >>> [round(t, 3) for t in bracket(0.01, 0.32, 4)]
     [0.01, 0.026, 0.123, 0.32]
@@ -289,10 +331,14 @@ def _check_geometry(shots: Shots, geometry: str | Correspondence) -> None:
     if (grid, camera) != (shots.grid, shots.camera_grid):
         text = f"from photographs of {camera} to a projector of {grid}; the rig has photographs of"
         name = repr(geometry) if isinstance(geometry, str) else "a Correspondence"
-        raise InputError(f"geometry is {name}, {text} {shots.camera_grid} and a projector of {shots.grid}")
+        raise InputError(
+            f"geometry is {name}, {text} {shots.camera_grid} and a projector of {shots.grid}"
+        )
 
 
-def _response(session: CaptureSession, effort: _Effort, seconds: float, response: Response | None) -> float:
+def _response(
+    session: CaptureSession, effort: _Effort, seconds: float, response: Response | None
+) -> float:
     """Response of the camera and hot pixels, for the session; the exposure at which white has `_WHITE`."""
     shots, full = session.shots, np.ones(session.shots.grid, np.float32)
     if response is None:
@@ -322,7 +368,10 @@ def _ramps(session: CaptureSession, effort: _Effort, seconds: float) -> tuple[Re
             break
         times.append(t)
         exposed += session.take([[(ramp, t) for ramp in ramps]])
-    images, numbers = [side_by_side(group) for group in exposed], (exposed[0][0].number, shots.number)
+    images, numbers = (
+        [side_by_side(group) for group in exposed],
+        (exposed[0][0].number, shots.number),
+    )
     with acquisition_error("the response of the camera, photographs {} to {}".format(*numbers)):
         return radiometry.calibrate(images, times, levels=shots.levels, saturation=_LAST_CODE), hot
 
@@ -331,7 +380,9 @@ def _resampling(
     session: CaptureSession, geometry: str | Correspondence, seconds: float
 ) -> tuple[Resampling, Sharpness | None, list[Photograph]]:
     black = np.zeros(session.shots.grid, np.float32)
-    session.prepare([(black, seconds), (black, nearest(session.shots.exposures, _LONGER * seconds))])
+    session.prepare(
+        [(black, seconds), (black, nearest(session.shots.exposures, _LONGER * seconds))]
+    )
     if geometry == "aligned":
         return Resampling.aligned(session.shots.grid), None, []
     stripes, light = [], []
@@ -347,11 +398,16 @@ def _resampling(
 
 
 def _check_map(
-    session: CaptureSession, R: Resampling, stripes: list[Photograph], blocks: np.ndarray, white: np.ndarray
+    session: CaptureSession,
+    R: Resampling,
+    stripes: list[Photograph],
+    blocks: np.ndarray,
+    white: np.ndarray,
 ) -> None:
     """Refuse Gray code of which a pattern was exchanged with its inverse: its map is mirrored in part.
 
-    The picture of blocks tells: it is more like their pattern in the map that exchanging them back gives.
+    The picture of blocks tells: it is more like their pattern in the map that exchanging them back
+    gives.
     """
     grid, levels, codes = R.grid, session.shots.levels, anchor.pattern(R.grid).ravel()
 
@@ -385,7 +441,11 @@ def _longest(session: CaptureSession, white: float) -> float:
         seconds, longer = nearest(session.shots.exposures, shorter), seconds
         if seconds >= longer:
             return longer
-        logger.info("%s, of black, is too bright at %.3g s", session.shots.name(session.shots.number), longer)
+        logger.info(
+            "%s, of black, is too bright at %.3g s",
+            session.shots.name(session.shots.number),
+            longer,
+        )
     return white
 
 
@@ -398,14 +458,19 @@ def _check_black(session: CaptureSession, photographs: list[Photograph]) -> None
     bright = (excess > _LAMP + _CERTAIN * noise) & (excess < _PATTERN)
     if bright.any():
         name = session.shots.name(photographs[int(np.argmax(bright))].number)
-        raise AcquisitionError(f"{name}, of black, is too bright: another light was on; {agreement.ADVICE}")
+        raise AcquisitionError(
+            f"{name}, of black, is too bright: another light was on; {agreement.ADVICE}"
+        )
 
 
 def _sensor(session: CaptureSession, dark: list[Photograph], bright: list[Photograph]) -> Sensor:
     """Noise, and the linear value without light: 0 where one exposure cannot tell it from ambient light."""
     response, levels = session.sensor.response, session.shots.levels
     groups = [(each, t) for each in (dark, bright) for t in sorted({p.seconds for p in each})]
-    bursts = [[_fill_hot_pixels(p.image, session.hot) for p in each if p.seconds == t] for each, t in groups]
+    bursts = [
+        [_fill_hot_pixels(p.image, session.hot) for p in each if p.seconds == t]
+        for each, t in groups
+    ]
     with acquisition_error("the noise of the camera"):
         bursts = [images for images in bursts if len(images) > 1]
         noise = radiometry.estimate(bursts, response=response, levels=levels)
@@ -414,7 +479,9 @@ def _sensor(session: CaptureSession, dark: list[Photograph], bright: list[Photog
     if min(times) == max(times):
         return Sensor(response, noise, np.zeros(session.shots.channels))
     with acquisition_error("black"):
-        offset = radiometry.black_level([p.image for p in dark], times, response, noise, levels=levels)
+        offset = radiometry.black_level(
+            [p.image for p in dark], times, response, noise, levels=levels
+        )
     return Sensor(response, noise, offset)
 
 
@@ -432,16 +499,19 @@ def _check_uniform(
     W, below, last = bright - black, 0.0, None
     of_colour = f", which {named(shots[-1].number)} is" if len(shots) > len(pictures) else ""
     for photograph, picture in zip(shots, pictures, strict=False):
-        y, v, valid = (agreement.sample(x, pixels) for x in (picture.value, picture.variance, picture.valid))
+        y, v, valid = (
+            agreement.sample(x, pixels) for x in (picture.value, picture.variance, picture.valid)
+        )
         total = max(float(np.sum(W[valid] ** 2)), 1e-30)
         g = float(np.sum(((y - black) * W)[valid])) / total
         noise = float(np.sqrt(np.sum(W[valid] ** 2 * (v + dark_variance)[valid]))) / total
         expected = black + g * W, dark_variance + g**2 * variance + (_UNEVEN * g * W) ** 2
         image, name = [agreement.sample(photograph.image, pixels)], named(photograph.number)
-        if agreement.find_deviation(image, [photograph.seconds], session.sensor, expected) is not None:
-            text = (
-                f"{name}, of a uniform code, does not show a part of white{of_colour}: another light was on"
-            )
+        if (
+            agreement.find_deviation(image, [photograph.seconds], session.sensor, expected)
+            is not None
+        ):
+            text = f"{name}, of a uniform code, does not show a part of white{of_colour}: another light was on"
             raise AcquisitionError(f"{text}, or it is another pattern; {agreement.ADVICE}")
         if last is not None and g < below - _SIGNIFICANT * noise - _UNEVEN * below:
             text = f"{last} or {name} deviates: it shows {g / below:.2g} times the light of a darker code"
@@ -452,7 +522,9 @@ def _check_uniform(
 def _check_light(scan: tuple[float, ...], white: Radiance, R: Resampling, sensor: Sensor) -> None:
     """Refuse a projector without light; exposures that saturate lit pixels, or show noise alone."""
     if white.value.sum() <= _SIGNIFICANT * math.sqrt(white.variance[white.valid].sum()):
-        raise AcquisitionError(f"photographs are no brighter under white than under black; {NO_LIGHT}")
+        raise AcquisitionError(
+            f"photographs are no brighter under white than under black; {NO_LIGHT}"
+        )
     light = R.apply(np.where(white.valid, white.value, 0.0))[R.seen]
     level = float(np.median(light[light > 0])) if (light > 0).any() else 0.0
     reason = ""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Calibration`: what `calibrate` has measured, as arrays in a store; `Setup`: it on the pixels of T.
 
-With light p of a pattern in [0, 1], codes x that the projector is fed, its response g and ambient light a,
+With light p of a pattern in [0, 1], codes x that the projector is fed, its response g and ambient
+light a,
 
     x = g^-1(p)                 for each channel, on the projector's own pixels
     picture = T p + a           in linear sensor values a second
@@ -26,7 +27,7 @@ from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
-from ltcl.transport import Transport
+from ltcl.transport.transport import Transport
 
 PREFIX = "calibration."  # of the names of the extra arrays that a calibration is kept in
 _VALID = 0.5  # of the camera pixels that see a projector pixel: with less its value is unknown
@@ -36,10 +37,10 @@ _VALID = 0.5  # of the camera pixels that see a projector pixel: with less its v
 class Calibration:
     """What is known of a set-up.
 
-    `exposures` in seconds, ascending; `offset`, the camera's linear value without light; `ambient`, `white`,
-    (H, W[, 3]), what a black projector shows and a white one adds; `mixing`, (3, 3), None of one channel;
-    `resampling` to the projector's pixels; `sharpness`, None of an aligned camera; `anchor`, None of older
-    stores.
+    `exposures` in seconds, ascending; `offset`, the camera's linear value without light; `ambient`,
+    `white`, (H, W[, 3]), what a black projector shows and a white one adds; `mixing`, (3, 3), None
+    of one channel; `resampling` to the projector's pixels; `sharpness`, None of an aligned camera;
+    `anchor`, None of older stores.
     """
 
     exposures: tuple[float, ...]
@@ -67,18 +68,24 @@ class Calibration:
         if not names:
             raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
         if "resampling.doubtful" not in names:
-            raise FileError(f"{scan.path}: its calibration is of an earlier ltcl; it must be acquired again")
+            raise FileError(
+                f"{scan.path}: its calibration is of an earlier ltcl; it must be acquired again"
+            )
         arrays = {name: np.array(scan.extra(PREFIX + name)) for name in names}
 
         def group(prefix: str) -> dict[str, Any]:
-            return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
+            return {
+                k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)
+            }
 
         R, ambient, white, anchor = map(group, ("resampling.", "ambient.", "white.", "anchor."))
         anchor.pop("shift", None)  # of earlier versions
         for light in (ambient, white):  # of earlier versions: 0 where it is not valid
             light["variance"] = np.where(light["valid"], light["variance"], np.float32(np.inf))
         (h, w), (H, W) = R["coverage"].shape, R["camera_grid"].tolist()
-        weights = scipy.sparse.csr_array((R["data"], R["indices"], R["indptr"]), shape=(h * w, H * W))
+        weights = scipy.sparse.csr_array(
+            (R["data"], R["indices"], R["indptr"]), shape=(h * w, H * W)
+        )
         *sensor, levels = arrays["noise"].tolist()
         y, x, width = arrays.get("sharpness", np.zeros(3)).tolist()
         return cls(
@@ -108,7 +115,9 @@ class Calibration:
             "resampling.camera_grid": np.array(R.camera_grid),
             "resampling.doubtful": np.zeros(R.grid, bool) if R.doubtful is None else R.doubtful,
         }
-        arrays |= {f"resampling.{name}": getattr(R.weights, name) for name in ("data", "indices", "indptr")}
+        arrays |= {
+            f"resampling.{name}": getattr(R.weights, name) for name in ("data", "indices", "indptr")
+        }
         if self.sharpness is not None:
             arrays["sharpness"] = np.hstack(astuple(self.sharpness))
         if self.mixing is not None:
@@ -129,8 +138,12 @@ class Setup:
     >>> import tempfile, ltcl
     >>> from ltcl.acquisition import VirtualRig
     >>> store = f"{tempfile.mkdtemp()}/T.zarr"
-    >>> T = ltcl.acquire(VirtualRig(np.eye(64) / 2, (8, 8), ambient=0.1), geometry="aligned", store=store)
-    >>> Setup.of(store).codes(np.full(T.grid, 0.214)).mean().round(1)  # sRGB, as this rig has by default
+    >>> T = ltcl.acquire(
+    ...     VirtualRig(np.eye(64) / 2, (8, 8), ambient=0.1), geometry="aligned", store=store
+    ... )
+    >>> Setup.of(store).codes(np.full(T.grid, 0.214)).mean().round(
+    ...     1
+    ... )  # sRGB, as this rig has by default
     np.float32(0.5)
     """
 
@@ -174,7 +187,8 @@ class Setup:
     def relative_error(self, rig: Any, T: Transport) -> tuple[float, ...]:
         """||s T p - c|| / ||c|| of each channel for random p of 0 and 1, s = <T p, c> / ||T p||^2.
 
-        c is what `rig`, a `VirtualRig`, shows under p less black; the camera's unit of light is unknown.
+        c is what `rig`, a `VirtualRig`, shows under p less black; the camera's unit of light is
+        unknown.
         """
         patterns = (np.random.default_rng(0).random((4, *T.grid)) < 0.5).astype(np.float32)
         pictures = [rig.radiance(self.blocks.enlarged(p)) for p in (0 * patterns[0], *patterns)]
@@ -182,8 +196,12 @@ class Setup:
             pictures = [self.calibration.resampling.apply(picture) for picture in pictures]
         light = patterns if T.channels == 1 else np.repeat(patterns[..., None], 3, axis=-1)
         sides = [T @ p for p in light], [self._mean(c - pictures[0]) for c in pictures[1:]]
-        x, y = (np.reshape(side, (4, -1, T.channels))[:, ~T.masked].astype(np.float64) for side in sides)
-        scale = (x * y).sum(axis=(0, 1)) / np.maximum((x * x).sum(axis=(0, 1)), np.finfo(float).tiny)
+        x, y = (
+            np.reshape(side, (4, -1, T.channels))[:, ~T.masked].astype(np.float64) for side in sides
+        )
+        scale = (x * y).sum(axis=(0, 1)) / np.maximum(
+            (x * x).sum(axis=(0, 1)), np.finfo(float).tiny
+        )
         error = np.sqrt(((scale * x - y) ** 2).sum(axis=(0, 1)) / (y * y).sum(axis=(0, 1)))
         return tuple(error.tolist())
 
@@ -196,4 +214,6 @@ class Setup:
         return values
 
     def _mean(self, picture: np.ndarray) -> np.ndarray:
-        return (self.blocks.sum(picture) / self.blocks.sum(np.ones_like(picture))).astype(np.float32)
+        return (self.blocks.sum(picture) / self.blocks.sum(np.ones_like(picture))).astype(
+            np.float32
+        )

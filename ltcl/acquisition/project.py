@@ -8,9 +8,9 @@
     [acquire]
     strategy = "auto"
 
-Keys of [rig] are arguments of its class, those of [acquire] of `ltcl.acquire`; "none" stands for None. A
-virtual rig has the files `transport` and `camera_map`, a live one the tables [rig.camera], of kind "opencv"
-or "gphoto2", and [rig.display].
+Keys of [rig] are arguments of its class, those of [acquire] of `ltcl.acquire`; "none" stands for
+None. A virtual rig has the files `transport` and `camera_map`, a live one the tables [rig.camera],
+of kind "opencv" or "gphoto2", and [rig.display].
 """
 
 from __future__ import annotations
@@ -46,7 +46,15 @@ _NOISELESS = 1e9  # electrons
 _RIGS: dict[str, Any] = {"virtual": rigs.VirtualRig, "mitsuba": rigs.MitsubaRig}
 _RIGS |= {"folder": rigs.FolderRig, "live": rigs.LiveRig}
 _CAMERAS = {"opencv": rigs.OpenCVCamera, "gphoto2": rigs.GPhoto2Camera}
-_OBJECTS = ("T", "folder", "rig", "store", "resume", "progress", "device")  # arguments that no file has
+_OBJECTS = (
+    "T",
+    "folder",
+    "rig",
+    "store",
+    "resume",
+    "progress",
+    "device",
+)  # arguments that no file has
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,13 @@ class Project:
     >>> import pathlib, tempfile, ltcl
     >>> folder = pathlib.Path(tempfile.mkdtemp())
     >>> ltcl.save(folder / "truth.npz", ltcl.scenes.dihedral(4).transport())
-    >>> lines = ("[rig]", 'kind = "virtual"', 'transport = "truth.npz"', "[acquire]", 'geometry = "aligned"')
+    >>> lines = (
+    ...     "[rig]",
+    ...     'kind = "virtual"',
+    ...     'transport = "truth.npz"',
+    ...     "[acquire]",
+    ...     'geometry = "aligned"',
+    ... )
     >>> _ = (folder / "acquisition.toml").write_text(chr(10).join(lines))
     >>> project = Project.open(folder)
     >>> with project.rig() as rig:
@@ -75,14 +89,18 @@ class Project:
         """Read and check the file of a folder: FileError where it is none, InputError for its keys."""
         path = (folder := as_path(folder)) / FILE
         if not path.exists():
-            raise FileError(f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one")
+            raise FileError(
+                f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one"
+            )
         try:
             content = tomllib.loads(input_file(path).read_text(encoding="utf-8-sig"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise FileError(f"{path}: is no TOML: {error}") from None
         for name, value in content.items():
             if name not in ("rig", "acquire") or not isinstance(value, dict):
-                raise InputError(f"{path}: has {name!r}; it must have the tables [rig] and [acquire] only")
+                raise InputError(
+                    f"{path}: has {name!r}; it must have the tables [rig] and [acquire] only"
+                )
         table = _check(path, "rig", content.get("rig"), _RIGS)
         if table["kind"] == "live":
             table["camera"] = _check(path, "rig.camera", table["camera"], _CAMERAS)
@@ -122,7 +140,9 @@ class Project:
         camera = ("camera_map", "camera_grid") if aligned else ()
         with self.naming("rig"):
             try:
-                rig = _make(self.folder, {k: v for k, v in self.table.items() if k not in camera}, closed)
+                rig = _make(
+                    self.folder, {k: v for k, v in self.table.items() if k not in camera}, closed
+                )
             except LtclError:
                 raise
             except (TypeError, ValueError) as error:  # a number where a class expects a list
@@ -154,13 +174,22 @@ class Project:
             light = replace(light, ambient=float(np.mean(getattr(rig, "ambient", light.ambient))))
             times = expected_exposures(shots, light.direct + light.indirect, light.ambient)
             facts: dict[str, Any] = {"exposures": tuple(sorted(settings.exposures or times))}
-            facts |= {"grid": shots.grid, "channels": shots.channels, "noise": noise, "light": light}
+            facts |= {
+                "grid": shots.grid,
+                "channels": shots.channels,
+                "noise": noise,
+                "light": light,
+            }
         if self.state != "new":
             known = Calibration.of(self.store)
             facts |= {"exposures": known.exposures, "noise": known.noise, "light": measured(known)}
         ways = {"aligned": settings.geometry == "aligned", "by_hand": self.kind == "folder"}
-        facts["calibration"] = photographs(facts["grid"], facts["channels"], settings.frames, **ways)
-        return settings, facts | {name: getattr(settings, name) for name in ("block", "order", "threshold")}
+        facts["calibration"] = photographs(
+            facts["grid"], facts["channels"], settings.frames, **ways
+        )
+        return settings, facts | {
+            name: getattr(settings, name) for name in ("block", "order", "threshold")
+        }
 
 
 def _check(path: Path, name: str, table: Any, make: Any) -> dict[str, Any]:
@@ -170,7 +199,9 @@ def _check(path: Path, name: str, table: Any, make: Any) -> dict[str, Any]:
     needed: dict[str, bool] = {}
     if isinstance(make, dict):
         if (kind := table.get("kind")) not in [*make]:
-            raise InputError(f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(make)}")
+            raise InputError(
+                f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(make)}"
+            )
         make, needed = make[kind], {"kind": True}
     arguments = dict(inspect.signature(make).parameters)
     if arguments.pop("sensor", None):
@@ -194,7 +225,9 @@ def _make(folder: Path, table: dict[str, Any], closed: bool) -> Any:
         else:
             record = formats.read(folder / str(camera_map))
             if isinstance(record, Parts):
-                raise InputError(f"camera_map is {camera_map}, a compressed transport; it must be a matrix")
+                raise InputError(
+                    f"camera_map is {camera_map}, a compressed transport; it must be a matrix"
+                )
             table["camera_map"] = record.in_memory().matrices
         return rigs.VirtualRig(T, T.grid, **table)
     if kind == "mitsuba":

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Rig`: what a set-up of projector and camera must offer. `Shots`: the one way the package uses it.
 
-`Shots` checks what goes into a rig and what comes back, counts the photographs, and scales their codes:
+`Shots` checks what goes into a rig and what comes back, counts the photographs, and scales their
+codes:
     value = code / full scale,    full scale = 2^bits - 1 of an integer camera, 1 of a float one.
 """
 
@@ -31,12 +32,12 @@ _Kind = tuple[tuple[int, ...], np.dtype]  # shape and type of a photograph
 class Rig(Protocol):
     """A projector, (h, w), and a camera that looks at what it lights; `channels` are 1 for grey, 3 for RGB.
 
-    Optional: `exposures`, the seconds that the camera offers, ascending (else any from 1e-4 to 30); `bits` in
-    use in a uint16 image (else 16); `prepare(shots)`, called with the (codes, seconds) that come next;
-    `describe()`, a dict of plain JSON, equal when a scan is resumed (but for what is measured anew, such as
-    "survey"); `recall(codes, seconds, image)`, called for a photograph of an earlier session;
-    `keeps_photographs`, whether it stores them itself; `number` of the last photograph and
-    `file_name(number)`, for messages; `close()`.
+    Optional: `exposures`, the seconds that the camera offers, ascending (else any from 1e-4 to 30);
+    `bits` in use in a uint16 image (else 16); `prepare(shots)`, called with the (codes, seconds)
+    that come next; `describe()`, a dict of plain JSON, equal when a scan is resumed (but for what
+    is measured anew, such as "survey"); `recall(codes, seconds, image)`, called for a photograph of
+    an earlier session; `keeps_photographs`, whether it stores them itself; `number` of the last
+    photograph and `file_name(number)`, for messages; `close()`.
     """
 
     projector_grid: tuple[int, int]
@@ -45,7 +46,8 @@ class Rig(Protocol):
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
         """What the camera gives after `seconds` of light under `codes`, (h, w) or (h, w, 3) in [0, 1].
 
-        Returns uint8, uint16 or float of (H, W) or (H, W, 3), always the same; full scale of a float is 1.
+        Returns uint8, uint16 or float of (H, W) or (H, W, 3), always the same; full scale of a
+        float is 1.
         """
         ...
 
@@ -70,15 +72,17 @@ class Closing(contextlib.AbstractContextManager):
 class Shots(Closing):
     """Photographs of a rig: checked, counted, float32 in [0, 1] of full scale.
 
-    InputTypeError for a rig that lacks a member, InputError where one cannot be used. `exposures` are None
-    for any from 1e-4 to 30 s; `count` is of the photographs, `image` the last as the rig gave it. After the
-    first there are `camera_grid`, `levels` (256 of 8 bits, None of floats), and `digest`: of the first under
-    "black" and "white" the seconds, and means over 8 x 8 cells.
+    InputTypeError for a rig that lacks a member, InputError where one cannot be used. `exposures`
+    are None for any from 1e-4 to 30 s; `count` is of the photographs, `image` the last as the rig
+    gave it. After the first there are `camera_grid`, `levels` (256 of 8 bits, None of floats), and
+    `digest`: of the first under "black" and "white" the seconds, and means over 8 x 8 cells.
 
     Examples
     --------
     >>> from ltcl.acquisition import VirtualRig
-    >>> shots = Shots(VirtualRig(np.eye(2) / 2, grid=(1, 2), gain=None, read=0, black=0, response="linear"))
+    >>> shots = Shots(
+    ...     VirtualRig(np.eye(2) / 2, grid=(1, 2), gain=None, read=0, black=0, response="linear")
+    ... )
     >>> shots.photograph([[0, 1]], seconds=1).round(2)
     array([[0. , 0.5]], dtype=float32)
     >>> shots.count, shots.camera_grid, shots.levels
@@ -119,34 +123,47 @@ class Shots(Closing):
     def photograph(self, codes: Any, seconds: float, stored: Any = None) -> np.ndarray:
         """One photograph of codes (h, w[, 3]) in [0, 1] over full scale: float32, (H, W) or (H, W, 3).
 
-        `stored` is the image of an earlier run, in place of a new one. InputError for other codes, or seconds
-        that the camera does not have; AcquisitionError where the rig fails, or the image cannot be used.
+        `stored` is the image of an earlier run, in place of a new one. InputError for other codes,
+        or seconds that the camera does not have; AcquisitionError where the rig fails, or the image
+        cannot be used.
         """
         codes, seconds = as_shot(self, codes, seconds)
         if stored is not None:
             getattr(self.rig, "recall", lambda *_: None)(codes, seconds, stored)
         try:
-            self.image = image = np.asarray(self.rig.photograph(codes, seconds) if stored is None else stored)
+            self.image = image = np.asarray(
+                self.rig.photograph(codes, seconds) if stored is None else stored
+            )
         except LtclError:
             raise
         except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise AcquisitionError(f"photograph {self.count + 1}: the rig failed with {reason}") from error
+            raise AcquisitionError(
+                f"photograph {self.count + 1}: the rig failed with {reason}"
+            ) from error
         name = self.name(getattr(self.rig, "number", self.count + 1))
         scaled = to_unit(name, image, self.rig, self._first)
         self._first = image.shape, image.dtype
-        self.camera_grid, self.levels = (image.shape[0], image.shape[1]), _levels(image.dtype, self.rig)
+        self.camera_grid, self.levels = (
+            (image.shape[0], image.shape[1]),
+            _levels(image.dtype, self.rig),
+        )
         sizes = self.camera_grid, self.levels
         if self.expected is not None and self.expected != sizes:
             text = "{} pixels and {} levels"
-            expected = f"{text.format(*self.expected)}, as the scan was begun with, or another store"
+            expected = (
+                f"{text.format(*self.expected)}, as the scan was begun with, or another store"
+            )
             raise InputError(f"{name} has {text.format(*sizes)}; it must have {expected}")
         self.count += 1
         for view, code in (("black", 0.0), ("white", 1.0)):
             if view not in self.digest and np.all(codes == code):
                 size = min(_CELLS, image.shape[1]), min(_CELLS, image.shape[0])
                 cells = cv2.resize(scaled, size, interpolation=cv2.INTER_AREA)
-                self.digest[view] = {"seconds": seconds, "cells": cells.astype(float).round(5).tolist()}
+                self.digest[view] = {
+                    "seconds": seconds,
+                    "cells": cells.astype(float).round(5).tolist(),
+                }
         return scaled
 
     def describe(self) -> dict[str, Any]:
@@ -184,7 +201,9 @@ def exact(name: str, seconds: Any, exposures: Iterable[float] | None) -> float:
         return checks.number(name, seconds, least=SHORTEST, most=LONGEST)
     offered = nearest(exposures, checks.number(name, seconds, above=0.0))
     if not math.isclose(offered, seconds, rel_tol=_SAME):
-        raise InputError(f"{name} is {seconds:g}; it must be an exposure, the nearest is {offered:g}")
+        raise InputError(
+            f"{name} is {seconds:g}; it must be an exposure, the nearest is {offered:g}"
+        )
     return offered
 
 
@@ -194,24 +213,34 @@ def as_codes(codes: Any, grid: tuple[int, int], channels: int) -> np.ndarray:
     checks.shape("codes", array, *([grid] if channels == 1 else [grid, (*grid, 3)]))
     checks.finite("codes", array)
     if array.min() < 0 or array.max() > 1:
-        raise InputError(f"codes reach from {array.min():g} to {array.max():g}; they must be in [0, 1]")
+        raise InputError(
+            f"codes reach from {array.min():g} to {array.max():g}; they must be in [0, 1]"
+        )
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
 def as_shot(rig: Any, codes: Any, seconds: Any) -> tuple[np.ndarray, float]:
     """Codes by `as_codes` and seconds by `exact`, for a rig whose members are checked."""
-    return as_codes(codes, rig.projector_grid, rig.channels), exact("seconds", seconds, rig.exposures)
+    return as_codes(codes, rig.projector_grid, rig.channels), exact(
+        "seconds", seconds, rig.exposures
+    )
 
 
 def to_unit(name: str, image: np.ndarray, camera: Any, first: _Kind | None = None) -> np.ndarray:
     """A photograph of a rig or camera over full scale, float32; AcquisitionError begins with `name`."""
     if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
         raise AcquisitionError(f"{name} holds {image.dtype}; it must hold uint8, uint16 or float")
-    if image.ndim < 2 or image.shape[2:] != (() if camera.channels == 1 else (3,)) or image.size == 0:
+    if (
+        image.ndim < 2
+        or image.shape[2:] != (() if camera.channels == 1 else (3,))
+        or image.size == 0
+    ):
         expected = "(H, W)" if camera.channels == 1 else "(H, W, 3)"
         raise AcquisitionError(f"{name} has shape {image.shape}; it must be {expected}, not empty")
     if first is not None and first != (image.shape, image.dtype):
-        raise AcquisitionError(f"{name} is {image.dtype} {image.shape}; it must be {first[1]} {first[0]}")
+        raise AcquisitionError(
+            f"{name} is {image.dtype} {image.shape}; it must be {first[1]} {first[0]}"
+        )
     levels = _levels(image.dtype, camera)
     if levels is None:
         with np.errstate(over="ignore"):
@@ -220,7 +249,9 @@ def to_unit(name: str, image: np.ndarray, camera: Any, first: _Kind | None = Non
             raise AcquisitionError(f"{name} has {bad} NaN or infinite value(s); all must be finite")
         return scaled
     if image.max() >= levels:
-        raise AcquisitionError(f"{name} reaches {image.max()}; by rig.bits the largest code is {levels - 1}")
+        raise AcquisitionError(
+            f"{name} reaches {image.max()}; by rig.bits the largest code is {levels - 1}"
+        )
     return image * np.float32(1.0 / (levels - 1))
 
 
@@ -258,7 +289,9 @@ def fingerprint(*matrices: Any) -> str:
     digest = hashlib.sha256()
     for matrix in matrices:
         if scipy.sparse.issparse(matrix):
-            rows = scipy.sparse.csr_array(matrix, copy=not getattr(matrix, "has_canonical_format", False))
+            rows = scipy.sparse.csr_array(
+                matrix, copy=not getattr(matrix, "has_canonical_format", False)
+            )
             rows.sum_duplicates()
             arrays = [rows.data, rows.indices.astype(np.int64), rows.indptr.astype(np.int64)]
         elif isinstance(matrix, np.ndarray):
@@ -267,7 +300,9 @@ def fingerprint(*matrices: Any) -> str:
             random = np.random.default_rng(0)
             v = random.random(matrix.shape[1]).astype(matrix.dtype)
             sums = random.random((4, matrix.shape[0])) @ (matrix @ v)
-            arrays = [np.array([f"{number:.4g}" for number in sums], "S16")]  # products in float32 vary
+            arrays = [
+                np.array([f"{number:.4g}" for number in sums], "S16")
+            ]  # products in float32 vary
         for array in arrays:
             digest.update(f"{array.dtype.str} {array.shape};".encode())
             digest.update(np.ascontiguousarray(array).data)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`CaptureSession`: the photographs of a calibration; and the folder that holds them until it has ended.
 
-The photographs of a calibration decide on the next one. So one that was stopped is run again from its start,
-with the photographs in STORE.calibration, until it asks for a new one: known by codes, seconds, and how often
-a list of requests had the same before.
+The photographs of a calibration decide on the next one. So one that was stopped is run again from
+its start, with the photographs in STORE.calibration, until it asks for a new one: known by codes,
+seconds, and how often a list of requests had the same before.
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ class CaptureSession:
         """Photographs of requests, in order; those of uniform patterns are used again."""
         requests = [request for group in groups for request in group]
         self.prepare(requests)
-        photographs = iter([self._uniform.get(name) or self._take(name, r) for name, r in _named(requests)])
+        photographs = iter(
+            [self._uniform.get(name) or self._take(name, r) for name, r in _named(requests)]
+        )
         return [[next(photographs) for _ in group] for group in groups]
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
@@ -141,8 +143,8 @@ def remove_photographs(store: Path) -> None:
 def photograph_log(store: Path, shots: Shots) -> Iterator[ArrayLog | None]:
     """The folder for a session, which is removed where the block ends well.
 
-    None where the rig stores its photographs itself. InputError where those in it are of another rig;
-    FileError where it cannot be written, or another process is at work there.
+    None where the rig stores its photographs itself. InputError where those in it are of another
+    rig; FileError where it cannot be written, or another process is at work there.
     """
     if getattr(shots.rig, "keeps_photographs", False):
         yield None
@@ -190,5 +192,7 @@ def _identity(description: Any) -> dict[str, Any]:
     return json.loads(
         json.dumps(description, default=str),
         parse_float=lambda digits: float(f"{float(digits):.4g}"),
-        object_pairs_hook=lambda pairs: {key: value for key, value in pairs if key not in VOLATILE_KEYS},
+        object_pairs_hook=lambda pairs: {
+            key: value for key, value in pairs if key not in VOLATILE_KEYS
+        },
     )

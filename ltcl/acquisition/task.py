@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`acquire`: from a rig to a transport, by photographs alone; it can be stopped at any time, and goes on.
 
-First the set-up is measured (`calibrate`) and committed as a whole; then T is scanned (`scanning`), batch by
-batch: columns of T, or pictures of an adaptive scan, which the transport replaces in the end.
+First the set-up is measured (`calibrate`) and committed as a whole; then T is scanned (`scanning`),
+batch by batch: columns of T, or pictures of an adaptive scan, which the transport replaces in the
+end.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError,
 from ltcl.files import as_path
 from ltcl.store import BlockStore, Parts, StoredRows, load
 from ltcl.store.block_store import check_place
-from ltcl.transport import Transport
+from ltcl.transport.transport import Transport
 
 logger = logging.getLogger(__name__)
 _REFUSED = 0.3  # of white: relative deviation of row sums
@@ -60,18 +61,29 @@ class Settings:
         """Checked for the rig of `shots`; errors as of `acquire`."""
         settings = cls(*values, **named)
         geometry, response, times = settings.geometry, settings.response, settings.exposures
-        if not isinstance(geometry, Correspondence) and str(geometry) not in ("graycode", "aligned"):
+        if not isinstance(geometry, Correspondence) and str(geometry) not in (
+            "graycode",
+            "aligned",
+        ):
             text = "it must be 'graycode', 'aligned' or a Correspondence"
             raise InputError(f"geometry is {checks.shown(geometry)}; {text}")
         if not isinstance(response, Response | None):
-            raise InputTypeError(f"response is a {type(response).__name__}; it must be a Response, or None")
+            raise InputTypeError(
+                f"response is a {type(response).__name__}; it must be a Response, or None"
+            )
         if response is None and shots.exposures is not None and len(shots.exposures) == 1:
-            raise InputError("rig.exposures has one exposure, which determines no response; give response=")
+            raise InputError(
+                "rig.exposures has one exposure, which determines no response; give response="
+            )
         if times is not None:
             seconds = checks.finite("exposures", checks.real("exposures", times))
             if seconds.ndim != 1 or seconds.size == 0 or seconds.min() <= 0:
-                raise InputError(f"exposures is {times!r}; it must be a sequence of positive seconds")
-            times = tuple(exact("exposures", t, shots.exposures) for t in seconds.astype(float).tolist())
+                raise InputError(
+                    f"exposures is {times!r}; it must be a sequence of positive seconds"
+                )
+            times = tuple(
+                exact("exposures", t, shots.exposures) for t in seconds.astype(float).tolist()
+            )
         if checks.count("order", settings.order) & (settings.order + 1):
             raise InputError(f"order is {settings.order}; it must be 2^k - 1: 1, 3, 7, 15, ...")
         checks.one_of("strategy", settings.strategy, ("auto", *plan.STRATEGIES))
@@ -113,48 +125,53 @@ def acquire(
     Parameters
     ----------
     rig : Rig
-        A projector and a camera: anything with projector_grid, channels and photograph(codes, seconds).
+        A projector and a camera: anything with projector_grid, channels and photograph(codes,
+        seconds).
     geometry : "graycode", "aligned" or Correspondence
         Which projector pixel each camera pixel sees: measured; the same; or as measured before.
     strategy : "auto", "adaptive", "pixel", "block" or "hadamard"
-        Cells that are divided where needed; one pixel at a time; blocks of pixels, which makes a coarser
-        transport; many pixels at once. "auto" decides by the noise of the camera (`scanning.plan`).
+        Cells that are divided where needed; one pixel at a time; blocks of pixels, which makes a
+        coarser transport; many pixels at once. "auto" decides by the noise of the camera
+        (`scanning.plan`).
     store : path, optional
-        Folder of the transport, which keeps what was photographed, to be resumed. Until the set-up is
-        measured its photographs are in the folder STORE.calibration; to begin anew, remove both.
+        Folder of the transport, which keeps what was photographed, to be resumed. Until the set-up
+        is measured its photographs are in the folder STORE.calibration; to begin anew, remove both.
     resume : bool
         Go on with what is in the store; else the store must not exist.
     progress : function of (str, int, int), optional
-        Called with "calibration" or "scan", how many of its photographs or patterns are done, those of an
-        earlier run included, and of how many at most.
+        Called with "calibration" or "scan", how many of its photographs or patterns are done, those
+        of an earlier run included, and of how many at most.
     exposures : sequence of float, optional
         Seconds of the photographs of each pattern, which the rig must have; by default chosen.
     response : Response, optional
         Of the camera, where it is known.
     frames : int
-        Photographs of black and of white that are averaged; those of a person are shared by the camera pixels
-        that see one projector pixel.
+        Photographs of black and of white that are averaged; those of a person are shared by the
+        camera pixels that see one projector pixel.
     block, order : int
         Side of the blocks of "block"; pixels lit together by "hadamard", 2^k - 1.
     threshold, sigmas : float
-        Part of what a camera pixel sees under white, above which a cell is divided by "adaptive"; standard
-        deviations above which an entry or a sum of entries is light and not noise, 0 keeps all.
+        Part of what a camera pixel sees under white, above which a cell is divided by "adaptive";
+        standard deviations above which an entry or a sum of entries is light and not noise, 0 keeps
+        all.
     device : Device or str, optional
         As in `Transport`; opened before the first photograph.
 
     Returns
     -------
     Transport
-        On the projector's pixels (blocks of them, of "block"), for light relative to white less black, in
-        linear sensor values a second. Pixels without a first bounce are masked. `Setup.of(store)` has the
-        codes that the projector is fed for linear light, and the ambient light on these pixels.
+        On the projector's pixels (blocks of them, of "block"), for light relative to white less
+        black, in linear sensor values a second. Pixels without a first bounce are masked.
+        `Setup.of(store)` has the codes that the projector is fed for linear light, and the ambient
+        light on these pixels.
 
     Raises
     ------
     InputError, InputTypeError, DeviceError
         Bad arguments; a store that was made with others, or with another rig; no such device.
     AcquisitionError
-        The rig fails, or photographs contradict each other; `PhotographMissing`: call again with it.
+        The rig fails, or photographs contradict each other; `PhotographMissing`: call again with
+        it.
     FileError
         The store is damaged, or cannot be written.
 
@@ -171,7 +188,9 @@ def acquire(
     """
     checks.flag("resume", resume)
     if progress is not None and not callable(progress):
-        raise InputTypeError(f"progress is {progress!r}; it must be a function of (str, int, int), or None")
+        raise InputTypeError(
+            f"progress is {progress!r}; it must be a function of (str, int, int), or None"
+        )
     progress, shots = progress or (lambda step, done, total: None), Shots(rig)
     settings = Settings.of(
         shots, geometry, strategy, exposures, response, frames, block, order, threshold, sigmas
@@ -207,8 +226,8 @@ def acquire(
 def finalize(store: str | os.PathLike[str], progress: Progress | None = None) -> None:
     """Make the transport from the photographs in a store; nothing happens where that was done before.
 
-    `progress` is that of `ltcl.acquire`. FileError for a store that is missing, damaged or not made by
-    `ltcl.acquire`; AcquisitionError where photographs are missing.
+    `progress` is that of `ltcl.acquire`. FileError for a store that is missing, damaged or not made
+    by `ltcl.acquire`; AcquisitionError where photographs are missing.
 
     >>> finalize("nowhere.zarr")
     Traceback (most recent call last):
@@ -216,7 +235,9 @@ def finalize(store: str | os.PathLike[str], progress: Progress | None = None) ->
     """
     opened = BlockStore.open(store)
     if "strategy" not in opened.attributes:
-        raise FileError(f"{opened.path}: holds no whole calibration of ltcl.acquire, so no transport either")
+        raise FileError(
+            f"{opened.path}: holds no whole calibration of ltcl.acquire, so no transport either"
+        )
     if opened.final:
         return opened.finalize()  # removes what a process that was killed at the very end has left
 
@@ -234,7 +255,9 @@ def _open(path: Path, resume: bool) -> BlockStore | None:
     places = [p for p in (session.calibration_folder(path), path) if os.path.exists(p)]
     places = [p for p in places if not p.is_dir() or any(p.iterdir())]
     if places and not resume:
-        raise InputError(f"resume is False, but {places[0]} exists; remove it, or give another store")
+        raise InputError(
+            f"resume is False, but {places[0]} exists; remove it, or give another store"
+        )
     if path not in places:
         return None
     store = BlockStore.open(path)
@@ -267,10 +290,14 @@ def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
             raise InputError(f"{text}; rig and scene must be the same")
 
 
-def _calibrate(path: Path, shots: Shots, settings: Settings, log: Any, progress: Progress) -> BlockStore:
+def _calibrate(
+    path: Path, shots: Shots, settings: Settings, log: Any, progress: Progress
+) -> BlockStore:
     """Measure the set-up, choose a strategy, and make the store."""
     side = settings.block if settings.strategy == "block" else 1
-    options = {name: getattr(settings, name) for name in ("geometry", "response", "exposures", "frames")}
+    options = {
+        name: getattr(settings, name) for name in ("geometry", "response", "exposures", "frames")
+    }
     calibration = calibrate.measure(shots, **options, side=side, progress=progress, log=log)
     options = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
     options |= {"channels": shots.channels, "calibration": shots.count}
@@ -295,7 +322,9 @@ def _calibrate(path: Path, shots: Shots, settings: Settings, log: Any, progress:
     calibration.write(store)
     if calibration.mixing is not None:
         store.extra("mixing", calibration.mixing)
-    store.update(settings=settings.to_json(), why=why, plan=asdict(plans[strategy]), strategy=strategy)
+    store.update(
+        settings=settings.to_json(), why=why, plan=asdict(plans[strategy]), strategy=strategy
+    )
     return store  # which is resumed from here on
 
 
@@ -311,7 +340,9 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
         store.update(patterns=log.done)
         for c, V in enumerate(core.matrices("variance")):
             store.extra(f"core_variance_{c}", V.data)
-        arrays = adaptive.arrays(core, calibration.mixing, settings.sigmas) | pictures.noise(core.variances)
+        arrays = adaptive.arrays(core, calibration.mixing, settings.sigmas) | pictures.noise(
+            core.variances
+        )
         store.finalize(compressed=Parts(arrays))
         progress("scan", log.done, log.done)
         return
@@ -324,7 +355,10 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
         progress("scan", done, total)
 
     columns.scan(pictures, code, store, settings.sigmas, count)
-    white, sums = pictures.white, np.stack([columns.sums(store, c) for c in range(pictures.channels)])
+    white, sums = (
+        pictures.white,
+        np.stack([columns.sums(store, c) for c in range(pictures.channels)]),
+    )
     # They do of a camera of one exposure that changes it by itself; others are refused in a batch.
     if (relative := columns.deviation(sums, white)) > _REFUSED:
         raise ScanRefused(
@@ -338,6 +372,8 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
 
     def add_up(c: int, first: int, matrix: Any, variance: Any) -> tuple[Any, Any]:
         rows = slice(first, first + matrix.shape[0])
-        return columns.balance(matrix, variance, Picture(white.value[c, rows], white.variance[c, rows]))
+        return columns.balance(
+            matrix, variance, Picture(white.value[c, rows], white.variance[c, rows])
+        )
 
     store.finalize(sigmas=settings.sigmas, change=add_up)

@@ -3,8 +3,27 @@
 
 from __future__ import annotations
 
-from ltcl.batch.frames import CompensatedFrames, compensate_frames
-from ltcl.batch.manifest import Record
-from ltcl.batch.scenes import map
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ltcl.batch.frames import CompensatedFrames, compensate_frames
+    from ltcl.batch.manifest import Record
+    from ltcl.batch.scenes import map
 
 __all__ = ["CompensatedFrames", "Record", "compensate_frames", "map"]
+
+# Loaded at the first use: tasks import `ltcl.batch.cluster`, and films need the tasks.
+_MODULES = {
+    "CompensatedFrames": "frames",
+    "compensate_frames": "frames",
+    "Record": "manifest",
+    "map": "scenes",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'ltcl.batch' has no attribute {name!r}")
+    module = importlib.import_module(f"ltcl.batch.{_MODULES[name]}")
+    return getattr(module, name)

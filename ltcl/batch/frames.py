@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`compensate_frames`: patterns for a folder or a video of frames, a batch of right-hand sides at a time.
 
-Every frame gets the same gain: one that followed the frames would make the scene flicker. Batches begin at
-the same frames in every run and share nothing but T and a survey of S: a resumed run, or one on a cluster,
-gives what an uninterrupted one does, to the last bit on devices of one kind with one memory of timings. What
-is missing from a batch is solved alone, to the same tolerance: the rest after `frames=`, or a lost pattern.
+Every frame gets the same gain: one that followed the frames would make the scene flicker. Batches
+begin at the same frames in every run and share nothing but T and a survey of S: a resumed run, or
+one on a cluster, gives what an uninterrupted one does, to the last bit on devices of one kind with
+one memory of timings. What is missing from a batch is solved alone, to the same tolerance: the rest
+after `frames=`, or a lost pattern.
 """
 
 from __future__ import annotations
@@ -21,19 +22,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ltcl import checks, images, layout
+from ltcl import checks, images
 from ltcl.batch import manifest
+from ltcl.batch.cluster import is_there, stream
 from ltcl.batch.manifest import OtherRun, Record, curve, identity, setting
-from ltcl.cluster import is_there, stream
-from ltcl.compensation import compensate, problem
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, locked, read_ahead
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
 from ltcl.images.pictures import Encoding
-from ltcl.report import versions
 from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
-from ltcl.transport import Transport, error_note, require, resolve_reference
+from ltcl.tasks.compensation import compensate, problem
+from ltcl.tasks.report import versions
+from ltcl.transport import frames as layout
+from ltcl.transport.transport import Transport, error_note, require, resolve_reference
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -47,7 +49,8 @@ _WRITERS = 4  # threads: files are compressed and flushed side by side
 class CompensatedFrames:
     """Result of `compensate_frames`: a record a frame, in order, those of earlier runs, too.
 
-    `solved` frames of this run took `seconds`. `transport_error` is not in the errors of the records.
+    `solved` frames of this run took `seconds`. `transport_error` is not in the errors of the
+    records.
     """
 
     folder: Path
@@ -107,43 +110,48 @@ def compensate_frames(
     ----------
     T, source : Transport; folder of pictures or video file, as of `ltcl.images.frames.open_frames`
     out
-        A folder: pattern_000001.png and so on, and frames.json with settings and frames. Other files in it
-        stay; a second run in it at the same time is refused.
+        A folder: pattern_000001.png and so on, and frames.json with settings and frames. Other
+        files in it stay; a second run in it at the same time is refused.
     batch : int
         Frames solved at once; more need more memory and, up to a point, less time each.
     resume : bool
-        Go on where an earlier run with the same T, settings and frames ended, if there was one. Without it, a
-        folder with frames of an earlier run is refused.
+        Go on where an earlier run with the same T, settings and frames ended, if there was one.
+        Without it, a folder with frames of an earlier run is refused.
     frames : int, optional, only so many, from the first on
     format : str
-        "png", 16 bits in sRGB with white at the upper bound of the light; or "exr", the light as it is.
+        "png", 16 bits in sRGB with white at the upper bound of the light; or "exr", the light as it
+        is.
     appearance : bool
         Write T pattern + background, too, into a folder appearance within `out`.
     video, fps : optional
-        Also a video of the patterns: .mkv or .avi (lossless), .mp4; by default at the source's rate, or 25.
+        Also a video of the patterns: .mkv or .avi (lossless), .mp4; by default at the source's
+        rate, or 25.
     encoding, resize : what the frames hold; whether to scale them to the camera's grid
     gain : float or "auto"
-        Of all frames; "auto" finds the largest for a sample of `batch` frames, evenly spread. A frame that
-        needs more light is clipped, and its record tells how much.
+        Of all frames; "auto" finds the largest for a sample of `batch` frames, evenly spread. A
+        frame that needs more light is clipped, and its record tells how much.
     progress : callable("frames", done, total), optional
-        Called before every batch and at the end; done counts frames of earlier runs, too; total may be None.
+        Called before every batch and at the end; done counts frames of earlier runs, too; total may
+        be None.
     codes : callable(pattern), optional
-        Codes of the projector for a pattern of light, such as `ltcl.acquisition.Setup.codes`: .png and video
-        then hold these, and not sRGB.
+        Codes of the projector for a pattern of light, such as `ltcl.acquisition.Setup.codes`: .png
+        and video then hold these, and not sRGB.
     client : distributed.Client, optional
-        Of a Dask cluster whose workers solve, as `ltcl.cluster.stream` does it. T is loaded there from the
-        file that `ltcl.load` read here, if all see it, or sent once. Files are those of a run without it.
+        Of a Dask cluster whose workers solve, as `ltcl.cluster.stream` does it. T is loaded there
+        from the file that `ltcl.load` read here, if all see it, or sent once. Files are those of a
+        run without it.
     share_gpu : bool
         Whether several workers may use one GPU.
     **options
-        Of `ltcl.compensate`: bounds, method, rtol, exact, and so on; background and weights are one picture.
+        Of `ltcl.compensate`: bounds, method, rtol, exact, and so on; background and weights are one
+        picture.
 
     Raises
     ------
     FileError, InputError, ConvergenceError
-        As `ltcl.compensate`, `open_frames` and `write_video`; frames of another size or of another run. What
-        was done stays, as after Ctrl-C. One that cannot be read, or is of another size than those before, is
-        left out, and named when all others are done.
+        As `ltcl.compensate`, `open_frames` and `write_video`; frames of another size or of another
+        run. What was done stays, as after Ctrl-C. One that cannot be read, or is of another size
+        than those before, is left out, and named when all others are done.
     ClusterError
         As `ltcl.cluster.stream`.
 
@@ -175,14 +183,21 @@ def compensate_frames(
             raise InputError(f"{name} is {target}, where the frames are; it must be another place")
     settings = {**(compensate.__kwdefaults__ or {}), "gain": gain, "loss": loss}
     settings |= {"batch": checks.count("batch", batch), "format": format, "appearance": appearance}
-    settings |= {"encoding": encoding, "resize": resize, "codes": codes and curve(codes, T.grid), **options}
+    settings |= {
+        "encoding": encoding,
+        "resize": resize,
+        "codes": codes and curve(codes, T.grid),
+        **options,
+    }
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
     head = {"versions": versions(), "settings": described, "transport": identity(T), "gain": None}
     reload: Any = T.reload
     seen = client is not None and is_there(client, reload and reload.args[0])
     solver = _Solver(T, options, appearance, head["transport"], reload if seen else None)
     each = partial(stream, client, share_gpu=share_gpu)
-    run = _Run(solver, each, opened, limit, folder, head, bounds[1] if bounds[1] > 0 else 1.0, codes)
+    run = _Run(
+        solver, each, opened, limit, folder, head, bounds[1] if bounds[1] > 0 else 1.0, codes
+    )
     with locked(folder, wait=False):
         run.records |= manifest.read(folder, head, resume)
         try:
@@ -218,7 +233,9 @@ def _validate(
             continue
         count = layout.unpack(name, value, T.camera_grid, T.channels)[1].frames
         if count is not None:
-            raise InputError(f"{name} holds {count} frame(s); it must be one picture, for all frames alike")
+            raise InputError(
+                f"{name} holds {count} frame(s); it must be one picture, for all frames alike"
+            )
     return checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
 
 
@@ -230,14 +247,20 @@ class _Solver:
     options: dict[str, Any]
     appearance: bool
     identity: dict[str, Any]
-    reload: Callable[[], Transport] | None = None  # on workers, in the place of T: reads it from its file
+    reload: Callable[[], Transport] | None = (
+        None  # on workers, in the place of T: reads it from its file
+    )
     gain: Any = None  # of all frames, when it is known
 
     def __call__(self, batch: tuple[list[int], np.ndarray]) -> tuple[Any, ...]:
         """Of numbers and pictures. With "auto", every batch sees the same survey of S."""
         numbers, pictures = batch
         try:
-            if self.options.get("method", "auto") == "auto" and self.T.is_square and self.T.shape[0] > SMALL:
+            if (
+                self.options.get("method", "auto") == "auto"
+                and self.T.is_square
+                and self.T.shape[0] > SMALL
+            ):
                 for S in self.T.systems:
                     survey(S)
             solved = compensate(self.T, pictures, gain=self.gain, **self.options)
@@ -277,7 +300,9 @@ class _Run:
     white: float  # light that is white in .png
     codes: Callable[[np.ndarray], np.ndarray] | None
     read: int = 0  # frames, of the right size
-    records: dict[int, Record] = field(default_factory=dict)  # by number, of all runs into the folder
+    records: dict[int, Record] = field(
+        default_factory=dict
+    )  # by number, of all runs into the folder
     done: set[int] = field(default_factory=set)  # numbers of frames, of earlier runs, too
     broken: dict[int, str] = field(default_factory=dict)  # frames that are left out, and why
     solved: int = 0
@@ -285,7 +310,9 @@ class _Run:
     def __post_init__(self) -> None:
         known, settings = self.source.count, self.head["settings"]
         self.count = known and min(known, self.limit or known)  # as far as the source tells
-        self.size, self.format, self.resize = (settings[name] for name in ("batch", "format", "resize"))
+        self.size, self.format, self.resize = (
+            settings[name] for name in ("batch", "format", "resize")
+        )
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
         """All batches; yields the number of frames done, before the first that is not and after each."""
@@ -299,7 +326,9 @@ class _Run:
         taken, waiting = tee(chain(first, batches))
         tasks = (([frame.number for frame, *_ in batch], _stack(batch)) for batch in taken)
         with ThreadPoolExecutor(_WRITERS) as writers:
-            for (light, *numbers), batch in zip(self.each(self.solver, tasks), waiting, strict=True):
+            for (light, *numbers), batch in zip(
+                self.each(self.solver, tasks), waiting, strict=True
+            ):
                 list(writers.map(self._write, (frame.number for frame, *_ in batch), *light))
                 for (frame, digest, _), *others in zip(batch, *numbers, strict=True):
                     self.records[frame.number] = Record(frame.number, frame.name, digest, *others)
@@ -308,7 +337,9 @@ class _Run:
                 self.solved += len(batch)
                 yield len(self.done)
         if self.broken:
-            named = ", ".join(f"{number} ({why})" for number, why in sorted(self.broken.items())[:_NAMED])
+            named = ", ".join(
+                f"{number} ({why})" for number, why in sorted(self.broken.items())[:_NAMED]
+            )
             more = f" and {len(self.broken) - _NAMED} more" if len(self.broken) > _NAMED else ""
             raise FileError(f"{self.source.path}: frames were left out: {named}{more}")
 
@@ -344,15 +375,25 @@ class _Run:
                 return []
             picture = frame.picture()
             if picture.shape[:2] != (h, w) and not self.resize:
-                size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
-                raise InputError(f"{place} is {size}; give resize=True (--resize) to scale all frames")
+                size = (
+                    f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
+                )
+                raise InputError(
+                    f"{place} is {size}; give resize=True (--resize) to scale all frames"
+                )
         except InputError as error:
             if isinstance(error, OtherRun) or not (isinstance(error, FileError) or self.read):
                 raise  # also where all seem to be of another size
             self.broken[frame.number] = str(error)
             return []
         self.read += 1
-        return [(frame, digest, picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w)))]
+        return [
+            (
+                frame,
+                digest,
+                picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w)),
+            )
+        ]
 
     def patterns(self) -> Iterator[np.ndarray]:
         """As they were written, white at 1; codes as the light of which sRGB makes them."""
@@ -360,7 +401,9 @@ class _Run:
             pattern = images.read(self._files(number)[0])
             if self.format == "exr":
                 codes = self.codes
-                pattern = images.from_srgb(codes(pattern)) if codes else pattern / np.float32(self.white)
+                pattern = (
+                    images.from_srgb(codes(pattern)) if codes else pattern / np.float32(self.white)
+                )
             yield pattern
 
     def _files(self, number: int) -> list[Path]:

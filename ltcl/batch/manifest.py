@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a folder of patterns says of itself: from which T, with which settings, which frames are done.
 
-Replaced whole after every batch, when its patterns are on the disk: what ends a run early costs one batch.
+Replaced whole after every batch, when its patterns are on the disk: what ends a run early costs one
+batch.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import report
 from ltcl.acquisition.rig import fingerprint
 from ltcl.errors import InputError
 from ltcl.files import input_file, replace_file
 from ltcl.store.record import about
-from ltcl.transport import Transport
+from ltcl.tasks import report
+from ltcl.transport.transport import Transport
 
 NAME = "frames.json"
 _FORMAT = 2
@@ -47,7 +48,9 @@ def write(folder: Path, head: dict[str, Any], records: dict[int, Record]) -> Non
     text = report.dumps({"format": _FORMAT, **head})
     frames = ",\n    ".join(json.dumps(vars(records[number])) for number in sorted(records))
     with replace_file(folder / NAME) as temporary:
-        temporary.write_text(f'{text[:-2]},\n  "frames": [\n    {frames}\n  ]\n}}\n', encoding="utf-8")
+        temporary.write_text(
+            f'{text[:-2]},\n  "frames": [\n    {frames}\n  ]\n}}\n', encoding="utf-8"
+        )
 
 
 def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
@@ -61,14 +64,21 @@ def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
             raise ValueError(f"format {content['format']!r}")
         records = {int(entry["number"]): Record(**entry) for entry in content["frames"]}
         head["gain"], settings = float(content["gain"]), dict(content["settings"])
-        transport = {**content["transport"], "error": head["transport"]["error"]}  # that of the first bounce
+        transport = {
+            **content["transport"],
+            "error": head["transport"]["error"],
+        }  # that of the first bounce
     if not resume:
         count = f"{folder}: holds {len(records)} frame(s) of an earlier run"
-        raise InputError(f"{count}; give resume=True (--resume) to go on with it, or another folder")
+        raise InputError(
+            f"{count}; give resume=True (--resume) to go on with it, or another folder"
+        )
     for name in sorted({*head["settings"], *settings}):
         before, now = settings.get(name), head["settings"].get(name)
         if before != now:
-            raise OtherRun(f"{path}: that run had {name}={before!r}, this one has {now!r}; {advice}")
+            raise OtherRun(
+                f"{path}: that run had {name}={before!r}, this one has {now!r}; {advice}"
+            )
     if transport != head["transport"]:
         raise OtherRun(f"{path}: that run was with another T; {advice}")
     return records

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ltcl.cluster import stream
+from ltcl.batch.cluster import stream
 from ltcl.errors import BatchError, LtclError
 
 if TYPE_CHECKING:
@@ -23,14 +23,15 @@ def map(
 ) -> list[Any]:
     """Results of a function of each scene, in order; one that fails is named, and the rest go on.
 
-    `function` gets a path, or whatever `scenes` hold. Without a `client` it is called here, else on workers,
-    which then have to see the paths; `share_gpu` is as of `ltcl.cluster.stream`. `progress("scenes", done,
-    total)` is called after each.
+    `function` gets a path, or whatever `scenes` hold. Without a `client` it is called here, else on
+    workers, which then have to see the paths; `share_gpu` is as of `ltcl.cluster.stream`.
+    `progress("scenes", done, total)` is called after each.
 
     Raises
     ------
     BatchError
-        Some scenes failed, by an LtclError of `function`. `results` has them all, errors in their places.
+        Some scenes failed, by an LtclError of `function`. `results` has them all, errors in their
+        places.
 
     Examples
     --------
@@ -48,5 +49,7 @@ def map(
             progress("scenes", len(results), len(scenes))
     failed = [f"{s}: {r}" for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)]
     if failed:
-        raise BatchError(f"{len(failed)} of {len(scenes)} scenes failed: {'; '.join(failed)}", results)
+        raise BatchError(
+            f"{len(failed)} of {len(scenes)} scenes failed: {'; '.join(failed)}", results
+        )
     return results

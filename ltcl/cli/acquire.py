@@ -20,9 +20,9 @@ from ltcl.cli.command import WAITING, Answer, Context, command, percent, table
 from ltcl.cli.options import argument, option, pixels
 from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing, ScanRefused
-from ltcl.report import versions
 from ltcl.store import Record, formats
-from ltcl.verdict import verdict
+from ltcl.tasks.report import versions
+from ltcl.transport.verdict import verdict
 
 _SCENES = ("dihedral", "trihedral", "box")
 
@@ -44,7 +44,9 @@ _CAMERA_HELP = "Camera pixels, if other ones: Gray code then measures which is w
 
 
 def _rig_options(
-    size: Annotated[int | None, option("Patches along a wall of a scene. Default: 16.", min=2)] = None,
+    size: Annotated[
+        int | None, option("Patches along a wall of a scene. Default: 16.", min=2)
+    ] = None,
     grid: Annotated[tuple | None, pixels(_GRID_HELP)] = None,
     camera_grid: Annotated[tuple | None, pixels(_CAMERA_HELP)] = None,
     albedo: Annotated[Any, option(_ALBEDO_HELP, parser=_albedo, metavar="ALBEDO")] = None,
@@ -60,19 +62,23 @@ def _rig_options(
 
 @command(_rig_options)
 def simulate(
-    context: Context, scene: Annotated[str, argument("SCENE", _SCENE, parser=None)], out: options.Out
+    context: Context,
+    scene: Annotated[str, argument("SCENE", _SCENE, parser=None)],
+    out: options.Out,
 ) -> Answer:
     """Make a folder in which 'ltcl acquire' photographs SCENE, without a camera.
 
-    Writes acquisition.toml, with what else it could say in comments, and truth.npz, the transport that is to
-    be measured (not of mitsuba).
+    Writes acquisition.toml, with what else it could say in comments, and truth.npz, the transport
+    that is to be measured (not of mitsuba).
     """
     from ltcl.acquisition import Project
 
     if (out / "transport.zarr").exists():
         raise InputError(f"{out}: holds a transport.zarr that was acquired; choose another folder")
     if (out / "acquisition.toml").exists() and not (out / "simulate.json").exists():
-        raise InputError(f"{out}: holds an acquisition.toml of somebody else; choose another folder")
+        raise InputError(
+            f"{out}: holds an acquisition.toml of somebody else; choose another folder"
+        )
     asked = {name: value for name, value in context.options.items() if name != "out"}
     text = {"command": "simulate", "versions": versions(), "scene": scene, "options": asked}
     with pictures.fill(out, text) as folder:
@@ -82,7 +88,9 @@ def simulate(
         aligned = asked["camera_grid"] is None and not scene.endswith(".xml")
         settings = {"geometry": "aligned" if aligned else "graycode", "strategy": asked["strategy"]}
         tables = {
-            name: "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in keys.items())
+            name: "".join(
+                f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in keys.items()
+            )
             for name, keys in (("rig", rig), ("acquire", settings))
         }
         template = Path(__file__).with_name("acquisition.toml.in").read_text("utf-8")
@@ -108,14 +116,19 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
         if is_refused and asked[name] is not None:
             raise InputError(f"--{name} is {asked[name]}, but {scene} takes no --{name}")
     albedo = asked["albedo"] or (0.7,)
-    rig: dict[str, Any] = {} if asked["camera_grid"] is None else {"camera_grid": asked["camera_grid"]}
+    rig: dict[str, Any] = (
+        {} if asked["camera_grid"] is None else {"camera_grid": asked["camera_grid"]}
+    )
     if is_rendered:
         rig |= {"kind": "mitsuba", "projector_grid": asked["grid"] or (24, 32)}
         rig |= {"scene": source if is_named else str(Path(source).resolve())}
         paint = {"channels": len(albedo), "albedo": albedo if albedo[1:] else albedo[0]}
         return rig | (paint if is_named else {})
     if is_named:
-        walls, sides = np.array([albedo]) if albedo[1:] else albedo[0], {"sides": 5} if scene == "box" else {}
+        walls, sides = (
+            np.array([albedo]) if albedo[1:] else albedo[0],
+            {"sides": 5} if scene == "box" else {},
+        )
         built = getattr(scenes, scene)(asked["size"] or 16, albedo=walls, **sides)
         record: Any = Record(built.matrices(), grid=built.grid)
     elif not Path(scene).suffix and not Path(scene).exists():
@@ -124,19 +137,28 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
     elif (record := formats.read(Path(scene))).grid is None and asked["grid"] is None:
         raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
     elif isinstance(record, Record) and asked["grid"] is not None:
-        record = dataclasses.replace(record, grid=checks.grid("--grid", asked["grid"], record.shape[1]))
+        record = dataclasses.replace(
+            record, grid=checks.grid("--grid", asked["grid"], record.shape[1])
+        )
     formats.write(folder / "truth.npz", record)
     rig |= {"kind": "virtual", "transport": "truth.npz"}
     rig |= {"ambient": 0.01 if asked["ambient"] is None else asked["ambient"]}
     if asked["camera_grid"]:  # a camera in the projector's place
         rig |= {"camera_map": "camera.npz"}
-        (H, W), (h, w) = asked["camera_grid"], checks.grid("grid", record.camera_grid or record.grid)
-        seen = camera_map(lambda u, v: ((u + 0.5) * w / W - 0.5, (v + 0.5) * h / H - 0.5), (H, W), (h, w))
+        (H, W), (h, w) = (
+            asked["camera_grid"],
+            checks.grid("grid", record.camera_grid or record.grid),
+        )
+        seen = camera_map(
+            lambda u, v: ((u + 0.5) * w / W - 0.5, (v + 0.5) * h / H - 0.5), (H, W), (h, w)
+        )
         formats.write(folder / "camera.npz", Record((seen,), grid=(h, w), camera_grid=(H, W)))
     return rig
 
 
-_TAKE = "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
+_TAKE = (
+    "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
+)
 _Take = Annotated[Path | None, options.file(_TAKE, metavar="FOLDER")]
 _Overhead = Annotated[float, option("Seconds of each photograph beyond its exposure.", min=0.0)]
 
@@ -147,8 +169,8 @@ DIR/transport.zarr. DIR has an acquisition.toml, which says what photographs, an
 def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.0) -> Answer:
     """What each strategy takes: photographs, time, disk; and how accurate it is.
 
-    Noise and light are as measured once DIR/transport.zarr has its calibration, before that they are guessed.
-    No camera is opened.
+    Noise and light are as measured once DIR/transport.zarr has its calibration, before that they
+    are guessed. No camera is opened.
     """
     from ltcl.acquisition import Project
     from ltcl.acquisition.scanning.plan import choose, plans
@@ -157,7 +179,11 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     settings, facts = project.outlook()
     with project.naming("acquire"):
         strategies = plans(**facts, overhead=overhead)
-    (best, why), is_measured, count = choose(strategies), project.state != "new", facts["calibration"]
+    (best, why), is_measured, count = (
+        choose(strategies),
+        project.state != "new",
+        facts["calibration"],
+    )
     data = {"folder": folder, "rig": project.kind, "measured": is_measured}
     data |= {"asked_for": settings.strategy, "auto": best, "why": why}
     data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")}
@@ -166,9 +192,19 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
         counts = "{} x {}".format(*each.grid), each.patterns, each.photographs
         sizes = datetime.timedelta(seconds=round(each.seconds)), checks.size(each.disk)
         rows.append((name, *counts, *sizes, percent(each.error, 2)))
-    columns = ("strategy", "pixels", "patterns", "photographs", "time", "disk at most", "error of T p")
+    columns = (
+        "strategy",
+        "pixels",
+        "patterns",
+        "photographs",
+        "time",
+        "disk at most",
+        "error of T p",
+    )
     source = "measured" if is_measured else "guessed; the calibration will measure them"
-    advice = "" if settings.strategy == "auto" else f"acquisition.toml asks for {settings.strategy}; "
+    advice = (
+        "" if settings.strategy == "auto" else f"acquisition.toml asks for {settings.strategy}; "
+    )
     lines = [
         f"{folder}: {project.kind} rig, {facts['channels']} channel(s)",
         f"exposures {', '.join(f'{t:.3g}' for t in facts['exposures'])} s, noise and light {source}\n",
@@ -184,11 +220,11 @@ def run(
 ) -> Answer:
     """Measure the set-up, then photograph all patterns; the transport comes to DIR/transport.zarr.
 
-    Goes on from wherever the folder stands: after Ctrl-C or a power cut, with photographs that were missing,
-    or with nothing but the transport left to be made.
+    Goes on from wherever the folder stands: after Ctrl-C or a power cut, with photographs that were
+    missing, or with nothing but the transport left to be made.
 
-    With a folder rig a person takes the photographs. Where they are missing, prints which pattern to show
-    next, for how long to expose and the name to save it by, and ends with exit code 3.
+    With a folder rig a person takes the photographs. Where they are missing, prints which pattern
+    to show next, for how long to expose and the name to save it by, and ends with exit code 3.
     """
     from ltcl.acquisition import Project, acquire, finalize
 
@@ -215,8 +251,13 @@ def run(
             except PhotographMissing as error:  # the normal way of a folder scan
                 missing, shot, name = rig.missing(), error.shot._asdict(), shlex.quote(str(folder))
                 data = {"folder": folder, "next": shot, "missing": missing, "exit_code": WAITING}
-                lines = [f"next: {error}", f"{folder / 'shots.csv'} is the list; {len(missing)} are missing"]
-                lines.append(f"on the projector: ltcl show {name}; then: ltcl acquire run {name} --take CARD")
+                lines = [
+                    f"next: {error}",
+                    f"{folder / 'shots.csv'} is the list; {len(missing)} are missing",
+                ]
+                lines.append(
+                    f"on the projector: ltcl show {name}; then: ltcl acquire run {name} --take CARD"
+                )
                 return Answer(data, lines, WAITING)
     except (AcquisitionError, KeyboardInterrupt) as error:
         error.args = (f"{str(error) or 'interrupted'}; {_advice(project, error)}",)
@@ -237,14 +278,16 @@ def _advice(project: Any, error: BaseException) -> str:
         return f"what was photographed before is kept in {project.store}; {again}"
     if project.kind == "folder":
         return again
-    return f"{calibration_photographs(project.store)} photographs of the calibration are kept; {again}"
+    return (
+        f"{calibration_photographs(project.store)} photographs of the calibration are kept; {again}"
+    )
 
 
 def report(context: Context, folder: options.Acquisition, device: options.Device = None) -> Answer:
     """Coverage, saturation, noise and reciprocity of a finished acquisition.
 
-    Of a virtual rig also the relative error of T p, for patterns p that were not scanned, after one scale for
-    each channel: the unit of light of a camera is its own.
+    Of a virtual rig also the relative error of T p, for patterns p that were not scanned, after one
+    scale for each channel: the unit of light of a camera is its own.
     """
     from ltcl.acquisition import Project, Report, Setup
 
@@ -256,7 +299,9 @@ def report(context: Context, folder: options.Acquisition, device: options.Device
     data = {"folder": folder, "store": project.store, **json.loads(facts.to_json())}
     lines = [str(facts)]
     T = store.load(project.store, on_dark="mask", device=opened)
-    data["verdict"] = judged = verdict(T, sum_deviation=facts.sum_deviation, saturation=facts.saturated)
+    data["verdict"] = judged = verdict(
+        T, sum_deviation=facts.sum_deviation, saturation=facts.saturated
+    )
     if project.kind == "virtual":
         context.progress("relative error of T p")
         with project.rig(aligned=True) as rig:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What all commands share: --json, --quiet, --verbose, progress, tables, errors in one line, exit codes.
 
-Results are on stdout, tables for people or one JSON document; notes, warnings, errors, progress on stderr.
+Results are on stdout, tables for people or one JSON document; notes, warnings, errors, progress on
+stderr.
 """
 
 from __future__ import annotations
@@ -20,11 +21,17 @@ import rich.progress
 import typer
 from rich.cells import cell_len
 from rich.console import Console
-from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from typer.models import ArgumentInfo
 
-from ltcl import report
 from ltcl.errors import LtclError
+from ltcl.tasks import report
 
 FAILED, USAGE, WAITING, INTERNAL, INTERRUPTED = 1, 2, 3, 70, 130
 EXIT_CODES = (
@@ -58,9 +65,15 @@ class Answer:
 
 
 def _shared(
-    json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout, or an error's.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, notes or warnings.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Also say what is being done.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="One JSON document on stdout, or an error's.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="No progress, notes or warnings.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Also say what is being done.")
+    ] = False,
 ) -> None:
     """The options of every command."""
 
@@ -72,10 +85,18 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
     """
 
     def decorate(function: Callable[..., Answer]) -> Callable[..., None]:
-        signatures = [inspect.signature(each, eval_str=True) for each in (function, *groups, _shared)]
-        every = [parameter for signature in signatures for parameter in signature.parameters.values()]
-        parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in every[1:]]
-        positional = {p.name for p in parameters if isinstance(p.annotation.__metadata__[0], ArgumentInfo)}
+        signatures = [
+            inspect.signature(each, eval_str=True) for each in (function, *groups, _shared)
+        ]
+        every = [
+            parameter for signature in signatures for parameter in signature.parameters.values()
+        ]
+        parameters = [
+            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in every[1:]
+        ]
+        positional = {
+            p.name for p in parameters if isinstance(p.annotation.__metadata__[0], ArgumentInfo)
+        }
         own = [*signatures[0].parameters][1:]
 
         @functools.wraps(function)
@@ -113,7 +134,10 @@ def fail(error: BaseException, json: bool = False, verbose: bool = False) -> dic
     elif isinstance(error, MemoryError) and not isinstance(error, LtclError):
         message = "the host has no memory left"
     elif not isinstance(error, LtclError):
-        code, message = INTERNAL, f"internal error: {kind}: {message}; --verbose prints where it occurred"
+        code, message = (
+            INTERNAL,
+            f"internal error: {kind}: {message}; --verbose prints where it occurred",
+        )
         if verbose:
             typer.echo("".join(traceback.format_exception(error)), err=True)
     typer.echo(f"ltcl: error: {message}", err=True)
@@ -150,7 +174,9 @@ def _log_to_stderr(quiet: bool, verbose: bool) -> Iterator[None]:
 def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
     """A table, numbers right-aligned; nothing is cut off in a narrow terminal."""
     aligned = []
-    for name, *values in zip(columns, *([_cell(value) for value in row] for row in rows), strict=True):
+    for name, *values in zip(
+        columns, *([_cell(value) for value in row] for row in rows), strict=True
+    ):
         right = all(value[:1] in "+-.0123456789" or value == "diverges" for value in values)
         width = max(map(cell_len, (name, *values)))
         padded = ((text, " " * (width - cell_len(text))) for text in (name, *values))
@@ -173,27 +199,41 @@ def percent(share: float | None, digits: int = 3) -> str | None:
 class Progress(rich.progress.Progress):
     """`progress(step, done, total)`: a bar on stderr with elapsed time and time left, on a terminal only.
 
-    It runs from the start of a command to its end; without a total it shows that something is running.
+    It runs from the start of a command to its end; without a total it shows that something is
+    running.
     """
 
     def __init__(self, quiet: bool = False) -> None:
         console = Console(stderr=True)
         hidden = quiet or not console.is_terminal
-        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(bar_width=24)
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+        )
         times = TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("left")
         super().__init__(
-            *columns, *times, console=console, transient=True, disable=hidden, speed_estimate_period=_PERIOD
+            *columns,
+            *times,
+            console=console,
+            transient=True,
+            disable=hidden,
+            speed_estimate_period=_PERIOD,
         )
         self._item = self._step = ""
         self._solves = 0  # of this item that have begun
         self.add_task("", total=None)
 
-    def __call__(self, step: str, done: float = 0, total: float | None = None, *, detail: str = "") -> None:
+    def __call__(
+        self, step: str, done: float = 0, total: float | None = None, *, detail: str = ""
+    ) -> None:
         """Show what is being done and how much of it is done."""
         if step != self._step:
             _logger.info("%s%s", self._item, step)
         (task,), self._step = self.tasks, step
-        if task.total != total or done < task.completed:  # something else is counted, at another pace
+        if (
+            task.total != total or done < task.completed
+        ):  # something else is counted, at another pace
             self.remove_task(task.id)
             self.add_task("", total=total)
         self.update(self.task_ids[0], description=f"{self._item}{step}{detail}", completed=done)
@@ -211,7 +251,9 @@ class Progress(rich.progress.Progress):
 
         def callback(iteration: int, residual: float) -> None:
             self._solves += iteration == 0
-            gained = math.log(residual) / math.log(rtol) if 0 < residual < 1 and 0 < rtol < 1 else 0.0
+            gained = (
+                math.log(residual) / math.log(rtol) if 0 < residual < 1 and 0 < rtol < 1 else 0.0
+            )
             shown = "" if math.isnan(residual) else f", relative residual {residual:.1e}"
             done = min(self._solves - 1 + min(gained, 1.0), solves)
             self("solving", done, solves, detail=f": iteration {iteration}{shown}")

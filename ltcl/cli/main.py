@@ -31,7 +31,14 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_COMMANDS = [doctor.devices, doctor.doctor, doctor.demo, acquire.simulate, files.info, files.analyze]
+_COMMANDS = [
+    doctor.devices,
+    doctor.doctor,
+    doctor.demo,
+    acquire.simulate,
+    files.info,
+    files.analyze,
+]
 _COMMANDS += [files.convert, files.compress, files.invert, files.denoise, compensate.compensate]
 _COMMANDS += [compensate.separate, compensate.relight, view.view, view.play, view.show]
 for _command in _COMMANDS:
@@ -82,7 +89,11 @@ def _run_on_every_rank(words: list[str]) -> int:
     ends, said, out, err = MPI.COMM_WORLD.Dup(), io.StringIO(), sys.stdout, sys.stderr
     with tempfile.TemporaryDirectory() as folder:
         if ends.rank > 0:
-            words, out, err = [*words, "--out", f"{folder}/out"], io.StringIO(), said  # the last --out counts
+            words, out, err = (
+                [*words, "--out", f"{folder}/out"],
+                io.StringIO(),
+                said,
+            )  # the last --out counts
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = _run(words)
     all_ended, limit = ends.Ibarrier(), time.monotonic() + _PATIENCE

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Options that several commands share, each defined once, and what they ask for.
 
-Groups of options have their function here: `load` the transport that a command works with, `solving` how, and
-`heading` what its report says of both. Output places are tested before any work.
+Groups of options have their function here: `load` the transport that a command works with,
+`solving` how, and `heading` what its report says of both. Output places are tested before any work.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from ltcl import checks, report, store
+from ltcl import checks, store
 from ltcl.cli.command import Context, note, table
 from ltcl.device import open_device
 from ltcl.errors import FileError, InputError
-from ltcl.first_bounce import DARK
 from ltcl.operators import rank_device
 from ltcl.solvers.solve import METHODS, SAMPLED
-from ltcl.transport import Transport, default_rtol, resolve_reference
-from ltcl.verdict import Verdict
+from ltcl.tasks import report
+from ltcl.transport.first_bounce import DARK
+from ltcl.transport.transport import Transport, default_rtol, resolve_reference
+from ltcl.transport.verdict import Verdict
 
 _ROUNDING = 1e-5  # of float32, in a picture
 
@@ -93,7 +94,9 @@ _DEVICE = "gpu, cpu, an index of 'ltcl devices', part of a name, or all. Default
 _SEED = "Of monte_carlo and hybrid: the same numbers."
 _ENCODING = "Of pictures; auto: integers sRGB, floats linear."
 _RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error of T where more."
-_EXACT = "What TRANSPORT was compressed from: corrects solves to any RTOL; errors are those with it."
+_EXACT = (
+    "What TRANSPORT was compressed from: corrects solves to any RTOL; errors are those with it."
+)
 _SAMPLES = "Random walks from each pixel (monte_carlo, 256), or columns of a row (hybrid, 32)."
 _FIRST = "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated. Default: as in the file."
 _NOISE = "A second measurement of the same scene, of which the noise of TRANSPORT follows; else estimated."
@@ -102,13 +105,21 @@ _SHOW_DARK = "Picture, a PNG, of direct light; pixels without it are orange."
 _DARK = "Direct light below DARK times its median is dark, too; 0 leaves it lit."
 Matrix = Annotated[Path, argument("TRANSPORT", FORMATS)]
 Matrices = Annotated[list[Path], argument("FILE...", FORMATS)]
-Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")]
-Out = Annotated[Path, out("Folder for the results; filled only on success.", lambda p: writable(p, p), "DIR")]
-Acquisition = Annotated[Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")]
+Pictures = Annotated[
+    list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")
+]
+Out = Annotated[
+    Path, out("Folder for the results; filled only on success.", lambda p: writable(p, p), "DIR")
+]
+Acquisition = Annotated[
+    Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")
+]
 Device = Annotated[str | None, option(_DEVICE)]
 OnDark = Annotated[Literal["mask", "raise"], option(_ON_DARK)]
 ShowDark = Annotated[Path | None, file(_SHOW_DARK, callback=writable_file)]
-Variable = Annotated[str | None, option("Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME")]
+Variable = Annotated[
+    str | None, option("Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME")
+]
 
 
 def file_options(
@@ -130,9 +141,13 @@ def transport_options(
 
 
 def solve_options(
-    method: Annotated[str, option(f"One of {', '.join(METHODS)}.", callback=_known, metavar="NAME")] = "auto",
+    method: Annotated[
+        str, option(f"One of {', '.join(METHODS)}.", callback=_known, metavar="NAME")
+    ] = "auto",
     rtol: Annotated[float | None, option(_RTOL)] = None,
-    inverse: Annotated[Path | None, file("From 'ltcl invert': one product a picture and no solve.")] = None,
+    inverse: Annotated[
+        Path | None, file("From 'ltcl invert': one product a picture and no solve.")
+    ] = None,
     exact: Annotated[Path | None, file(_EXACT)] = None,
     samples: Annotated[int | None, option(_SAMPLES, min=1, max=2**32 - 1)] = None,
     seed: Annotated[int | None, option(_SEED, min=0, max=2**64 - 1)] = None,
@@ -141,7 +156,9 @@ def solve_options(
 
 
 def picture_options(
-    resize: Annotated[bool, option("Scale pictures of another size to the grid.", "--resize")] = False,
+    resize: Annotated[
+        bool, option("Scale pictures of another size to the grid.", "--resize")
+    ] = False,
     encoding: Annotated[Literal["auto", "srgb", "linear"], option(_ENCODING)] = "auto",
 ) -> None:
     """How pictures are read."""
@@ -154,8 +171,14 @@ TASK = (*TRANSPORT, solve_options, picture_options)
 def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     """Open the device, then load: a mistyped device does not wait for a large file."""
     device, out = context.options["device"], context.options.get("out")
-    if out is not None and path.exists() and path.resolve() in (out.resolve(), *out.resolve().parents):
-        raise InputError(f"--out is {out}, which is TRANSPORT itself or in it; it must be another place")
+    if (
+        out is not None
+        and path.exists()
+        and path.resolve() in (out.resolve(), *out.resolve().parents)
+    ):
+        raise InputError(
+            f"--out is {out}, which is TRANSPORT itself or in it; it must be another place"
+        )
     if context.options.get("mpi"):
         from mpi4py import MPI
 
@@ -163,14 +186,18 @@ def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     device = open_device(device)
     context.progress(f"reading {path}")
     names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark", "dark")
-    settings = {name: context.options[name] for name in names if context.options.get(name) is not None}
+    settings = {
+        name: context.options[name] for name in names if context.options.get(name) is not None
+    }
     if noise := context.options.get("noise"):
         context.progress(f"reading {noise}")
         second = {name: settings[name] for name in names[:3] if name in settings}
         settings["noise"] = store.load(noise, device=device, **second)
     T = store.load(path, device=device, **settings)
     if (dark := int(T.masked.sum())) and dark_note and not T.dark:  # which was logged
-        note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
+        note(
+            f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit"
+        )
     return T
 
 
@@ -193,7 +220,9 @@ def setup(transport: Path, calibration: Path | None = None) -> Any:
 def note_lost(source: Path, target: Path) -> None:
     """Say what a copy of a measured transport does not keep."""
     if is_measured(source):
-        note(f"{target}: does not keep how the projector was measured; use compensate --calibration {source}")
+        note(
+            f"{target}: does not keep how the projector was measured; use compensate --calibration {source}"
+        )
 
 
 def solving(context: Context, T: Transport, rtol: float, solves: int = 1) -> dict[str, Any]:
@@ -210,7 +239,9 @@ def solving(context: Context, T: Transport, rtol: float, solves: int = 1) -> dic
         picture = T @ pattern
         error = float(np.linalg.norm(picture - exact @ pattern) / np.linalg.norm(picture))
         if not error <= T.error + _ROUNDING:
-            text = f"pictures differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
+            text = (
+                f"pictures differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
+            )
             raise InputError(f"{path}: is not what TRANSPORT was compressed from: {text}")
     rtol = default_rtol(rtol, T, exact, inverse) if asked["rtol"] is None else asked["rtol"]
     settings = {"method": asked["method"], "rtol": rtol, "inverse": inverse, "exact": exact}
@@ -239,7 +270,9 @@ def caveat(what: str, T: Transport, exact: Path | None = None) -> str | None:
         return None
     if exact is not None:
         return f"{what} of {exact}, by which solutions were corrected"
-    bound = f"{100 * float(checks.upwards(T.error)):.2g} %" + " for pictures" * (T.error < T.error_bound)
+    bound = f"{100 * float(checks.upwards(T.error)):.2g} %" + " for pictures" * (
+        T.error < T.error_bound
+    )
     return f"{what} of the compressed transport, whose own relative error is at most {bound}"
 
 
@@ -252,7 +285,8 @@ def heading(context: Context, path: Path, T: Transport, **options: Any) -> dict[
         "versions": report.versions(),
         "device": report.device(T.device),
         "transport": {"file": path, **{name: getattr(T, name) for name in names}, **facts},
-        "options": {name: value for name, value in context.options.items() if name != "out"} | options,
+        "options": {name: value for name, value in context.options.items() if name != "out"}
+        | options,
     }
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures in and out: read on a grid; written as EXR, and for the eye as labelled PNG, with a report.
 
-What is written for the eye is enlarged to at least 512 pixels across, each pixel a square. All pictures of a
-run share one exposure, so that they can be compared: what they show is the linear picture times `exposure`.
+What is written for the eye is enlarged to at least 512 pixels across, each pixel a square. All
+pictures of a run share one exposure, so that they can be compared: what they show is the linear
+picture times `exposure`.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from ltcl import report
 from ltcl.cli.command import Context
 from ltcl.errors import InputError
 from ltcl.files import fill_folder, locked, replace_file
+from ltcl.tasks import report
 
 _WIDTH = 512  # pixels of a picture for the eye, at least
 _MARGIN, _TEXT = 8, 18  # of contact sheets and labels, in pixels
@@ -32,18 +33,27 @@ def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
     """`fill_folder`, with a report `text`, named after its command, of all files; one run at a time."""
     with locked(out, wait=False), fill_folder(out) as folder:
         yield folder
-        name, files = f"{text['command']}.json", [file for file in folder.rglob("*") if file.is_file()]
+        name, files = (
+            f"{text['command']}.json",
+            [file for file in folder.rglob("*") if file.is_file()],
+        )
         text["files"] = [*sorted(file.relative_to(folder).as_posix() for file in files), name]
         report.write(folder / name, text)
 
 
 def read(
-    context: Context, path: Path, grid: tuple[int, int], whose: str, setup: Any = None, upright: bool = True
+    context: Context,
+    path: Path,
+    grid: tuple[int, int],
+    whose: str,
+    setup: Any = None,
+    upright: bool = True,
 ) -> np.ndarray:
     """A linear picture on a `grid`, float32 (h, w[, 3]), by --encoding and --resize.
 
-    Integers are codes for the projector of a `setup`, where there is one and no other encoding is asked for.
-    Photographs, not `upright`, keep the camera's pixels. InputError where the size is another.
+    Integers are codes for the projector of a `setup`, where there is one and no other encoding is
+    asked for. Photographs, not `upright`, keep the camera's pixels. InputError where the size is
+    another.
     """
     from ltcl import images
 
@@ -59,7 +69,9 @@ def read(
     return setup.light(picture) if setup is not None and is_code else picture
 
 
-def read_all(context: Context, paths: Sequence[Path], *place: Any, **settings: Any) -> dict[str, np.ndarray]:
+def read_all(
+    context: Context, paths: Sequence[Path], *place: Any, **settings: Any
+) -> dict[str, np.ndarray]:
     """All pictures, as `read` does, by names for their results: stems, longer where an earlier one has it."""
     named: dict[str, np.ndarray] = {}
     for path in paths:
@@ -103,7 +115,9 @@ def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
     missing = missing.reshape(*codes.shape[:2], -1)
     largest = np.argmax(np.abs(missing), axis=-1)[..., None]  # the colour that deviates most
     missing = np.take_along_axis(missing, largest, axis=-1)
-    share = np.where(np.abs(missing) > _VISIBLE, np.clip(0.4 + 2.0 * np.abs(missing), 0.0, 1.0), 0.0)
+    share = np.where(
+        np.abs(missing) > _VISIBLE, np.clip(0.4 + 2.0 * np.abs(missing), 0.0, 1.0), 0.0
+    )
     return (1 - share) * grey + share * np.where(missing > 0, _ORANGE, _BLUE)
 
 
@@ -124,7 +138,9 @@ def amplified(picture: np.ndarray, name: str, factor: float) -> tuple[float, Any
     return times, panel(picture, f"{name}, {times} times as bright", factor * times)
 
 
-def deviation(folder: Path, name: str, std: np.ndarray, factor: float) -> tuple[dict[str, str], Any]:
+def deviation(
+    folder: Path, name: str, std: np.ndarray, factor: float
+) -> tuple[dict[str, str], Any]:
     """Files of standard deviations, and their panel, amplified."""
     _, shown = amplified(std, f"{name.split('/')[-1]}_std", factor)
     return write(folder, f"{name}_std", std, shown), shown
@@ -143,13 +159,17 @@ def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
     return sheet
 
 
-def write_first_bounces(place: Path | None, lights: Mapping[str, tuple[np.ndarray, tuple[int, int]]]) -> None:
+def write_first_bounces(
+    place: Path | None, lights: Mapping[str, tuple[np.ndarray, tuple[int, int]]]
+) -> None:
     """First bounces (N,) or (3, N) on their grids as one PNG; pixels where one is 0 are orange."""
     rows = []
     for name, (F, grid) in lights.items() if place is not None else ():
         dark = np.any(np.atleast_2d(F) <= 0.0, axis=0)
         codes = mark(shades(F.T.reshape(*grid, *F.shape[:-1]), exposure(F)), 1.0 * dark)
-        rows.append([panel(codes, f"{name}: {np.count_nonzero(dark)} of {dark.size} pixels are dark")])
+        rows.append(
+            [panel(codes, f"{name}: {np.count_nonzero(dark)} of {dark.size} pixels are dark")]
+        )
     if place is not None and rows:
         with replace_file(place) as temporary:
             contact_sheet(rows).save(temporary, "PNG")

@@ -9,13 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from ltcl import compensation
 from ltcl.cli import options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.compensate import GAIN, parse_gain
 from ltcl.cli.options import argument, option
 from ltcl.device import open_device
 from ltcl.errors import InputError
+from ltcl.tasks import compensation
 
 _SHOWN = f"{options.FORMATS} Or the folder of an acquisition."
 _HOST = "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute."
@@ -45,8 +45,8 @@ def view(
 ) -> Answer:
     """Look at TRANSPORT in the browser: probe, bounces, relight, compensate, projector. Ctrl-C ends it.
 
-    Of the folder of an acquisition, while it runs or afterwards: photographs as they come, their exposure,
-    coverage, time left and warnings; and its transport as soon as that is finished.
+    Of the folder of an acquisition, while it runs or afterwards: photographs as they come, their
+    exposure, coverage, time left and warnings; and its transport as soon as that is finished.
     """
     from ltcl import images
     from ltcl.viewer.answers import Scene
@@ -56,7 +56,9 @@ def view(
         from ltcl.viewer.scan import Scan
 
         if picture:
-            raise InputError(f"PICTURE is {picture[0]}, but {transport} is an acquisition; it takes none")
+            raise InputError(
+                f"PICTURE is {picture[0]}, but {transport} is an acquisition; it takes none"
+            )
         scene: Scene = Scan(transport, open_device(context.options["device"]))
     else:
         T = options.load(context, transport)
@@ -73,7 +75,9 @@ def view(
 @command(*options.TRANSPORT, options.solve_options, _address_options)
 def play(
     context: Context,
-    film: Annotated[Path, argument("FILM", "A video, whose sound is left out, or a folder of pictures.")],
+    film: Annotated[
+        Path, argument("FILM", "A video, whose sound is left out, or a folder of pictures.")
+    ],
     transport: options.Matrix,
     gain: Annotated[str | None, option(GAIN, parser=parse_gain, metavar="FACTOR")] = None,
 ) -> Answer:
@@ -82,8 +86,8 @@ def play(
     Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT, makes it fast.
     """
     from ltcl.images.frames import open_frames
+    from ltcl.show.window import Window, play
     from ltcl.viewer.answers import Scene
-    from ltcl.viewer.window import Window, play
 
     source, T, setup = open_frames(film), options.load(context, transport), options.setup(transport)
     settings = options.solving(context, T, compensation.RTOL)
@@ -103,7 +107,9 @@ def show(
     context: Context,
     folder: Annotated[Path, argument("FOLDER", "Pictures, one or a folder; or an acquisition.")],
     display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
-    every: Annotated[float | None, option("Next picture after so many seconds.", metavar="SECONDS")] = None,
+    every: Annotated[
+        float | None, option("Next picture after so many seconds.", metavar="SECONDS")
+    ] = None,
     arrival: Annotated[bool, option(_ARRIVAL, "--arrival")] = False,
     browser: Annotated[bool, option(_BROWSER, "--browser")] = False,
 ) -> Answer:
@@ -112,13 +118,17 @@ def show(
     With --browser Ctrl-C ends it, and it needs extra view.
     """
     if every is not None and arrival:
-        raise InputError(f"--every is {every:g}, but --arrival is given; one of them decides what comes next")
+        raise InputError(
+            f"--every is {every:g}, but --arrival is given; one of them decides what comes next"
+        )
     from ltcl.acquisition import rigs
-    from ltcl.viewer.window import Window
+    from ltcl.show.window import Window
 
     def progress(shot: Any, done: int, total: int) -> None:
         nonlocal count
-        context.progress(f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}", done, total)
+        context.progress(
+            f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}", done, total
+        )
         count = done + 1
 
     advance, count = "arrival" if arrival else "key" if every is None else every, 0

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ltcl import checks, errors, report
+from ltcl import checks, errors
 from ltcl.demo import experiment, output
 from ltcl.files import fill_folder
+from ltcl.tasks import report
 
 __all__ = ["STEPS", "Demo", "run"]
 
@@ -71,8 +72,12 @@ def run(
         begin("pictures")
         output.write_pictures(results, folder)
         ends = [*starts.values(), time.perf_counter()][1:]
-        seconds = {step: round(end - starts[step], 3) for step, end in zip(starts, ends, strict=True)}
+        seconds = {
+            step: round(end - starts[step], 3) for step, end in zip(starts, ends, strict=True)
+        }
         text = output.report_of(results, seconds)
         report.write(folder / "report.json", text)
-        files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
+        files = sorted(
+            file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()
+        )
     return Demo(Path(out), text, tuple(files))

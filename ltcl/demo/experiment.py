@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the demo computes: a corner of three bright, differently coloured walls, lit in three ways.
 
-In red all three walls are so bright that rho(R) > 1: there the paper's iteration diverges, and Chebyshev
-with the free bounds does not. The target is a sunset in just as much mist as the corner makes necessary: no
-projector can make a place darker than the light that bounces into it from the rest of the picture. With
-x = S^-1 picture and y = S^-1 mist, (N,) a channel, a target picture + b mist asks for the direct light
-x + b y; cutting off where that is negative changes what is seen by S min(x + b y, 0). The smallest b for
-which this stays below one percent is found by bisection, a product a step.
+In red all three walls are so bright that rho(R) > 1: there the paper's iteration diverges, and
+Chebyshev with the free bounds does not. The target is a sunset in just as much mist as the corner
+makes necessary: no projector can make a place darker than the light that bounces into it from the
+rest of the picture. With x = S^-1 picture and y = S^-1 mist, (N,) a channel, a target picture + b
+mist asks for the direct light x + b y; cutting off where that is negative changes what is seen by S
+min(x + b y, 0). The smallest b for which this stays below one percent is found by bisection, a
+product a step.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from ltcl import scenes
-from ltcl.analysis import Analysis, analyze
-from ltcl.compensation import Compensation, compensate
 from ltcl.scenes import Scene
 from ltcl.scenes.landscape import SUN
-from ltcl.separation import Separation, separate
 from ltcl.solvers import Solution, auto, solve
-from ltcl.transport import Transport
+from ltcl.tasks.analysis import Analysis, analyze
+from ltcl.tasks.compensation import Compensation, compensate
+from ltcl.tasks.separation import Separation, separate
+from ltcl.transport.transport import Transport
 
 ALBEDO = ((0.97, 0.25, 0.15), (0.96, 0.80, 0.30), (0.97, 0.45, 0.80))
 """Red, green, blue of the left wall, the right wall and the floor."""
@@ -36,7 +37,10 @@ _BOUNCES = 4
 _RACE_RTOL, _RACE_LENGTH = 1e-5, 60  # far enough to see where each method goes
 _LOST = 0.01  # of the target, what the projector's black may cost
 _MIST = (1.00, 0.80, 0.65)  # its colour, lit by the sun
-_OUTSIDE, _RADIUS = 0.3, 0.35  # share of the mist far from the corner; where it has thinned out, in heights
+_OUTSIDE, _RADIUS = (
+    0.3,
+    0.35,
+)  # share of the mist far from the corner; where it has thinned out, in heights
 
 
 @dataclass(frozen=True)
@@ -112,14 +116,18 @@ def compute(size: int, device: Any, begin: Callable[[str], object]) -> Experimen
 
 def _look(seen: np.ndarray, target: np.ndarray) -> Look:
     exposure = float(np.vdot(seen, target) / np.vdot(seen, seen))
-    return Look(seen, exposure, float(np.linalg.norm(exposure * seen - target) / np.linalg.norm(target)))
+    return Look(
+        seen, exposure, float(np.linalg.norm(exposure * seen - target) / np.linalg.norm(target))
+    )
 
 
 def _bounce_errors(scene: Scene, pattern: np.ndarray, separation: Separation) -> list[float]:
     """Relative error of each bounce against A^k F pattern, made of the scene's own form factors."""
     errors, truth = [], scene.albedo * pattern.reshape(-1, 3).T
     for bounce in (separation.direct, *separation.bounces):
-        errors.append(float(np.linalg.norm(bounce.reshape(-1, 3).T - truth) / np.linalg.norm(truth)))
+        errors.append(
+            float(np.linalg.norm(bounce.reshape(-1, 3).T - truth) / np.linalg.norm(truth))
+        )
         truth = scene.albedo * (truth @ scene.form_factors.T)
     return errors
 
@@ -133,13 +141,24 @@ def _reachable(scene: Scene, T: Transport) -> tuple[np.ndarray, float, float]:
     thickness = np.exp(-(place**2 + place[:, None] ** 2) / _RADIUS**2)[..., None]
     mist = (_OUTSIDE + (1 - _OUTSIDE) * thickness) * np.array(_MIST) * (1.0 - sunset)
     sides = [scene.sample(picture) for picture in (sunset, mist)]
-    columns = np.stack(sides, axis=-1).reshape(-1, 3, 2).transpose(1, 0, 2).astype(np.float64)  # (3, N, 2)
-    light = [solve(S, b, rtol=RTOL).x.astype(np.float64) for S, b in zip(T.systems, columns, strict=True)]
+    columns = (
+        np.stack(sides, axis=-1).reshape(-1, 3, 2).transpose(1, 0, 2).astype(np.float64)
+    )  # (3, N, 2)
+    light = [
+        solve(S, b, rtol=RTOL).x.astype(np.float64) for S, b in zip(T.systems, columns, strict=True)
+    ]
     low, high = 0.0, 1.0
     for _ in range(10):
         b = (low + high) / 2
-        lost = [np.asarray(S @ np.minimum(x @ (1.0, b), 0.0)) for S, x in zip(T.systems, light, strict=True)]
+        lost = [
+            np.asarray(S @ np.minimum(x @ (1.0, b), 0.0))
+            for S, x in zip(T.systems, light, strict=True)
+        ]
         enough = np.linalg.norm(np.stack(lost)) < _LOST * np.linalg.norm(columns @ (1.0, b))
         low, high = (low, b) if enough else (b, high)
     pattern = [x @ (1.0, high) / F for x, F in zip(light, T.first_bounce, strict=True)]
-    return sides[0] + np.float32(high) * sides[1], high, max(float(colour.max()) for colour in pattern)
+    return (
+        sides[0] + np.float32(high) * sides[1],
+        high,
+        max(float(colour.max()) for colour in pattern),
+    )

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The demo's folder: views of the corner, linear pictures on the walls' grid, plots, the report.
 
-Views are exposed to compare: each at the brightness at which it comes closest to the target, bounces at that
-of the uncompensated picture times the factor in their note; report.json has the factors. All are drawn at
-once, along the same rays. The files in ``linear/`` hold the values as they are.
+Views are exposed to compare: each at the brightness at which it comes closest to the target,
+bounces at that of the uncompensated picture times the factor in their note; report.json has the
+factors. All are drawn at once, along the same rays. The files in ``linear/`` hold the values as
+they are.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import images, plots, report
+from ltcl import images, plots
 from ltcl.demo.experiment import ALBEDO, COLOURS, RTOL, Experiment
 from ltcl.scenes import viewer
+from ltcl.tasks import report
 
 _VIEW = 800  # pixels along the longer side of a view
 _TITLE = "A picture projected into a coloured corner"
@@ -29,8 +31,12 @@ def write_pictures(results: Experiment, folder: Path) -> None:
     """Views and plots into `folder`, linear values into its subfolder ``linear``."""
     shown, scene = _pictures(results), results.scene
     exposed = [exposure * picture for _, exposure, picture in shown.values()]
-    stacked = viewer.draw(scene.viewer, scene.walls, np.concatenate(exposed, axis=2), _VIEW, supersample=2)
-    views = {label: stacked[..., 3 * k : 3 * k + 3] for k, (label, _, _) in enumerate(shown.values())}
+    stacked = viewer.draw(
+        scene.viewer, scene.walls, np.concatenate(exposed, axis=2), _VIEW, supersample=2
+    )
+    views = {
+        label: stacked[..., 3 * k : 3 * k + 3] for k, (label, _, _) in enumerate(shown.values())
+    }
     for name, (label, _, picture) in shown.items():
         images.write(folder / "linear" / f"{name}.exr", picture)
         images.write(folder / f"{name}.png", views[label])
@@ -55,13 +61,17 @@ def report_of(results: Experiment, seconds: dict[str, float]) -> dict[str, Any]:
             "scene": {
                 "grid": scene.grid,
                 "pixels": len(scene.area),
-                "albedo": {wall.name: albedo for wall, albedo in zip(scene.walls, ALBEDO, strict=True)},
+                "albedo": {
+                    wall.name: albedo for wall, albedo in zip(scene.walls, ALBEDO, strict=True)
+                },
             },
             "spectral_radius": dict(zip(COLOURS, radii, strict=True)),
             "analysis": results.analysis.to_dict(),
             "target": {"mist": results.mist},
             "errors": {name: look.error for name, look in results.looks.items()},
-            "exposure_of_views": {name: exposure for name, (_, exposure, _) in _pictures(results).items()},
+            "exposure_of_views": {
+                name: exposure for name, (_, exposure, _) in _pictures(results).items()
+            },
             "compensation": {
                 "gain": compensation.gain,
                 "clipped": compensation.clipped,
@@ -69,7 +79,9 @@ def report_of(results: Experiment, seconds: dict[str, float]) -> dict[str, Any]:
             },
             "bounces": [
                 {"bounce": k, "share": float(np.linalg.norm(bounce)) / total, "error": error}
-                for k, (bounce, error) in enumerate(zip(results.bounces, results.bounce_errors, strict=True))
+                for k, (bounce, error) in enumerate(
+                    zip(results.bounces, results.bounce_errors, strict=True)
+                )
             ],
             "convergence": {
                 "channel": COLOURS[results.worst],
@@ -94,6 +106,8 @@ def _pictures(results: Experiment) -> dict[str, tuple[str, float, np.ndarray]]:
     exposure, direct = results.looks["uncompensated"].exposure, np.linalg.norm(results.bounces[0])
     for k, bounce in enumerate(results.bounces):
         times = float(direct / np.linalg.norm(bounce))
-        label = f"Bounce {k}\n{times:.1f} times as bright" if k else "Direct light\nas bright as above"
+        label = (
+            f"Bounce {k}\n{times:.1f} times as bright" if k else "Direct light\nas bright as above"
+        )
         pictures[f"bounce_{k}"] = label, times * exposure, bounce
     return pictures

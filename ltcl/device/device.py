@@ -26,7 +26,8 @@ _POOLED = 256  # arrays up to this part of the memory are pooled: vectors, not m
 class Device:
     """One OpenCL device with a context and an in-order queue. Made by `ltcl.open_device`.
 
-    A block of the pool may be handed out again while a kernel that uses it is queued: there is one queue.
+    A block of the pool may be handed out again while a kernel that uses it is queued: there is one
+    queue.
 
     Attributes
     ----------
@@ -41,7 +42,8 @@ class Device:
     launches : Counter
         How often each kernel has been queued.
     others : tuple of Device
-        Of ``open_device("all")``, the other devices of its platform: rows of matrices are on all of them.
+        Of ``open_device("all")``, the other devices of its platform: rows of matrices are on all of
+        them.
     """
 
     def __init__(self, description: Description) -> None:
@@ -62,7 +64,9 @@ class Device:
         self.memory: int = checks.host_memory() if self.is_cpu else handle.global_mem_size
         self.others: tuple[Device, ...] = ()
         self.allocations, self.launches = 0, Counter[str]()
-        self._pool = MemoryPool(ImmediateAllocator(self.queue), leading_bits_in_bin_id=4)  # 1/16 too large
+        self._pool = MemoryPool(
+            ImmediateAllocator(self.queue), leading_bits_in_bin_id=4
+        )  # 1/16 too large
         self._largest_pooled = min(self.memory // _POOLED, self.max_allocation // 16)
         self._programs: dict[tuple, tuple[Any, dict[str, Kernel]]] = {}
         self.reductions: dict[tuple, Any] = {}  # of `vectors`
@@ -88,7 +92,9 @@ class Device:
                 named[name] = Kernel(self, built, name)
             return named[name]
 
-    def launch(self, name: str, handle: Any, items: tuple[int, ...], group: tuple[int, ...]) -> None:
+    def launch(
+        self, name: str, handle: Any, items: tuple[int, ...], group: tuple[int, ...]
+    ) -> None:
         """Queue a cl_kernel whose arguments are set."""
         kernels.refuse_forked()
         try:
@@ -107,7 +113,9 @@ class Device:
                 f"{self.name} allows, {checks.size(self.max_allocation)}"
             )
         with kernels.translated(f"allocating {checks.size(nbytes)} on {self.name}"), self._lock:
-            if size > self._largest_pooled:  # a new one, for which unused blocks of the pool make room
+            if (
+                size > self._largest_pooled
+            ):  # a new one, for which unused blocks of the pool make room
                 self.allocations += 1
                 self._pool.free_held()
                 buffer = self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which devices there are, which is best, and which one a user means.
 
-Rank: GPUs (most compute units first), accelerators, CPUs (newest driver first); a simulator only when it is
-named. A driver that crashes takes the process with it: `ltcl doctor` tries each in a child process.
+Rank: GPUs (most compute units first), accelerators, CPUs (newest driver first); a simulator only
+when it is named. A driver that crashes takes the process with it: `ltcl doctor` tries each in a
+child process.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import weakref
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ltcl import linker
 from ltcl.device import kernels
+from ltcl.device import pocl_linker as linker
 from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
 
@@ -69,11 +70,19 @@ def list_devices() -> list[Description]:
             brand = platform.name.strip()
             with contextlib.suppress(cl.Error):  # DEVICE_NOT_FOUND
                 for d, handle in enumerate(platform.get_devices()):
-                    kind = next((name for flag, name in kinds.items() if handle.type & flag), "accelerator")
+                    kind = next(
+                        (name for flag, name in kinds.items() if handle.type & flag), "accelerator"
+                    )
                     kind = "simulator" if "oclgrind" in brand.lower() else kind
                     driver = f"{brand} {handle.driver_version.strip()}"
-                    sizes = handle.max_compute_units, handle.global_mem_size, handle.max_mem_alloc_size
-                    devices.append(Description(f"{p}:{d}", handle.name.strip(), kind, driver, *sizes, handle))
+                    sizes = (
+                        handle.max_compute_units,
+                        handle.global_mem_size,
+                        handle.max_mem_alloc_size,
+                    )
+                    devices.append(
+                        Description(f"{p}:{d}", handle.name.strip(), kind, driver, *sizes, handle)
+                    )
     linker.provide(device.driver for device in devices)
     return sorted(devices, key=lambda device: device.rank)
 
@@ -84,15 +93,16 @@ def open_device(select: str | Device | None = None) -> Device:
     Parameters
     ----------
     select : str or Device, optional
-        "gpu", "cpu" or "accelerator"; an index "platform:device" as `ltcl devices` prints it; a part of the
-        name of device or driver; or "all": the best, with the others of its platform, over which the rows of
-        matrices that are not compressed are spread by measured speed. Without it, ``LTCL_DEVICE`` says so,
-        else the best is taken.
+        "gpu", "cpu" or "accelerator"; an index "platform:device" as `ltcl devices` prints it; a
+        part of the name of device or driver; or "all": the best, with the others of its platform,
+        over which the rows of matrices that are not compressed are spread by measured speed.
+        Without it, ``LTCL_DEVICE`` says so, else the best is taken.
 
     Raises
     ------
     DeviceError
-        No device at all (with the fix for this system), or none that `select` means (with those there are).
+        No device at all (with the fix for this system), or none that `select` means (with those
+        there are).
 
     Examples
     --------
@@ -103,13 +113,19 @@ def open_device(select: str | Device | None = None) -> Device:
     if isinstance(select, Device):
         return select
     if not isinstance(select, str | None):
-        raise InputTypeError(f"device is {select!r}; it must be a Device, a name or an index like '0:1'")
+        raise InputTypeError(
+            f"device is {select!r}; it must be a Device, a name or an index like '0:1'"
+        )
     devices, select = list_devices(), select or os.environ.get("LTCL_DEVICE") or ""
     every = select.strip().lower() == "all"
     description, others = choose(devices, "" if every else select), []
     if every:
         platform = description.index.partition(":")[0] + ":"
-        others = [open_device(d.index) for d in devices if d.index.startswith(platform) and d != description]
+        others = [
+            open_device(d.index)
+            for d in devices
+            if d.index.startswith(platform) and d != description
+        ]
         description = replace(description, index="all") if others else description
     linker.require(description.driver)
     with _opening:
@@ -120,7 +136,9 @@ def open_device(select: str | Device | None = None) -> Device:
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
-    command = _FIXES.get(sys.platform) or _FIXES.get(os.uname().machine, "sudo apt install pocl-opencl-icd")
+    command = _FIXES.get(sys.platform) or _FIXES.get(
+        os.uname().machine, "sudo apt install pocl-opencl-icd"
+    )
     folder = "PoCL needs a folder that it can write, which POCL_CACHE_DIR names"
     fix = f"install a driver: {command}, or that of your GPU's vendor; {folder}"
     if not devices:
@@ -137,5 +155,11 @@ def choose(devices: list[Description], select: str | None) -> Description:
         names = f"{device.name}\n{device.driver}".lower()
         if name in (device.kind, device.index) or (name not in KINDS and name in names):
             return device
-    kind = {"gpu": "GPU", "cpu": "CPU"}.get(name, name) if name in KINDS else "device of this index or name"
-    raise DeviceError(f"device is {select!r}, but there is no {kind} here; the devices are: {known}")
+    kind = (
+        {"gpu": "GPU", "cpu": "CPU"}.get(name, name)
+        if name in KINDS
+        else "device of this index or name"
+    )
+    raise DeviceError(
+        f"device is {select!r}, but there is no {kind} here; the devices are: {known}"
+    )

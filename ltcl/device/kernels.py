@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One way to run a kernel: find the source, build it once per device and defines, launch it.
 
-Includes are expanded here, with `#line` marks: messages of every driver point at the file a person edits.
+Includes are expanded here, with `#line` marks: messages of every driver point at the file a person
+edits.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from ltcl.errors import DeviceError, LtclError, MemoryLimitError
 if TYPE_CHECKING:
     from ltcl.device.device import Device
 
-# Exact float32: no fast-math (it deletes NaN tests), contraction of a * b + c is left to the driver.
+# Exact float32: no fast-math (it deletes NaN tests), contraction of a * b + c is left to the
+# driver.
 _OPTIONS = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-w"]
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _PRIVATE = 0x119E  # CL_KERNEL_ARG_ADDRESS_PRIVATE: numbers
-_PACKERS: dict[str, Any] = {  # a Python number as bytes; reals beyond float32 are infinite, as in a kernel
+_PACKERS: dict[
+    str, Any
+] = {  # a Python number as bytes; reals beyond float32 are infinite, as in a kernel
     "real": ctypes.c_float,
     "float": ctypes.c_float,
     "int": struct.Struct("i").pack,
@@ -35,7 +39,12 @@ _PACKERS: dict[str, Any] = {  # a Python number as bytes; reals beyond float32 a
     "ulong": struct.Struct("Q").pack,
 }
 _Size = int | tuple[int, ...]
-_MEMORY = {"MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE"}
+_MEMORY = {
+    "MEM_OBJECT_ALLOCATION_FAILURE",
+    "OUT_OF_RESOURCES",
+    "OUT_OF_HOST_MEMORY",
+    "INVALID_BUFFER_SIZE",
+}
 _ADVICE = {
     "DEVICE_NOT_AVAILABLE": "the device is in use by another process or was unplugged; try LTCL_DEVICE=cpu",
     "COMPILER_NOT_AVAILABLE": "this driver cannot compile kernels; choose another device (ltcl devices)",
@@ -79,14 +88,17 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
         except device.cl.Error as error:
             log_text = str(error).split("(options:")[0].strip()  # pyopencl adds options and source
             where = f"{device.name} ({device.driver}) with {' '.join(options)}"
-            raise DeviceError(f"kernels/{file}.cl does not compile on {where}:\n{log_text}") from error
+            raise DeviceError(
+                f"kernels/{file}.cl does not compile on {where}:\n{log_text}"
+            ) from error
 
 
 class Kernel:
     """A compiled kernel of one device.
 
-    Call it with the number of work-items, the work-group size and the arguments: Python numbers, `Array`, or
-    local memory. Items are rounded up to whole groups, which are clamped to what is allowed (`group`).
+    Call it with the number of work-items, the work-group size and the arguments: Python numbers,
+    `Array`, or local memory. Items are rounded up to whole groups, which are clamped to what is
+    allowed (`group`).
     """
 
     def __init__(self, device: Device, program: Any, name: str) -> None:
@@ -156,7 +168,8 @@ class Launch:
         try:
             if packer is None:
                 self._handle.set_arg(index, getattr(value, "buffer", value))
-            else:  # `set_arg` would do as well, but tries all else before bytes: 6 us instead of 0.1
+            else:
+                # `set_arg` would do as well, but tries all else before bytes: 6 us instead of 0.1
                 self._handle._set_arg_buf(index, packer(value))
         except self._kernel.device.cl.Error as error:
             raise explain(f"argument {index} of {self._kernel.name}", error) from error
@@ -198,10 +211,14 @@ def explain(doing: str, error: Exception) -> LtclError:
     import pyopencl as cl
 
     code = getattr(error, "code", None)
-    status = str(error).partition("\n")[0] if code is None else cl.status_code.to_string(code, f"{code}")
+    status = (
+        str(error).partition("\n")[0] if code is None else cl.status_code.to_string(code, f"{code}")
+    )
     if status in _MEMORY:
         return MemoryLimitError(
             f"{doing}: the device ran out of memory ({status}); compress the matrix, free other buffers, "
             "or choose a device with more memory (ltcl devices)"
         )
-    return DeviceError(f"{doing}: OpenCL answered {status}; {_ADVICE.get(status, 'see ltcl doctor')}")
+    return DeviceError(
+        f"{doing}: OpenCL answered {status}; {_ADVICE.get(status, 'see ltcl doctor')}"
+    )

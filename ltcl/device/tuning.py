@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What is timed once per device and then remembered: the fastest of several kernel variants, machine speeds.
 
-`LTCL_TUNE=0` turns timing off: the first variant is taken, speeds are constants. Variants agree to rounding.
-The memory is a JSON file in the user's cache, or where `LTCL_CACHE` says; it may be deleted.
+`LTCL_TUNE=0` turns timing off: the first variant is taken, speeds are constants. Variants agree to
+rounding. The memory is a JSON file in the user's cache, or where `LTCL_CACHE` says; it may be
+deleted.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ _TRIAD_BYTES = 1 << 26  # of one of its three arrays: beyond the caches
 _FACTORIZED = 768  # rows
 
 
-def choose(device: Device, file: str, problem: str, variants: Mapping[str, Callable[[], None]]) -> str:
+def choose(
+    device: Device, file: str, problem: str, variants: Mapping[str, Callable[[], None]]
+) -> str:
     """The fastest of `variants`, each of which queues a launch; remembered for all of this `problem`."""
     names = list(variants)
     if len(names) == 1 or os.environ.get("LTCL_TUNE") == "0":
@@ -53,10 +56,15 @@ def choose(device: Device, file: str, problem: str, variants: Mapping[str, Calla
     for name, launch in variants.items():
         try:
             times[name] = _time(launch, device.finish)
-        except (DeviceError, MemoryLimitError) as error:  # the latter where a group needs too many registers
+        except (
+            DeviceError,
+            MemoryLimitError,
+        ) as error:  # the latter where a group needs too many registers
             log.info("%s of %s fails and is left out: %s", name, file, error)
     if not times:
-        raise DeviceError(f"no variant of kernels/{file}.cl runs on {device.name} ({device.driver})")
+        raise DeviceError(
+            f"no variant of kernels/{file}.cl runs on {device.name} ({device.driver})"
+        )
     best = min(times, key=times.__getitem__)
     log.info("%s on %s, %s: %s of %s", file, device.name, problem, best, times)
     remember(key, best)
@@ -65,7 +73,9 @@ def choose(device: Device, file: str, problem: str, variants: Mapping[str, Calla
 
 def seconds(device: Device, key: str, launch: Callable[[], object]) -> float:
     """Seconds that `launch` takes on `device`, waiting included."""
-    return _measured((device.name, device.driver, key), SECONDS, lambda: _time(launch, device.finish))
+    return _measured(
+        (device.name, device.driver, key), SECONDS, lambda: _time(launch, device.finish)
+    )
 
 
 def bandwidth(device: Device) -> float:
@@ -115,13 +125,17 @@ def _time(run: Callable[[], object], wait: Callable[[], object]) -> float:
 
 def folder() -> Path:
     """The cache folder; it may not exist yet."""
-    return Path(os.environ.get("LTCL_CACHE") or platformdirs.user_cache_dir("ltcl", appauthor=False))
+    return Path(
+        os.environ.get("LTCL_CACHE") or platformdirs.user_cache_dir("ltcl", appauthor=False)
+    )
 
 
 def make_folder() -> Path:
     """The cache folder, created for its owner only where it is missing."""
     path = folder()
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)  # an existing folder keeps its mode: it is the user's
+    path.mkdir(
+        mode=0o700, parents=True, exist_ok=True
+    )  # an existing folder keeps its mode: it is the user's
     return path
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Arrays on a device, and what a solver does between two products: fill, axpby, scaling, dot, norm.
 
-An array is (N,) for one right-hand side or (N, k) for several, row-major. Only what gives numbers to the host
-waits: `get`, `dot`, `norm`, `norms`. Sums are trees over fixed slices: the same bits at every call.
+An array is (N,) for one right-hand side or (N, k) for several, row-major. Only what gives numbers
+to the host waits: `get`, `dot`, `norm`, `norms`. Sums are trees over fixed slices: the same bits at
+every call.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ if TYPE_CHECKING:
     from ltcl.device.device import Device
     from ltcl.device.kernels import Kernel
 
-_VALUES = {True: 128, False: 8}  # of an item of a CPU or not, before a reduction takes another group
+_VALUES = {
+    True: 128,
+    False: 8,
+}  # of an item of a CPU or not, before a reduction takes another group
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +56,9 @@ class Array:
         try:
             host = np.empty(self.shape, self.dtype)
         except MemoryError as error:
-            raise MemoryLimitError(f"the host has no room to copy {checks.size(self.nbytes)}") from error
+            raise MemoryLimitError(
+                f"the host has no room to copy {checks.size(self.nbytes)}"
+            ) from error
         if host.size:
             self.device.copy(host, self.buffer)
         return host
@@ -60,7 +66,9 @@ class Array:
     def set(self, values: np.ndarray) -> Array:
         """Overwrite with host values of the same shape; returns the array."""
         if values.shape != self.shape:
-            raise InputError(f"values have shape {values.shape}; the array on the device has {self.shape}")
+            raise InputError(
+                f"values have shape {values.shape}; the array on the device has {self.shape}"
+            )
         host = rounded(values, self.dtype)
         if host.size:
             self.device.copy(self.buffer, host)
@@ -79,7 +87,9 @@ class Array:
     def set_rows(self, first: int, block: Array) -> Array:
         """Overwrite the rows from `first` on with another array of the device; returns this one."""
         if block.shape[1:] != self.shape[1:] or not 0 <= first <= self.shape[0] - block.shape[0]:
-            raise InputError(f"rows {first} on of an array of shape {self.shape} cannot hold {block.shape}")
+            raise InputError(
+                f"rows {first} on of an array of shape {self.shape} cannot hold {block.shape}"
+            )
         if block.size:
             offset = first * self.columns * self.dtype.itemsize
             self.device.copy(self.buffer, block.buffer, byte_count=block.nbytes, dst_offset=offset)
@@ -109,7 +119,9 @@ def rounded(values: Any, dtype: Any) -> np.ndarray:
         raise InputError(f"a value is beyond {dtype.name}, {most}") from error
     except MemoryError as error:
         nbytes = checks.size(array.size * dtype.itemsize)
-        raise MemoryLimitError(f"the host has no room for {nbytes} to copy from as {dtype.name}") from error
+        raise MemoryLimitError(
+            f"the host has no room for {nbytes} to copy from as {dtype.name}"
+        ) from error
 
 
 def fill(x: Array, value: float) -> Array:
@@ -205,7 +217,9 @@ def _plan(name: str, x: Array) -> _Plan:
     if (name, rows, k) not in device.reductions:
         kernel = kernel_of(device, name)
         group = kernel.group((16 if k <= 16 else 64) if device.is_cpu else 256)
-        most = max(64, 4 * device.compute_units)  # enough for a large GPU, few enough for one last group
+        most = max(
+            64, 4 * device.compute_units
+        )  # enough for a large GPU, few enough for one last group
         groups = 1 if name == "vector_sums" else -(-rows * k // (group * _VALUES[device.is_cpu]))
         device.reductions[name, rows, k] = _Plan(kernel, rows, k, max(1, min(groups, most)), group)
     return device.reductions[name, rows, k]

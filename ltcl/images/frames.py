@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Many pictures in a row, a folder of them or a video, read as linear light; videos written.
 
-OpenCV's FFmpeg decodes videos to 8 bits a channel and leaves damaged frames out: they are counted. `_COUNTED`
-formats keep their number; others, as Matroska, a duration, which sound may stretch: a warning. Known limits:
-a decoder may replace damaged pixels by others, and FFmpeg itself also writes to stderr about damage.
+OpenCV's FFmpeg decodes videos to 8 bits a channel and leaves damaged frames out: they are counted.
+`_COUNTED` formats keep their number; others, as Matroska, a duration, which sound may stretch: a
+warning. Known limits: a decoder may replace damaged pixels by others, and FFmpeg itself also writes
+to stderr about damage.
 """
 
 from __future__ import annotations
@@ -23,10 +24,29 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.images.pictures import BITS, ENCODINGS, Encoding, as_picture, decoding, from_linear, read, to_linear
+from ltcl.images.pictures import (
+    BITS,
+    ENCODINGS,
+    Encoding,
+    as_picture,
+    decoding,
+    from_linear,
+    read,
+    to_linear,
+)
 
 _COUNTED = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
-EXTENSIONS = (*_COUNTED, ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv", ".flv", ".ogv")  # of videos
+EXTENSIONS = (
+    *_COUNTED,
+    ".mkv",
+    ".webm",
+    ".mpg",
+    ".mpeg",
+    ".ts",
+    ".wmv",
+    ".flv",
+    ".ogv",
+)  # of videos
 CODECS = {".mkv": "FFV1", ".avi": "FFV1", ".mp4": "mp4v"}  # of videos that can be written
 _logger = logging.getLogger(__name__)
 
@@ -52,7 +72,9 @@ class Frame:
             return read(self.stored, encoding=self.encoding)
         b, g, r = cv2.split(self.stored)
         is_grey = np.array_equal(b, g) and np.array_equal(g, r)  # which costs a third
-        return to_linear(b if is_grey else cv2.cvtColor(self.stored, cv2.COLOR_BGR2RGB), self.encoding)
+        return to_linear(
+            b if is_grey else cv2.cvtColor(self.stored, cv2.COLOR_BGR2RGB), self.encoding
+        )
 
 
 class Source:
@@ -96,12 +118,16 @@ def _pictures(folder: Path) -> list[Path]:
         visible = [file for file in folder.iterdir() if not file.name.startswith(".")]
     except OSError as error:
         raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
-    files = sorted((file for file in visible if file.suffix.lower() in BITS and file.is_file()), key=order)
+    files = sorted(
+        (file for file in visible if file.suffix.lower() in BITS and file.is_file()), key=order
+    )
     if not files:
         raise FileError(f"{folder}: holds no pictures; frames are {', '.join(BITS)}")
     for file, other in itertools.pairwise(files):
         if file.stem == other.stem:
-            raise FileError(f"{folder}: holds {file.name} and {other.name}; each frame must be one file")
+            raise FileError(
+                f"{folder}: holds {file.name} and {other.name}; each frame must be one file"
+            )
     return files
 
 
@@ -121,8 +147,8 @@ def is_frames(path: str | os.PathLike[str]) -> bool:
 def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> Source:
     """Open a folder of pictures, in natural order, or a video, upright as a player shows it.
 
-    Hidden and other files are left out; `encoding` is that of `ltcl.images.read`. FileError for no picture in
-    the folder, two files of one name in it, an unknown extension, no readable video.
+    Hidden and other files are left out; `encoding` is that of `ltcl.images.read`. FileError for no
+    picture in the folder, two files of one name in it, an unknown extension, no readable video.
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     path = as_path(path)
@@ -137,15 +163,19 @@ def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
     if path.suffix.lower() not in CODECS:
         raise FileError(f"{path}: {unknown_extension(path)}; a video must be {', '.join(CODECS)}")
     if grid[0] % 2 or grid[1] % 2:
-        raise InputError(f"{path}: frames are {grid[0]} x {grid[1]} pixels; those of a video must be even")
+        raise InputError(
+            f"{path}: frames are {grid[0]} x {grid[1]} pixels; those of a video must be even"
+        )
 
 
-def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], fps: float = 25.0) -> int:
+def write_video(
+    path: str | os.PathLike[str], pictures: Iterable[np.ndarray], fps: float = 25.0
+) -> int:
     """Write linear pictures as a video, which replaces another whole or not at all; their number.
 
-    `path` ends in .mkv or .avi (lossless) or .mp4; 8 bits in sRGB. `pictures`, (h, w) or (h, w, 3), are cut
-    to [0, 1]; h and w are even and the same for all. InputError for other sizes, no frames or NaN; FileError
-    for another extension or a file that cannot be written.
+    `path` ends in .mkv or .avi (lossless) or .mp4; 8 bits in sRGB. `pictures`, (h, w) or (h, w, 3),
+    are cut to [0, 1]; h and w are even and the same for all. InputError for other sizes, no frames
+    or NaN; FileError for another extension or a file that cannot be written.
     """
     path, fps = as_path(path), checks.number("fps", fps, above=0.0)
     check_video(path, (0, 0))
@@ -154,19 +184,27 @@ def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], fp
         try:
             for count, picture in enumerate(pictures, start=1):
                 codes = from_linear(as_picture("a frame", picture), "srgb", 8, is_float=False)
-                codes = cv2.cvtColor(codes, cv2.COLOR_GRAY2BGR if codes.ndim == 2 else cv2.COLOR_RGB2BGR)
+                codes = cv2.cvtColor(
+                    codes, cv2.COLOR_GRAY2BGR if codes.ndim == 2 else cv2.COLOR_RGB2BGR
+                )
                 if count == 1:
                     shape = h, w, _ = codes.shape
                     check_video(path, (h, w))
                     writer.open(str(temporary), cv2.CAP_FFMPEG, writer.fourcc(*codec), fps, (w, h))
                 if codes.shape != shape:
-                    raise InputError(f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}")
+                    raise InputError(
+                        f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}"
+                    )
                 writer.write(codes)
         finally:
             writer.release()
         if not count:
             raise InputError(f"{path}: there are no frames to write")
-        written = int(cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT))
+        written = int(
+            cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT)
+        )
         if written != count:  # of which OpenCV says nothing
-            raise FileError(f"{path}: holds {written} of {count} frames in {codec}; is the disk full?")
+            raise FileError(
+                f"{path}: holds {written} of {count} frames in {codec}; is the disk full?"
+            )
     return count

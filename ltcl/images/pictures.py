@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures in linear light: PNG, JPEG, TIFF, BMP and EXR files in and out, the sRGB curve, other grids.
 
-Pillow decodes 8 bits, up to 179 million pixels, OpenCV 16-bit PNG and TIFF, OpenEXR its own. Known limits:
-some damage is a wrong picture where a format has no checksum (JPEG, BMP, TIFF); OpenEXR also writes
-to stderr about some. The curve is that of IEC 61966-2-1, outside [0, 1] odd and continued as of scRGB.
+Pillow decodes 8 bits, up to 179 million pixels, OpenCV 16-bit PNG and TIFF, OpenEXR its own. Known
+limits: some damage is a wrong picture where a format has no checksum (JPEG, BMP, TIFF); OpenEXR
+also writes to stderr about some. The curve is that of IEC 61966-2-1, outside [0, 1] odd and
+continued as of scRGB.
 """
 
 from __future__ import annotations
@@ -33,25 +34,39 @@ from ltcl.files import as_path, input_file, replace_file, unknown_extension
 Encoding = Literal["auto", "srgb", "linear"]
 ENCODINGS = get_args(Encoding)
 BITS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".jpg": (8,), ".jpeg": (8,), ".bmp": (8,)}
-BITS |= {".tif": (32, 8, 16), ".tiff": (32, 8, 16), ".exr": (32, 16)}  # that can be written, default first
+BITS |= {
+    ".tif": (32, 8, 16),
+    ".tiff": (32, 8, 16),
+    ".exr": (32, 16),
+}  # that can be written, default first
 _ORIENTATION = 274  # the tag of EXIF and TIFF
 _BYTES = 24  # of a pixel in memory: three codes and three floats of 4 bytes each
 # 4:4:4 at 95: colour must not bleed between neighbouring projector pixels more than JPEG has to.
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+_JPEG = [
+    cv2.IMWRITE_JPEG_QUALITY,
+    95,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+]
 _log_lock = threading.Lock()
 _FIGURE = """<figure style="display:inline-block;margin:4px"><img src="data:image/png;base64,{}"
 style="width:128px;image-rendering:pixelated"><figcaption>{}: white is {:.2g}</figcaption></figure>"""
 
 
 def read(
-    path: str | os.PathLike[str], *, encoding: Encoding = "auto", upright: bool = True, memory: int = 1 << 62
+    path: str | os.PathLike[str],
+    *,
+    encoding: Encoding = "auto",
+    upright: bool = True,
+    memory: int = 1 << 62,
 ) -> np.ndarray:
     """Read a picture as linear light: float32, (h, w) or (h, w, 3) RGB, white of an integer format is 1.
 
-    `path` is a .png, .jpg, .jpeg, .bmp, .tif, .tiff (8, 16 or 32 bits) or .exr file, opaque everywhere.
-    `encoding` is what it holds, "srgb" or "linear"; "auto" takes integers as sRGB and floats as linear. The
-    orientation in the header (EXIF, TIFF) is applied, unless `upright` is False, as for a photograph.
-    FileError for a damaged or transparent one, NaN; MemoryLimitError for 24 bytes a pixel beyond `memory`.
+    `path` is a .png, .jpg, .jpeg, .bmp, .tif, .tiff (8, 16 or 32 bits) or .exr file, opaque
+    everywhere. `encoding` is what it holds, "srgb" or "linear"; "auto" takes integers as sRGB and
+    floats as linear. The orientation in the header (EXIF, TIFF) is applied, unless `upright` is
+    False, as for a photograph. FileError for a damaged or transparent one, NaN; MemoryLimitError
+    for 24 bytes a pixel beyond `memory`.
 
     Examples
     --------
@@ -63,7 +78,9 @@ def read(
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     codes, orientation = _stored(as_path(path), memory)
-    return to_linear(np.ascontiguousarray(_turned(codes, orientation) if upright else codes), encoding)
+    return to_linear(
+        np.ascontiguousarray(_turned(codes, orientation) if upright else codes), encoding
+    )
 
 
 def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
@@ -72,21 +89,30 @@ def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def write(
-    path: str | os.PathLike[str], image: ArrayLike, *, encoding: Encoding = "auto", bits: int | None = None
+    path: str | os.PathLike[str],
+    image: ArrayLike,
+    *,
+    encoding: Encoding = "auto",
+    bits: int | None = None,
 ) -> None:
     """Write linear light (h, w) or (h, w, 3) as a picture, which replaces another whole or not at all.
 
-    The extension of `path` names the format, as in `read`. `encoding` "auto" is sRGB in integers, which are
-    clipped to [0, 1], and linear in floats, which never are. `bits` are 8 (default) or 16 for .png, 8, 16 or
-    32 (float, default) for .tif, 16 (half) or 32 (default) for .exr, 8 for others. InputError for NaN, too.
+    The extension of `path` names the format, as in `read`. `encoding` "auto" is sRGB in integers,
+    which are clipped to [0, 1], and linear in floats, which never are. `bits` are 8 (default) or 16
+    for .png, 8, 16 or 32 (float, default) for .tif, 16 (half) or 32 (default) for .exr, 8 for
+    others. InputError for NaN, too.
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     path = as_path(path)
     suffix, possible = path.suffix.lower(), _bits(path)
     bits = possible[0] if bits is None else bits
     if bits not in possible:
-        raise InputError(f"bits is {bits!r}; for {path.suffix} it must be {' or '.join(map(str, possible))}")
-    codes = from_linear(as_picture("image", image), encoding, bits, is_float=suffix == ".exr" or bits == 32)
+        raise InputError(
+            f"bits is {bits!r}; for {path.suffix} it must be {' or '.join(map(str, possible))}"
+        )
+    codes = from_linear(
+        as_picture("image", image), encoding, bits, is_float=suffix == ".exr" or bits == 32
+    )
     with replace_file(path) as temporary:
         try:
             if suffix == ".exr":
@@ -97,21 +123,25 @@ def write(
         except (cv2.error, RuntimeError) as error:  # a full disk
             raise FileError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
         if not success:
-            raise FileError(f"{path}: {codes.shape[0]} x {codes.shape[1]} pixels do not fit this format")
+            raise FileError(
+                f"{path}: {codes.shape[0]} x {codes.shape[1]} pixels do not fit this format"
+            )
         temporary.write_bytes(data.tobytes())
 
 
 def resize(image: ArrayLike, grid: tuple[int, int]) -> np.ndarray:
     """Resample a linear picture, (h, w) or (h, w, 3), to `grid` pixels, float32.
 
-    Area average where it shrinks, linear interpolation where it grows. InputError for another shape or NaN.
+    Area average where it shrinks, linear interpolation where it grows. InputError for another shape
+    or NaN.
 
     >>> resize(np.array([[0.0, 1.0], [2.0, 3.0]]), (1, 1))
     array([[1.5]], dtype=float32)
     """
     picture = as_picture("image", image)
     h, w = checks.grid("grid", grid)
-    # One axis at a time: OpenCV averages areas only where no axis grows; one may grow as the other shrinks.
+    # One axis at a time: OpenCV averages areas only where no axis grows; one may grow as the other
+    # shrinks.
     for rows, columns in ((h, picture.shape[1]), (h, w)):
         shrinks = rows < picture.shape[0] or columns < picture.shape[1]
         filter = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -131,7 +161,9 @@ def thumbnails(title: object, pictures: dict[str, np.ndarray]) -> str:
         white = float(np.quantile(light, 0.99)) or float(light.max()) or 1.0
         codes = from_linear(light / white, "srgb", 8, is_float=False)
         png = cv2.imencode(".png", codes if codes.ndim == 2 else codes[..., ::-1])[1]
-        figures.append(_FIGURE.format(base64.b64encode(png.tobytes()).decode(), html.escape(label), white))
+        figures.append(
+            _FIGURE.format(base64.b64encode(png.tobytes()).decode(), html.escape(label), white)
+        )
     return "".join(figures)
 
 
@@ -168,7 +200,9 @@ def as_picture(name: str, image: ArrayLike) -> np.ndarray:
     """Return `image` as contiguous float32 (h, w) or (h, w, 3); refuse other shapes, NaN and Inf."""
     array = checks.real(name, image)
     if array.ndim < 2 or array.shape[2:] not in ((), (3,)) or array.size == 0:
-        raise InputError(f"{name} has shape {array.shape}; it must be (h, w) or (h, w, 3), not empty")
+        raise InputError(
+            f"{name} has shape {array.shape}; it must be (h, w) or (h, w, 3), not empty"
+        )
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=np.float32)
     return checks.finite(name, array)
@@ -178,13 +212,16 @@ def to_linear(codes: np.ndarray, encoding: Encoding) -> np.ndarray:
     """Float32 of `codes`, uint8, uint16 or float; "auto" takes integers as sRGB, floats as linear."""
     is_srgb = encoding == "srgb" or (encoding == "auto" and codes.dtype.kind == "u")
     if codes.dtype.kind == "u":
-        # A table in float64: exact, and the power is taken 256 or 65536 times instead of once per pixel.
+        # A table in float64: exact, and the power is taken 256 or 65536 times instead of once per
+        # pixel.
         table = np.linspace(0, 1, np.iinfo(codes.dtype).max + 1)
         return (from_srgb(table) if is_srgb else table).astype(np.float32)[codes]
     return from_srgb(codes) if is_srgb else codes.astype(np.float32, copy=False)
 
 
-def from_linear(picture: np.ndarray, encoding: Encoding, bits: int, *, is_float: bool) -> np.ndarray:
+def from_linear(
+    picture: np.ndarray, encoding: Encoding, bits: int, *, is_float: bool
+) -> np.ndarray:
     """The codes of `picture` in a file of `bits` per channel; the inverse of `to_linear`."""
     if encoding == "srgb" or (encoding == "auto" and not is_float):
         picture = to_srgb(picture)
@@ -194,7 +231,9 @@ def from_linear(picture: np.ndarray, encoding: Encoding, bits: int, *, is_float:
     with np.errstate(over="ignore"):
         codes = picture.astype(np.float16 if bits == 16 else np.float32, copy=False)
     if not np.isfinite(codes).all():
-        raise InputError(f"image reaches {np.abs(picture).max():g}; half floats end at 65504, use bits=32")
+        raise InputError(
+            f"image reaches {np.abs(picture).max():g}; half floats end at 65504, use bits=32"
+        )
     return codes
 
 
@@ -211,8 +250,13 @@ def decoding(path: Path) -> Iterator[None]:
             kind = MemoryLimitError if isinstance(error, MemoryLimitError) else FileError
             raise kind(f"{path}: {error}") from None
         except Exception as error:
-            reason = re.sub(r" <\S+ object at \w+>", "", " ".join(f"{error}".split())) or type(error).__name__
-            raise FileError(f"{path}: is truncated, damaged or no picture: {reason:.200}") from error
+            reason = (
+                re.sub(r" <\S+ object at \w+>", "", " ".join(f"{error}".split()))
+                or type(error).__name__
+            )
+            raise FileError(
+                f"{path}: is truncated, damaged or no picture: {reason:.200}"
+            ) from error
         finally:
             cv2.utils.logging.setLogLevel(level)
 
@@ -249,12 +293,16 @@ def _opaque(codes: np.ndarray) -> np.ndarray:
     codes = codes[..., None] if codes.ndim == 2 else codes
     channels, kind = codes.shape[2], codes.dtype
     if channels > 4 or kind not in (np.uint8, np.uint16, np.float16, np.float32):
-        raise FileError(f"holds {channels} channels of {kind}; it must be grey or RGB, unsigned or floats")
+        raise FileError(
+            f"holds {channels} channels of {kind}; it must be grey or RGB, unsigned or floats"
+        )
     checks.finite("the picture", codes)
     if channels in (2, 4):
         opaque = np.iinfo(kind).max if kind.kind == "u" else 1
         if clear := np.count_nonzero(codes[..., -1] != opaque):
-            raise FileError(f"has {clear} transparent pixel(s), whose light is not known; make them opaque")
+            raise FileError(
+                f"has {clear} transparent pixel(s), whose light is not known; make them opaque"
+            )
     return codes[..., 0] if channels < 3 else codes[..., :3]
 
 
@@ -302,11 +350,14 @@ def _exr(path: Path, memory: int) -> np.ndarray:
     names = sorted((channel.name for channel in header["channels"]), key="RGBA".find)
     if len(names) != 1 and names not in ([*"RGB"], [*"RGBA"]):
         raise FileError(f"holds the channels {names}; they must be R, G, B, or one")
-    # `File` prints what is wrong with pixels on sys.stdout; `InputFile` crashes on headers refused above.
+    # `File` prints what is wrong with pixels on sys.stdout; `InputFile` crashes on headers refused
+    # above.
     file = OpenEXR.InputFile(str(path))
     kinds = {str(file.header()["channels"][name].type) for name in names}
     if kinds not in ({"HALF"}, {"FLOAT"}):
-        raise FileError(f"holds {', '.join(sorted(kinds))} channels; they must be all HALF or all FLOAT")
+        raise FileError(
+            f"holds {', '.join(sorted(kinds))} channels; they must be all HALF or all FLOAT"
+        )
     dtype = np.float16 if kinds == {"HALF"} else np.float32
     planes = [np.frombuffer(pixels, dtype).reshape(h, w) for pixels in file.channels(names)]
     return _opaque(np.stack(planes, axis=-1))

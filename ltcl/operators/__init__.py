@@ -7,7 +7,13 @@ from typing import Any
 
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Epilogue, Norms, Operator
-from ltcl.operators.bases import Basis, Pyramid, SubsetBasis, multiresolution_order, restrict_to_support
+from ltcl.operators.bases import (
+    Basis,
+    Pyramid,
+    SubsetBasis,
+    multiresolution_order,
+    restrict_to_support,
+)
 from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
@@ -29,7 +35,16 @@ __all__ = [
     "Host",
     "IdentityPlus",
 ]
-__all__ += ["MultiDevice", "Norms", "Operator", "Parts", "Pyramid", "RowBlocks", "ScaledColumns", "Streamed"]
+__all__ += [
+    "MultiDevice",
+    "Norms",
+    "Operator",
+    "Parts",
+    "Pyramid",
+    "RowBlocks",
+    "ScaledColumns",
+    "Streamed",
+]
 __all__ += ["SubsetBasis", "Tiles", "Wavelet", "as_operator", "basis", "interreflections"]
 __all__ += ["multiresolution_order", "rank_device", "restrict_to_support", "smallest"]
 
@@ -39,7 +54,8 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
 
     Parameters
     ----------
-    matrix : Operator (returned as it is), (M, N) array, scipy.sparse matrix or array, or LinearOperator
+    matrix : Operator (returned as it is), (M, N) array, scipy.sparse matrix or array, or
+    LinearOperator
     device : Device, the best one when not given
 
     Examples

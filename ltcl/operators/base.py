@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What every linear operator on a device promises.
 
-A subclass implements `_product`, which queues a product, or `_bound`, which prepares one for many calls.
+A subclass implements `_product`, which queues a product, or `_bound`, which prepares one for many
+calls.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ PLAIN = Epilogue()  # out = A x
 class Operator(scipy.sparse.linalg.LinearOperator):
     """An (M, N) linear operator in float32 on an OpenCL device.
 
-    NumPy in, NumPy out, wherever SciPy takes a `LinearOperator`; `apply` takes and gives device arrays.
+    NumPy in, NumPy out, wherever SciPy takes a `LinearOperator`; `apply` takes and gives device
+    arrays.
 
     Attributes
     ----------
@@ -58,13 +60,16 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     solution_error, error_bound : float
         What compression changes solutions by, ``||x~ - x|| / ||x||``: as its norm states, and at most.
     weights : (N,) float64 or None
-        Of an inner product <x, y> = sum_i w_i x_i y_i in which it should be self-adjoint, where one is known.
+        Of an inner product <x, y> = sum_i w_i x_i y_i in which it should be self-adjoint, where one
+        is known.
     """
 
     error = solution_error = error_bound = 0.0
     weights: np.ndarray | None = None
 
-    def __init__(self, device: Device, shape: tuple[int, int], *parts: Operator | Array | None) -> None:
+    def __init__(
+        self, device: Device, shape: tuple[int, int], *parts: Operator | Array | None
+    ) -> None:
         super().__init__(np.float32, shape)
         self.device = device
         self._parts: tuple[Operator | Array | None, ...] = parts  # what it is made of
@@ -88,7 +93,9 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         """Queue ``out = a (A x) + b y + c x``, or with A^T. `out` is never `x`."""
         self._bound(x, out, epilogue, transpose)()
 
-    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
+    def _bound(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+    ) -> Callable[[], object]:
         """What queues the product at each call."""
         return functools.partial(self._product, x, out, epilogue, transpose)
 
@@ -98,7 +105,9 @@ class Operator(scipy.sparse.linalg.LinearOperator):
 
     def norms(self) -> Norms:
         """Norms that need the entries; operators that cannot see theirs refuse."""
-        raise InputError(f"{type(self).__name__} cannot see its entries, so their norms are unknown")
+        raise InputError(
+            f"{type(self).__name__} cannot see its entries, so their norms are unknown"
+        )
 
     def apply(
         self,
@@ -112,10 +121,12 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     ) -> Array:
         """Queue ``out = scale (A x) + add_scale add + shift x``; returns `out`, made when not given.
 
-        x is (N,) or (N, k), `add` and `out` are (M,) or (M, k); `out` may be `add`, but not `x`. `shift`
-        needs a square operator. InputError for shapes that do not fit.
+        x is (N,) or (N, k), `add` and `out` are (M,) or (M, k); `out` may be `add`, but not `x`.
+        `shift` needs a square operator. InputError for shapes that do not fit.
         """
-        epilogue = Epilogue(float(scale), 0.0 if add is None else float(add_scale), add, float(shift))
+        epilogue = Epilogue(
+            float(scale), 0.0 if add is None else float(add_scale), add, float(shift)
+        )
         out = self._checked(x, out, epilogue)
         self._bound(x, out, epilogue, False)()
         return out
@@ -132,7 +143,9 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         A._checked(x, out, epilogue)
         return A._bound(x, out, epilogue, False)
 
-    def stepper(self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0) -> Stepper:
+    def stepper(
+        self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0
+    ) -> Stepper:
         """Steps of a stationary iteration on S x = b, S = a A + c I, which change `x` and its residual `r`.
 
         Norms of residuals of up to `slots` steps may wait on the device until they are read.
@@ -142,7 +155,10 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     def row_sums(self) -> np.ndarray:
         """A 1, (M,) float32: one product, at the first call only."""
         if self._row_sums is None:
-            ones, sums = self.device.upload(np.ones(self.shape[1])), self.device.empty(self.shape[0])
+            ones, sums = (
+                self.device.upload(np.ones(self.shape[1])),
+                self.device.empty(self.shape[0]),
+            )
             self.bind(ones, sums)()
             self._row_sums = sums.get()
         return self._row_sums
@@ -157,7 +173,9 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         except MemoryLimitError:
             raise
         except MemoryError as error:  # a limit of the process, below what the host has
-            raise MemoryLimitError(f"{what} needs {checks.size(nbytes)}, more than the host gives") from error
+            raise MemoryLimitError(
+                f"{what} needs {checks.size(nbytes)}, more than the host gives"
+            ) from error
 
     def _dense(self) -> np.ndarray:
         return self.between(*map(np.arange, self.shape))
@@ -218,7 +236,9 @@ class Operator(scipy.sparse.linalg.LinearOperator):
             if array.dtype != np.float32:
                 raise InputError(f"{name} holds {array.dtype}; operators take float32")
             if array.device is not self.device:
-                raise InputError(f"{name} is on another device, {array.device}; it must be on {self.device}")
+                raise InputError(
+                    f"{name} is on another device, {array.device}; it must be on {self.device}"
+                )
             if array is not x and array.shape != expected:
                 raise InputError(f"{name} has shape {array.shape}; it must be {expected}")
         if out.buffer is x.buffer:
@@ -229,8 +249,8 @@ class Operator(scipy.sparse.linalg.LinearOperator):
 class Stepper:
     """Steps of a stationary iteration: x += d; r -= S d; d = keep d + gain r.
 
-    With keep = 0 they are Jacobi's (gain 1, eq. 20) or Richardson's; with the right numbers Chebyshev's.
-    `waiting` counts the steps whose norms were not read yet.
+    With keep = 0 they are Jacobi's (gain 1, eq. 20) or Richardson's; with the right numbers
+    Chebyshev's. `waiting` counts the steps whose norms were not read yet.
     """
 
     def __init__(self, A: Operator, x: Array, r: Array, slots: int, a: float, c: float) -> None:
@@ -242,7 +262,9 @@ class Stepper:
 
     def _prepare(self) -> None:
         # (slots, groups, k) squares of residuals
-        self._partials = self.A.device.empty((self.slots, vectors.step_groups(self.x), self.x.columns))
+        self._partials = self.A.device.empty(
+            (self.slots, vectors.step_groups(self.x), self.x.columns)
+        )
         self._product = self.A.bind(self.d, self.other, Epilogue(self._a, c=self._c))
 
     def start(self, gain: float) -> None:
@@ -252,7 +274,9 @@ class Stepper:
     def step(self, keep: float, gain: float) -> None:
         """Queue one step: x moves along d, and the next d is keep d + gain r with the new r."""
         self._product()
-        vectors.queue_step(self.other, self.x, self.r, self.d, keep, gain, self._partials, self.waiting)
+        vectors.queue_step(
+            self.other, self.x, self.r, self.d, keep, gain, self._partials, self.waiting
+        )
         self.waiting += 1
 
     def norms(self) -> np.ndarray:
@@ -270,13 +294,19 @@ class Transposed(Operator):
     def __init__(self, base: Operator) -> None:
         super().__init__(base.device, base.shape[::-1], base)
         self.base = base
-        self.error, self.solution_error, self.error_bound = base.error, base.error_bound, base.error_bound
+        self.error, self.solution_error, self.error_bound = (
+            base.error,
+            base.error_bound,
+            base.error_bound,
+        )
 
     def diagonal(self) -> np.ndarray:
         """That of A."""
         return self.base.diagonal()
 
-    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
+    def _bound(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+    ) -> Callable[[], object]:
         return self.base._bound(x, out, epilogue, not transpose)
 
     def _transpose(self) -> Operator:

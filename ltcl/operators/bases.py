@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Bases: in which coefficients a picture is written, and some of their coefficients as bases of their own.
 
-An operator between two bases is R = W_out^T C W_in. Smooth light transport in wavelets leaves most rows and
-columns of C empty; with P, (M, N), that picks the others, its support, C = P^T (P C P^T) P.
+An operator between two bases is R = W_out^T C W_in. Smooth light transport in wavelets leaves most
+rows and columns of C empty; with P, (M, N), that picks the others, its support, C = P^T (P C P^T)
+P.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from ltcl.errors import InputError
 from ltcl.operators.base import PLAIN, WIDTHS, Epilogue, Operator
 
 _GROUP = 64  # work-items side by side
-_GROUPS = 1 << 14  # items along the second and third dimension, where kernels stride: GPUs take 65535 groups
+_GROUPS = (
+    1 << 14
+)  # items along the second and third dimension, where kernels stride: GPUs take 65535 groups
 _SMALL = 4096  # cells of a level from which on one launch does all the rest
 _MOST = 0.5  # of the coefficients: where more are in the support, restricting to them gains little
 
@@ -38,11 +41,17 @@ class Basis(Operator):
 
     orthonormal = True
     isometric = True
-    # (x, out, a, b, y, transpose): queues out = a (W x) + b y, or with W^T; y is not read where b is 0.
+    # (x, out, a, b, y, transpose): queues out = a (W x) + b y, or with W^T; y is not read where b
+    # is 0.
     _transform: Callable[[Array, Array, float, float, Array, bool], None]
 
     def __init__(
-        self, device: Device, grid: Any, name: str, coefficients: int, *parts: Operator | Array | None
+        self,
+        device: Device,
+        grid: Any,
+        name: str,
+        coefficients: int,
+        *parts: Operator | Array | None,
     ) -> None:
         self.grid, self.name = checks.grid("grid", grid), name
         super().__init__(device, (coefficients, self.grid[0] * self.grid[1]), *parts)
@@ -100,7 +109,9 @@ class SubsetBasis(Basis):
     def __init__(self, device: Device, grid: Any, places: Any, of: Basis | None = None) -> None:
         h, w = checks.grid("grid", grid)
         if of is not None and (of.device is not device or of.grid != (h, w)):
-            raise InputError(f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}")
+            raise InputError(
+                f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}"
+            )
         count, places = h * w if of is None else of.shape[0], checks.real("places", places)
         if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
             kind = f"{places.shape} of {places.dtype}"
@@ -125,7 +136,9 @@ class SubsetBasis(Basis):
         own = super().to_arrays() if self.of is None else self.of.to_arrays()
         return {**own, "places": self.places}
 
-    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
         order, k = self._orders[transpose], x.columns
         kernel, pieces = self._kernel("ordered", "gather", k)
         items, group = (pieces, min(order.size, _GROUPS)), (1, _GROUP)
@@ -144,9 +157,10 @@ class SubsetBasis(Basis):
 class Pyramid(Basis):
     """A quad-tree: sums over the cells of all levels, (M, N), the finest first (`kernels/pyramid.cl`).
 
-    Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the edges,
-    until one cell is left: the basis of transports that were scanned adaptively. Not orthonormal. `cells`
-    holds (rows, columns) of each level, whose cells are row-major one behind the other.
+    Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the
+    edges, until one cell is left: the basis of transports that were scanned adaptively. Not
+    orthonormal. `cells` holds (rows, columns) of each level, whose cells are row-major one behind
+    the other.
 
     Examples
     --------
@@ -166,7 +180,9 @@ class Pyramid(Basis):
         self.cells = tuple((-(-h // 2**level), -(-w // 2**level)) for level in levels)
         super().__init__(device, grid, "pyramid", sum(h * w for h, w in self.cells))
 
-    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
         k, levels = x.columns, len(self.cells)
         kernel, pieces = self._kernel("pyramid", "spread" if transpose else "gather", k)
         if transpose:
@@ -197,9 +213,9 @@ def restrict_to_support(core: Any, W: Basis) -> tuple[scipy.sparse.csr_array, Ba
 def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
     """An order of 2-D wavelet coefficients in which those of one place and size stand together, (N,) int64.
 
-    From coarse to fine, in each level row by row, the details of a place side by side: rows of W R W^T then
-    have their large entries in runs, which `Tiles` of 8 hold in a fifth fewer bytes. Coefficients are in the
-    layout of a `Wavelet` of so many `levels`.
+    From coarse to fine, in each level row by row, the details of a place side by side: rows of W R
+    W^T then have their large entries in runs, which `Tiles` of 8 hold in a fifth fewer bytes.
+    Coefficients are in the layout of a `Wavelet` of so many `levels`.
 
     >>> multiresolution_order((2, 4), 1).tolist()
     [0, 1, 2, 4, 6, 3, 5, 7]

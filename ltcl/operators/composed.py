@@ -49,9 +49,16 @@ class IdentityPlus(Operator):
         if sign not in (1.0, -1.0):
             raise InputError(f"sign is {sign!r}; it must be 1 for I + R or -1 for I - R")
         if not solution_error >= 0.0:
-            raise InputError(f"solution_error is {solution_error!r}; it must be a number of at least 0")
+            raise InputError(
+                f"solution_error is {solution_error!r}; it must be a number of at least 0"
+            )
         super().__init__(R.device, R.shape, R)
-        self.R, self.sign, self.error, self.solution_error = R, float(sign), R.error, float(solution_error)
+        self.R, self.sign, self.error, self.solution_error = (
+            R,
+            float(sign),
+            R.error,
+            float(solution_error),
+        )
         self.error_bound = self.solution_error
         self.weights = None if weights is None else checks.shape("weights", weights, R.shape[:1])
 
@@ -69,11 +76,15 @@ class IdentityPlus(Operator):
         dense[np.diag_indices_from(dense)] += 1.0
         return dense
 
-    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
+    def _bound(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+    ) -> Callable[[], object]:
         a, b, y, c = epilogue
         return self.R._bound(x, out, Epilogue(a * self.sign, b, y, c + a), transpose)
 
-    def stepper(self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0) -> Stepper:
+    def stepper(
+        self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0
+    ) -> Stepper:
         """Those of R with the identity in the same launch; see `Operator.stepper`."""
         return self.R.stepper(x, r, slots, a * self.sign, c + a)
 
@@ -86,16 +97,22 @@ class ScaledColumns(Operator):
 
     def __init__(self, A: Operator, d: np.ndarray, shift: Any = 0.0) -> None:
         self.d = checks.finite("d", checks.shape("d", checks.real("d", d), A.shape[1:]))
-        self.shift = checks.shape("shift", checks.real("shift", shift), (), A.shape[:1]).astype(np.float64)
+        self.shift = checks.shape("shift", checks.real("shift", shift), (), A.shape[:1]).astype(
+            np.float64
+        )
         if self.shift.any() and A.shape[0] != A.shape[1]:
-            raise InputError(f"the operator has shape {A.shape}; A - diag(shift) needs a square one")
+            raise InputError(
+                f"the operator has shape {A.shape}; A - diag(shift) needs a square one"
+            )
         self.A, self._d = A, A.device.upload(self.d)
         self._shift = A.device.upload(self.shift) if self.shift.ndim else None
         super().__init__(A.device, A.shape, A, self._d, self._shift)
         self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
         if not self.shift.any():
             errors = (A.solution_error, A.error_bound)
-            self.solution_error, self.error_bound = (error and error * spread(self.d) for error in errors)
+            self.solution_error, self.error_bound = (
+                error and error * spread(self.d) for error in errors
+            )
 
     def diagonal(self) -> np.ndarray:
         """diag(A) d - shift, (min(M, N),) float64."""
@@ -129,8 +146,9 @@ def spread(d: np.ndarray) -> float:
 class Compressed(Operator):
     """R = W_out^T C W_in, (M, N): a sparse core C between two bases; a side without one is of pixels.
 
-    W on the right alone are the wavelet rows of the paper (section 6). Where both are one isometric basis, R
-    has the norm, the spectrum (and 0 with it) and the solves of its core; see `ltcl.solvers.solve`.
+    W on the right alone are the wavelet rows of the paper (section 6). Where both are one isometric
+    basis, R has the norm, the spectrum (and 0 with it) and the solves of its core; see
+    `ltcl.solvers.solve`.
 
     Parameters
     ----------
@@ -147,7 +165,9 @@ class Compressed(Operator):
     >>> from ltcl.operators import Compressed, Dense, Wavelet
     >>> device = ltcl.open_device()
     >>> W = Wavelet(device, (2, 2), "haar")
-    >>> R = Compressed(Dense(device, numpy.diag([0.5, 0, 0, 0])), W, W, error=1e-3)  # of each the mean, half
+    >>> R = Compressed(
+    ...     Dense(device, numpy.diag([0.5, 0, 0, 0])), W, W, error=1e-3
+    ... )  # of each the mean, half
     >>> (R @ numpy.array([1.0, 2.0, 3.0, 6.0])).round(6).tolist(), R.error
     ([1.5, 1.5, 1.5, 1.5], 0.001)
     """
@@ -168,17 +188,23 @@ class Compressed(Operator):
                     f"{name} has {W.shape[0]} coefficients, but the core {core.shape}; it must have {count}"
                 )
             if W is not None and W.device is not core.device:
-                raise InputError(f"{name} is on another device, {W.device}; it must be on {core.device}")
+                raise InputError(
+                    f"{name} is on another device, {W.device}; it must be on {core.device}"
+                )
             shape.append(count if W is None else W.shape[1])
         super().__init__(core.device, (shape[0], shape[1]), core, out, into)
         self.core, self.out, self.into = core, out, into
         if error is None and core.error and not all(W is None or W.isometric for W in (out, into)):
-            raise InputError(f"error is None; it must be given, as {core.error:.3g} is that of coefficients")
+            raise InputError(
+                f"error is None; it must be given, as {core.error:.3g} is that of coefficients"
+            )
         self.error = core.error if error is None else checks.number("error", error, least=0.0)
         self.two_sided = out is into and out is not None and out.isometric
         self.known_diagonal: np.ndarray | None = None
         if diagonal is not None:
-            diagonal = checks.shape("diagonal", checks.real("diagonal", diagonal), (min(self.shape),))
+            diagonal = checks.shape(
+                "diagonal", checks.real("diagonal", diagonal), (min(self.shape),)
+            )
             self.known_diagonal = checks.finite("diagonal", diagonal).astype(np.float64)
 
     def diagonal(self) -> np.ndarray:
@@ -200,7 +226,11 @@ class Compressed(Operator):
             self.core._product(x, out, epilogue, transpose)
             return
         a, b, y, c = epilogue.without_shift(x)
-        factors = [(A, t) for A, t in ((first, False), (self.core, transpose), (last, True)) if A is not None]
+        factors = [
+            (A, t)
+            for A, t in ((first, False), (self.core, transpose), (last, True))
+            if A is not None
+        ]
         operand = x
         for A, transposed in factors[:-1]:
             product = self.device.empty((A.shape[transposed], *x.shape[1:]))
@@ -227,19 +257,26 @@ class Coupled(Operator):
     [0.55 0.5  1.  ]
     """
 
-    def __init__(self, blocks: Sequence[Sequence[Operator | None]], mixing: np.ndarray | None = None) -> None:
+    def __init__(
+        self, blocks: Sequence[Sequence[Operator | None]], mixing: np.ndarray | None = None
+    ) -> None:
         own = [block for row in blocks for block in row if block is not None]
         if [len(row) for row in blocks] != [3, 3, 3] or len({block.shape for block in own}) != 1:
             raise InputError("blocks must be 3 x 3 operators of one shape, or None")
         rows, columns = own[0].shape
         super().__init__(own[0].device, (3 * rows, 3 * columns), *own)
-        self.blocks, self.mixing = blocks, np.eye(3) if mixing is None else np.asarray(mixing, np.float64)
+        self.blocks, self.mixing = (
+            blocks,
+            np.eye(3) if mixing is None else np.asarray(mixing, np.float64),
+        )
         self.error = max(float(np.abs(self.mixing).sum()), 1.0) * sum(block.error for block in own)
 
     @classmethod
     def mixed(cls, operators: Sequence[Operator], mixing: np.ndarray) -> Coupled:
         """Channels that see only their own light, which is mixed before."""
-        return cls([[T if c == j else None for j in range(3)] for c, T in enumerate(operators)], mixing)
+        return cls(
+            [[T if c == j else None for j in range(3)] for c, T in enumerate(operators)], mixing
+        )
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         a, b, y, c = epilogue
@@ -284,8 +321,13 @@ class Host(Operator):
         """A x or A^T x on the host, of x (N, k) float64; what is not real and finite is refused."""
         name = f"the product of {self._name}"
         try:
-            product = (self.operator.T if transpose else self.operator).matmat(x)  # matvec drops masks
-        except (NotImplementedError, TypeError) as error:  # what SciPy raises, the second for several columns
+            product = (self.operator.T if transpose else self.operator).matmat(
+                x
+            )  # matvec drops masks
+        except (
+            NotImplementedError,
+            TypeError,
+        ) as error:  # what SciPy raises, the second for several columns
             if not transpose:
                 raise
             raise InputError(f"{self._name} has no rmatvec; its transpose is unknown") from error

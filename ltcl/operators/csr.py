@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compressed sparse rows: float32 values, 32-bit column indices, y = A x by `kernels/csr.cl`.
 
-A transposed product uses A^T in the same format, made at the first one: twice the memory, but the same bits
-at every call, which scattered additions would not give.
+A transposed product uses A^T in the same format, made at the first one: twice the memory, but the
+same bits at every call, which scattered additions would not give.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class CSR(RowOperator):
     Parameters
     ----------
     matrix : scipy.sparse matrix or array, (M, N)
-        InputError where it is malformed or not finite, MemoryLimitError where the device has no room for it.
+        InputError where it is malformed or not finite, MemoryLimitError where the device has no
+        room for it.
     pattern : Pattern, optional
         That of another channel; shared where the nonzeros are in the same places.
 
@@ -88,7 +89,9 @@ class CSR(RowOperator):
         matrix = checks.csr("matrix", matrix)
         super().__init__(device, matrix.shape)
         shared = pattern is not None and pattern.device is device and pattern.matches(matrix)
-        device.require(matrix.nnz * (4 if shared else 8), f"a sparse matrix of {matrix.nnz} nonzeros")
+        device.require(
+            matrix.nnz * (4 if shared else 8), f"a sparse matrix of {matrix.nnz} nonzeros"
+        )
         self.pattern = pattern if pattern is not None and shared else Pattern.of(device, matrix)
         self.slabs = self.pattern.with_values(matrix.data)
         self.nnz: int = matrix.nnz
@@ -127,8 +130,12 @@ class CSR(RowOperator):
         """Of what `to_arrays` gave; what does not fit together is refused."""
         rows, columns = (int(n) for n in arrays["shape"])
         data, indices, indptr = (arrays[name] for name in ("data", "indices", "indptr"))
-        checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), (rows, columns))
-        return cls(device, scipy.sparse.csr_array((data, indices, indptr), shape=(rows, columns)), pattern)
+        checks.compressed(
+            "the stored matrix", indptr, indices, checks.real("data", data), (rows, columns)
+        )
+        return cls(
+            device, scipy.sparse.csr_array((data, indices, indptr), shape=(rows, columns)), pattern
+        )
 
     def _transposed_rows(self) -> CSR:
         return CSR(self.device, scipy.sparse.csr_array(self._host.T))
@@ -149,7 +156,9 @@ class RowBlocks(CSR):
     --------
     >>> import ltcl
     >>> A = scipy.sparse.csr_array([[1.0, 2.0], [0.0, 3.0]])
-    >>> rows = RowBlocks(ltcl.open_device(), (2, 2), lambda: ((i, A[i : i + 1]) for i in range(2)), A.nnz)
+    >>> rows = RowBlocks(
+    ...     ltcl.open_device(), (2, 2), lambda: ((i, A[i : i + 1]) for i in range(2)), A.nnz
+    ... )
     >>> (rows @ np.array([1.0, 1.0])).tolist()
     [3.0, 3.0]
     """

@@ -15,7 +15,10 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Epilogue, widths
 from ltcl.operators.rows import RowOperator, Slab, cut
 
-_CHUNKS, _CHUNK_ROWS = 64, 32  # of a transposed product: enough groups for a large GPU, none too short
+_CHUNKS, _CHUNK_ROWS = (
+    64,
+    32,
+)  # of a transposed product: enough groups for a large GPU, none too short
 
 
 class Dense(RowOperator):
@@ -36,7 +39,9 @@ class Dense(RowOperator):
     """
 
     file = "dense"
-    exact: tuple[np.ndarray, ...] | None = None  # (A, d, e): it is A / d - diag(e), rounded to float32
+    exact: tuple[np.ndarray, ...] | None = (
+        None  # (A, d, e): it is A / d - diag(e), rounded to float32
+    )
 
     def __init__(self, device: Device, matrix: Any) -> None:
         host = checks.real("matrix", matrix)
@@ -91,4 +96,6 @@ class Dense(RowOperator):
                 place = (chunks, 0, 1, 0, 1.0, 0.0, 0.0)
                 kernel = self.kernel("dense_rmatvec", 1, 1)
                 kernel((out.size, 1), (64, 1), *place, self._ones, out, out, out.size, sums)
-            epilogue = Epilogue(a, 1.0, out)  # the following slabs add to what the first has written
+            epilogue = Epilogue(
+                a, 1.0, out
+            )  # the following slabs add to what the first has written

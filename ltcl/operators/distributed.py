@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A matrix whose rows lie on the ranks of an MPI communicator: one solve in lock-step on many devices.
 
-    A x   = (A_1 x; A_2 x; ...)     each rank multiplies its rows A_r on its own device; one Allgatherv
-    A^T x = sum_r A_r^T x_r         one Allreduce
+    A x   = (A_1 x; A_2 x; ...)     each rank multiplies its rows A_r on its own device; one
+    Allgatherv A^T x = sum_r A_r^T x_r         one Allreduce
 
-Vectors are whole on every rank, and every rank runs the same solver on them. Devices are alike, so the bits
-are the same on all ranks, and so is every decision; where one depends on time, rank 0 decides
-(`Device.agreed`). All calls are collective: every rank makes them, in the same order.
+Vectors are whole on every rank, and every rank runs the same solver on them. Devices are alike, so
+the bits are the same on all ranks, and so is every decision; where one depends on time, rank 0
+decides (`Device.agreed`). All calls are collective: every rank makes them, in the same order.
 
-`comm` is a communicator of mpi4py. A rank that fails alone leaves the others waiting for it: start scripts by
-``mpiexec -n 2 python -m mpi4py script.py``, which then ends them all.
+`comm` is a communicator of mpi4py. A rank that fails alone leaves the others waiting for it: start
+scripts by ``mpiexec -n 2 python -m mpi4py script.py``, which then ends them all.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ def rank_device(comm: Any, select: Device | str | None = None) -> RankDevice:
         if isinstance(select, Device):
             return select
         best = choose(devices := list_devices(), select or os.environ.get("LTCL_DEVICE"))
-        alike = [each.index for each in devices if (each.name, each.driver) == (best.name, best.driver)]
+        alike = [
+            each.index for each in devices if (each.name, each.driver) == (best.name, best.driver)
+        ]
         return open_device(alike[turn % len(alike)])
 
     own = together(comm, find)
@@ -127,7 +129,9 @@ class Distributed(Parts):
     def __init__(self, comm: Any, rows: Any, device: Device | str | None = None) -> None:
         shapes = comm.allgather(np.shape(rows))
         if any(len(shape) != 2 or 0 in shape or shape[1] != shapes[0][1] for shape in shapes):
-            raise InputError(f"rows have the shapes {shapes}, by rank; they must be (m, N), with m above 0")
+            raise InputError(
+                f"rows have the shapes {shapes}, by rank; they must be (m, N), with m above 0"
+            )
         device = rank_device(comm, rows.device if isinstance(rows, Operator) else device)
         make = lambda: rows if isinstance(rows, Operator) else on_device(device, rows)  # noqa: E731
         self.comm, self.rows = comm, together(comm, make)
@@ -145,7 +149,9 @@ class Distributed(Parts):
     def norms(self) -> Norms:
         """Norms of all rows together."""
         columns, inf, squares, lowest = zip(*self.comm.allgather(self.rows.sums()), strict=True)
-        return Norms(float(np.max(np.sum(columns, axis=0))), max(inf), sum(squares) ** 0.5, min(lowest))
+        return Norms(
+            float(np.max(np.sum(columns, axis=0))), max(inf), sum(squares) ** 0.5, min(lowest)
+        )
 
     def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
         count = self.counts[self.comm.rank]
@@ -156,5 +162,7 @@ class Distributed(Parts):
         if transpose:
             self.comm.Allreduce(product.get(), whole)
         else:
-            self.comm.Allgatherv(product.get(), [whole, [count * x.columns for count in self.counts]])
+            self.comm.Allgatherv(
+                product.get(), [whole, [count * x.columns for count in self.counts]]
+            )
         return whole

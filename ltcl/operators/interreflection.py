@@ -18,25 +18,30 @@ from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, spread
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.parts import Streamed, on_devices, row_blocks, stays_on_disk
 
-_DIGITS = 16.0  # times the largest entry of a column of T: up to such an F, S keeps 6 digits of the column
+# times the largest entry of a column of T: up to such an F, S keeps 6 digits of the column
+_DIGITS = 16.0
 
 
-def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> tuple[IdentityPlus, ...]:
+def interreflections(
+    matrices: Sequence[Any], F: np.ndarray, device: Device
+) -> tuple[IdentityPlus, ...]:
     """S = T F^-1 = I + R of every channel, on the device.
 
     Parameters
     ----------
     matrices : sequence of (N, N) array, csr_array, Operator or LinearOperator
-        T of each channel, checked. Of S diag(F) that S is taken as it is. Where they are mapped arrays or the
-        rows of a store that do not fit the device or the host, each product reads them.
+        T of each channel, checked. Of S diag(F) that S is taken as it is. Where they are mapped
+        arrays or the rows of a store that do not fit the device or the host, each product reads
+        them.
     F : (channels, N)
         First bounces; 0 where a projector pixel is masked, whose column of R is then 0.
 
     Returns
     -------
     tuple of IdentityPlus
-        Sparse channels share one pattern where their nonzeros are in the same places. `weights` are 1 / F,
-        where no pixel is masked: if T is symmetric (reciprocity, patches of equal area), so is F^-1 T F^-1.
+        Sparse channels share one pattern where their nonzeros are in the same places. `weights` are
+        1 / F, where no pixel is masked: if T is symmetric (reciprocity, patches of equal area), so
+        is F^-1 T F^-1.
     """
     systems, pattern = [], None
     on_disk = device.agreed(stays_on_disk(matrices, device))
@@ -50,7 +55,10 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
         system = IdentityPlus(R, weights=1.0 / f if np.all(f > 0) else None)
         if S is not None and S.error_bound:  # norms change by max(d / f) / min(d / f) at most
             ratio = spread(matrix.d[f > 0] / f[f > 0])
-            system.solution_error, system.error_bound = ratio * S.solution_error, ratio * S.error_bound
+            system.solution_error, system.error_bound = (
+                ratio * S.solution_error,
+                ratio * S.error_bound,
+            )
         systems.append(system)
     return tuple(systems)
 
@@ -63,7 +71,9 @@ def made_with(matrix: Any) -> IdentityPlus | None:
 
 def maskable(matrix: Any) -> bool:
     """Whether pixels may be dropped from it, which a LinearOperator would keep in its products."""
-    entries = isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or hasattr(matrix, "row_blocks")
+    entries = isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or hasattr(
+        matrix, "row_blocks"
+    )
     return entries or made_with(matrix) is not None
 
 
@@ -74,7 +84,9 @@ def device_of(rows: Sequence[Sequence[Any]], requested: Device | str | None) -> 
         raise InputError("matrix has operators on several devices; all must be on one")
     device = devices.pop() if devices else None
     if device is not None and requested is not None and open_device(requested) is not device:
-        raise InputError(f"device is {requested!r}, but operators lie on {device}; all must be on one device")
+        raise InputError(
+            f"device is {requested!r}, but operators lie on {device}; all must be on one device"
+        )
     return device
 
 
@@ -83,13 +95,16 @@ def nbytes(systems: Sequence[IdentityPlus]) -> int:
     return sum(array.nbytes for array in set[Array]().union(*(S.arrays() for S in systems)))
 
 
-def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:
+def _interreflection(
+    matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None
+) -> Operator:
     """R = T F^-1 - I, computed in float64 and rounded once."""
     lit = F > 0
     entries = matrix.matrix if isinstance(matrix, Streamed) else matrix
     if isinstance(entries, (np.ndarray, scipy.sparse.csr_array)) or hasattr(entries, "row_blocks"):
         _check_first_bounce(entries, F)
-    # Divided, not multiplied by 1 / F: x / x is 1 to the bit, so that F = diag(T) leaves R no diagonal.
+    # Divided, not multiplied by 1 / F: x / x is 1 to the bit, so that F = diag(T) leaves R no
+    # diagonal.
     divisor = np.where(lit, F, np.inf)
     if isinstance(matrix, np.ndarray):
         R = on_devices(device, matrix, lambda first, rows: _dense_R(rows, divisor, lit, first))
@@ -98,7 +113,9 @@ def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Patter
     if isinstance(matrix, scipy.sparse.csr_array):
         return on_devices(device, _sparse_R(matrix, divisor, lit), pattern=pattern)
     if hasattr(matrix, "row_blocks"):
-        return on_devices(device, matrix, lambda k, rows: _sparse_R(rows, divisor, lit, k), more=len(F))
+        return on_devices(
+            device, matrix, lambda k, rows: _sparse_R(rows, divisor, lit, k), more=len(F)
+        )
     operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)
     return ScaledColumns(operator, 1.0 / divisor, 1.0 if lit.all() else lit)
 
@@ -112,7 +129,9 @@ def _check_first_bounce(T: Any, F: np.ndarray) -> None:
     largest = diagonal
     for _, block in row_blocks(T):
         columns = abs(block).max(axis=0)
-        largest = np.maximum(largest, columns.toarray() if scipy.sparse.issparse(columns) else columns)
+        largest = np.maximum(
+            largest, columns.toarray() if scipy.sparse.issparse(columns) else columns
+        )
     lost &= _DIGITS * largest < F
     if lost.any():
         j = int(np.argmax(lost))
@@ -125,7 +144,10 @@ def _check_first_bounce(T: Any, F: np.ndarray) -> None:
 def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray, first: int = 0) -> np.ndarray:
     """Rows from `first` on, of the same of T."""
     checks.fits_host(f"R of {T.shape[0]} x {T.shape[1]}", 4 * T.size)
-    R, rows = np.empty(T.shape, np.float32), max(1, (1 << 24) // (8 * len(lit)))  # float64 a block at a time
+    R, rows = (
+        np.empty(T.shape, np.float32),
+        max(1, (1 << 24) // (8 * len(lit))),
+    )  # float64 a block at a time
     for start in range(0, len(T), rows):
         block = T[start : start + rows] / divisor
         here = np.arange(len(block))
@@ -134,7 +156,9 @@ def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray, first: int = 0
     return R
 
 
-def _sparse_R(T: Any, divisor: np.ndarray, lit: np.ndarray, first: int = 0) -> scipy.sparse.csr_array:
+def _sparse_R(
+    T: Any, divisor: np.ndarray, lit: np.ndarray, first: int = 0
+) -> scipy.sparse.csr_array:
     """Rows from `first` on of T F^-1 - I in T's pattern, or without a diagonal: channels stay alike."""
     row = first + np.repeat(np.arange(T.shape[0]), np.diff(T.indptr))
     on_diagonal = T.indices == row
@@ -147,6 +171,10 @@ def _sparse_R(T: Any, divisor: np.ndarray, lit: np.ndarray, first: int = 0) -> s
     R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
     if full:
         return R
-    missing = lit[first : first + T.shape[0]].astype(np.float64)  # F was given where T stores nothing
+    missing = lit[first : first + T.shape[0]].astype(
+        np.float64
+    )  # F was given where T stores nothing
     missing[row[on_diagonal] - first] = 0.0
-    return scipy.sparse.csr_array(R - scipy.sparse.diags_array(missing, offsets=first, shape=T.shape))
+    return scipy.sparse.csr_array(
+        R - scipy.sparse.diags_array(missing, offsets=first, shape=T.shape)
+    )

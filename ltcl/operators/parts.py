@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Operators whose rows lie elsewhere than on one device: on a disk, or on several devices.
 
-A product brings x to the rows, and what they make of it back, through the host: with rows A_p of part p,
+A product brings x to the rows, and what they make of it back, through the host: with rows A_p of
+part p,
 
     A x = (A_1 x; A_2 x; ...),    A^T x = sum_p A_p^T x_p
 
-`Streamed` has a device read its rows from a disk at each product, some megabytes at a time, threads reading
-ahead while it works: k right-hand sides share one reading. `MultiDevice` keeps rows on every device of a
-platform, as many as it is fast, and all work at once.
+`Streamed` has a device read its rows from a disk at each product, some megabytes at a time, threads
+reading ahead while it works: k right-hand sides share one reading. `MultiDevice` keeps rows on
+every device of a platform, as many as it is fast, and all work at once.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ from ltcl.operators.csr import CSR, Pattern, RowBlocks
 from ltcl.operators.dense import Dense
 from ltcl.operators.rows import ReadableRows, RowOperator
 
-_READ, _AHEAD = 1 << 22, 2  # bytes of rows in a reading, which caches hold; readings at the same time
+_READ, _AHEAD = (
+    1 << 22,
+    2,
+)  # bytes of rows in a reading, which caches hold; readings at the same time
 _TRIAL = 4096  # rows and columns of the product by which devices are compared: beyond the caches
 
 
@@ -57,7 +61,8 @@ class Streamed(Parts, ReadableRows):
     Parameters
     ----------
     matrix : numpy.memmap (M, N), or an array that looks at one; or an object with ``row_blocks()``
-        Not changed afterwards. FileError at a product where the file of an array is gone or shorter.
+        Not changed afterwards. FileError at a product where the file of an array is gone or
+        shorter.
 
     Examples
     --------
@@ -73,7 +78,11 @@ class Streamed(Parts, ReadableRows):
     where = "on a disk"
 
     def __init__(self, device: Device, matrix: Any) -> None:
-        none = matrix[:0] if isinstance(matrix, np.ndarray) else scipy.sparse.csr_array((0, matrix.shape[1]))
+        none = (
+            matrix[:0]
+            if isinstance(matrix, np.ndarray)
+            else scipy.sparse.csr_array((0, matrix.shape[1]))
+        )
         slab = on_device(device, none)
         super().__init__(device, matrix.shape, slab)
         self.matrix, self._slab = matrix, slab
@@ -98,7 +107,9 @@ class Streamed(Parts, ReadableRows):
         return self.product(x.get().reshape(x.shape[0], -1).astype(np.float64), transpose)
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        if transpose and isinstance(self._slab, CSR):  # rows would have to be sorted by columns first
+        if transpose and isinstance(
+            self._slab, CSR
+        ):  # rows would have to be sorted by columns first
             super()._product(x, out, epilogue, True)
             return
         for first, rows in row_blocks(self.matrix):
@@ -138,7 +149,9 @@ class MultiDevice(Parts, ReadableRows):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """Those of all parts."""
-        return ((start + first, rows) for start, part in self.parts for first, rows in part.blocks())
+        return (
+            (start + first, rows) for start, part in self.parts for first, rows in part.blocks()
+        )
 
     def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
         host, products = x.get(), []
@@ -192,7 +205,9 @@ def on_device(device: Device, matrix: Any, pattern: Pattern | None = None) -> CS
     return CSR(device, matrix, pattern) if scipy.sparse.issparse(matrix) else Dense(device, matrix)
 
 
-def over_devices(device: Device, rows: int, make: Callable[[Device, slice], RowOperator]) -> Operator:
+def over_devices(
+    device: Device, rows: int, make: Callable[[Device, slice], RowOperator]
+) -> Operator:
     """What `make` puts on a device: all rows, or of several devices or ranks as many as each is fast."""
     if (over_ranks := getattr(device, "over_ranks", None)) is not None:
         return over_ranks(rows, make)
@@ -214,7 +229,9 @@ def _trial(device: Device) -> float:
 
 def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
     """Whether all `matrices` are on a disk, and their R in float32 would not fit the device or the host."""
-    if not all(hasattr(T, "row_blocks") or isinstance(_root(intact(T)), np.memmap) for T in matrices):
+    if not all(
+        hasattr(T, "row_blocks") or isinstance(_root(intact(T)), np.memmap) for T in matrices
+    ):
         return False
     dense = [4 * T.size for T in matrices if isinstance(T, np.ndarray)]
     entries = sum(dense) + sum(8 * T.nnz for T in matrices if not isinstance(T, np.ndarray))
@@ -225,7 +242,9 @@ def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
             each.require(entries // (1 + len(device.others)) + copied * each.is_cpu, "R")
     except MemoryLimitError as error:
         size = checks.size(sum(T.nbytes for T in matrices))
-        getLogger(__name__).warning("T of %s stays on the disk and is read at each product: %s", size, error)
+        getLogger(__name__).warning(
+            "T of %s stays on the disk and is read at each product: %s", size, error
+        )
         return True
     return False
 
@@ -244,7 +263,11 @@ def intact(array: Any) -> Any:
     """`array`; FileError where it is mapped to a file that is shorter by now: reading ends the process."""
     root = _root(array)
     path = getattr(root, "filename", None)
-    if path is not None and os.path.exists(path) and os.path.getsize(path) < root.offset + root.nbytes:
+    if (
+        path is not None
+        and os.path.exists(path)
+        and os.path.getsize(path) < root.offset + root.nbytes
+    ):
         raise FileError(f"{path}: has become shorter; it must stay as it is while T is used")
     return array
 
@@ -257,7 +280,8 @@ def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndar
         return lambda first: (first, matrix[first : first + rows])
     offset = root.offset + matrix.ctypes.data - root.ctypes.data
     checks.fits_host(f"{path}: reading it", (_AHEAD + 1) * rows * width * matrix.itemsize)
-    # In turn, as new memory takes as long as reading: rows are valid until the third reading after them.
+    # In turn, as new memory takes as long as reading: rows are valid until the third reading after
+    # them.
     buffers = np.empty((_AHEAD + 1, rows * width), matrix.dtype)
 
     def read(first: int) -> tuple[int, np.ndarray]:

@@ -134,9 +134,14 @@ class RowOperator(ReadableRows):
             return self._fastest[key]
         variants, slab = self.variants(), max(self.slabs, key=lambda slab: slab.nbytes)
         best = next(iter(variants))
-        if len(variants) > 1:  # timed on the real matrix, into an array nobody needs: `out` may be an operand
+        if (
+            len(variants) > 1
+        ):  # timed on the real matrix, into an array nobody needs: `out` may be an operand
             spare = self.device.empty((self.shape[0], *x.shape[1:]))
-            trials = {name: self._launch(v, slab, x, spare, 0, width, PLAIN) for name, v in variants.items()}
+            trials = {
+                name: self._launch(v, slab, x, spare, 0, width, PLAIN)
+                for name, v in variants.items()
+            }
             row = slab.nbytes // max(slab.rows, 1)
             kind = " ".join(f"{name}={value}" for name, value in sorted(self.defines.items()))
             problem = f"{kind} k={width} of {x.columns}, rows of about 2^{row.bit_length()} bytes"
@@ -150,7 +155,14 @@ class RowOperator(ReadableRows):
         return self.device.kernel(self.file, name, K=width, **packed, **defines, **self.defines)
 
     def _launch(
-        self, variant: Variant, slab: Slab, x: Array, out: Array, offset: int, width: int, epilogue: Epilogue
+        self,
+        variant: Variant,
+        slab: Slab,
+        x: Array,
+        out: Array,
+        offset: int,
+        width: int,
+        epilogue: Epilogue,
     ) -> Callable[[], None]:
         kernel = self.kernel(f"{self.file}_matvec{variant.suffix}", width, x.columns)
         items, group, local = variant.shape(kernel, slab.rows, width)
@@ -159,7 +171,9 @@ class RowOperator(ReadableRows):
         operands = (x, out if y is None else y, out)
         return kernel.bind(items, group, *numbers, *operands, *slab.arguments, local)
 
-    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
+    def _bound(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+    ) -> Callable[[], object]:
         if transpose:
             return self._bound_transpose(x, out, epilogue)
         launches = [
@@ -172,7 +186,9 @@ class RowOperator(ReadableRows):
     def _bound_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
         return self.transposed_copy()._bound(x, out, epilogue, False)
 
-    def stepper(self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0) -> Stepper:
+    def stepper(
+        self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0
+    ) -> Stepper:
         """Steps of one launch each; see `Operator.stepper`."""
         return RowStepper(self, x, r, slots, a * self.unit, c)
 
@@ -196,10 +212,14 @@ class RowStepper(Stepper):
         self._groups = max(ends, default=1)
         self._partials = A.device.empty((self.slots, self._groups, columns))
         if len(set(ends)) > 1:
-            vectors.fill(self._partials, 0.0)  # some pieces of right-hand sides have fewer groups than others
+            vectors.fill(
+                self._partials, 0.0
+            )  # some pieces of right-hand sides have fewer groups than others
         # The direction is read by many rows while the next one is written: the two take turns.
         self._turns: list[list[tuple[Launch, int]]] = [[], []]
-        for turn, (d, following) in zip(self._turns, permutations((self.d, self.other)), strict=True):
+        for turn, (d, following) in zip(
+            self._turns, permutations((self.d, self.other)), strict=True
+        ):
             for kernel, (items, group, local), slab, offset, at in pieces:
                 numbers = (slab.rows, slab.first, columns, offset, self._a, self._c, 0.0, 0.0, at)
                 arrays = (d, self.x, self.r, following, self._partials, *slab.arguments)
@@ -217,7 +237,9 @@ class RowStepper(Stepper):
         self.waiting += 1
 
 
-def cut(device: Device, row_bytes: np.ndarray, what: str, itemsize: int = 4) -> list[tuple[int, int]]:
+def cut(
+    device: Device, row_bytes: np.ndarray, what: str, itemsize: int = 4
+) -> list[tuple[int, int]]:
     """Rows (start, stop) of as few slabs as possible whose buffer, of `row_bytes` (M,), the device takes."""
     # Kernels count in 32 bits, also a work-group beyond the end of a row; pointers are rows + 1.
     limit = min(device.max_allocation - SPARE_BYTES - 4, itemsize * ((1 << 31) - 4096))

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Bases by name; operators S = I + R and bases as plain arrays, which files hold, and made of such again.
 
-    system_0.sign, .solution_error, .weights    of each channel, .error_bound; weights where S has them
-    system_0.R.kind, .error                     "csr", "dense", "tiles" or "compressed"; of what was dropped
-    system_0.R.core.kind, ...                   of "compressed", with .out and .into: bases, -1 of pixels
-    basis_0.name, ...                           as `Basis.to_arrays` has it; one that is shared is there once
+    system_0.sign, .solution_error, .weights    of each channel, .error_bound; weights where S has
+    them system_0.R.kind, .error                     "csr", "dense", "tiles" or "compressed"; of
+    what was dropped system_0.R.core.kind, ...                   of "compressed", with .out and
+    .into: bases, -1 of pixels basis_0.name, ...                           as `Basis.to_arrays` has
+    it; one that is shared is there once
 
 Constructors check every size and index, before anything is uploaded.
 """
@@ -37,7 +38,9 @@ def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
     bases: dict[Basis, int] = {}
     arrays: Arrays = {}
     for number, S in enumerate(systems):
-        own = {name: np.array(getattr(S, name)) for name in ("sign", "solution_error", "error_bound")}
+        own = {
+            name: np.array(getattr(S, name)) for name in ("sign", "solution_error", "error_bound")
+        }
         if S.weights is not None:
             own["weights"] = np.asarray(S.weights, np.float64)
         arrays |= _named(f"system_{number}", own | _named("R", _compressed(S.R, bases)))
@@ -73,7 +76,9 @@ def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[Ident
 def _compressed(R: Operator, bases: dict[Basis, int]) -> Arrays:
     if not isinstance(R, Compressed):
         return _core(R)
-    own = {"kind": np.array("compressed"), "error": np.array(float(R.error))} | _named("core", _core(R.core))
+    own = {"kind": np.array("compressed"), "error": np.array(float(R.error))} | _named(
+        "core", _core(R.core)
+    )
     for name, W in (("out", R.out), ("into", R.into)):
         own[name] = np.array(-1 if W is None else bases.setdefault(W, len(bases)))
     return own if R.known_diagonal is None else own | {"diagonal": R.known_diagonal}
@@ -87,7 +92,10 @@ def _core(A: Any) -> Arrays:
 
 
 def _read(
-    device: Device, own: Mapping[str, Any], bases: Callable[[int], Basis | None], pattern: Pattern | None
+    device: Device,
+    own: Mapping[str, Any],
+    bases: Callable[[int], Basis | None],
+    pattern: Pattern | None,
 ) -> tuple[Operator, Pattern | None]:
     """R, and the pattern of its core, which that of the next channel may share."""
     between = str(own["kind"]) == "compressed"
@@ -115,8 +123,8 @@ def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
 def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
     """The basis called `name` of pictures of h x w pixels.
 
-    That is "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets: "haar",
-    "db2", "db4", ...; InputError for others.
+    That is "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets:
+    "haar", "db2", "db4", ...; InputError for others.
 
     >>> import ltcl
     >>> from ltcl.operators import basis
@@ -132,7 +140,11 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
     """The basis whose `to_arrays` gave `arrays`; others are refused."""
     if missing := sorted({"name", "grid"} - set(arrays)):
         raise InputError(f"the arrays of a basis lack {' and '.join(missing)}; compress again")
-    name, grid, levels = str(arrays["name"]), tuple(np.ravel(arrays["grid"]).tolist()), arrays.get("levels")
+    name, grid, levels = (
+        str(arrays["name"]),
+        tuple(np.ravel(arrays["grid"]).tolist()),
+        arrays.get("levels"),
+    )
     levels = None if levels is None else np.asarray(levels).tolist()
     W = basis(device, grid, name) if levels is None else Wavelet(device, grid, name, levels)
     if "places" in arrays:
@@ -145,4 +157,6 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
 def under(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     """Those whose name begins with `prefix` and a point, without these."""
     start = f"{prefix}."
-    return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
+    return {
+        name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)
+    }

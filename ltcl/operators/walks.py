@@ -9,8 +9,9 @@ R_ij / p(j | i), from a second load. So channels share a walk; of all p
 
     p(j | i) = P_ij / |P_i|,  P_ij^2 = mean over channels c of (R_cij / |R_ci|)^2
 
-has the least sum of the second moments of a step, each in units of those that the channel has by itself.
-Results are the same to the bit on every device, however launches are split, whatever pixels are asked for.
+has the least sum of the second moments of a step, each in units of those that the channel has by
+itself. Results are the same to the bit on every device, however launches are split, whatever pixels
+are asked for.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ _CERTAIN = 1 << 22  # chances to go on, of as many
 _NEVER = 64  # walks of a length whose chance is below 2^-64 are cut: nobody will see one
 _UNITS = 1 << 18  # chunks of one launch at most
 _RECORDS = 1 << 22  # samples of one launch of the adjoint at most
-_STEPS = 1 << 23  # mean steps of one launch for each compute unit: half a second, for who waits for progress
+_STEPS = (
+    1 << 23
+)  # mean steps of one launch for each compute unit: half a second, for who waits for progress
 
 
 class Tables:
@@ -54,7 +57,9 @@ class Tables:
         if columns > _COLUMNS:
             raise InputError(f"R has {columns} columns; walks take at most {_COLUMNS}")
         self._used = _count(M)
-        self.device.require(8 * (self._used + spare), f"tables of the {self._used + spare} entries of R")
+        self.device.require(
+            8 * (self._used + spare), f"tables of the {self._used + spare} entries of R"
+        )
         self.records = self.device.empty((rows + (spare > 0), 4), np.uint32)
         self.entries = self.device.empty((self._used + spare,), np.uint64)
         for slab in M.slabs:
@@ -82,7 +87,9 @@ class Tables:
 
     def _build(self, *arguments: Any) -> None:
         kernel = self.device.kernel("walk", "walk_tables", **_PLAIN)
-        kernel(arguments[0], 1 if self.device.is_cpu else 64, *arguments, self.records, self.entries)
+        kernel(
+            arguments[0], 1 if self.device.is_cpu else 64, *arguments, self.records, self.entries
+        )
 
     def _refuse_overflow(self, name: str, rows: slice) -> None:
         beyond = np.flatnonzero(~np.isfinite(self.sums()[rows]))
@@ -114,13 +121,17 @@ class Linked(Tables):
         row = np.repeat(np.arange(P.shape[0], dtype=np.int32), np.diff(P.indptr))
         values = np.sqrt(P.data / len(Rs))
         places = np.arange(P.nnz) - P.indptr[row]
-        super().__init__(CSR(device, scipy.sparse.csr_array((values, places, P.indptr), shape=P.shape)))
+        super().__init__(
+            CSR(device, scipy.sparse.csr_array((values, places, P.indptr), shape=P.shape))
+        )
         self._others = tuple(Rs[1:])  # kept alive, since their ids find these tables
         self.channels, self._pattern = len(Rs), (P.indices, P.indptr)
         self._chances = values.astype(np.float32) / self.sums()[row].astype(np.float64)
         links = np.zeros((P.nnz, 4), np.uint32)
         links[:, 0] = P.indices
-        numbers = scipy.sparse.csr_array((np.arange(1, P.nnz + 1), P.indices, P.indptr), shape=P.shape)
+        numbers = scipy.sparse.csr_array(
+            (np.arange(1, P.nnz + 1), P.indices, P.indptr), shape=P.shape
+        )
         for c, (sign, R) in enumerate(zip(signs, channels, strict=True)):
             here = (numbers * (R != 0)).data - 1  # the entries of this channel among all
             chances, factors = self._chances[here], np.zeros(R.nnz)
@@ -134,7 +145,10 @@ class Linked(Tables):
         assert self.links is not None  # noqa: S101 - made with the tables
         factors = np.ascontiguousarray(self.links.get().T[1 : 1 + self.channels]).view(np.float32)
         Qs = (self._chances * factor.astype(np.float64) ** 2 for factor in factors)
-        return [CSR(self.device, scipy.sparse.csr_array((Q, *self._pattern), shape=self.shape)) for Q in Qs]
+        return [
+            CSR(self.device, scipy.sparse.csr_array((Q, *self._pattern), shape=self.shape))
+            for Q in Qs
+        ]
 
 
 def tables(M: CSR | Dense) -> Tables:
@@ -190,8 +204,8 @@ def _like(M: CSR | Dense, host: Any) -> CSR | Dense:
 class Lengths:
     """How long walks are: coefficients c_1 .. c_L, (L,) float64, and the chance `go_on` of one more step.
 
-    Walks score at every step; those `from_b`, which have a step before, from the row of b to where they
-    start, score where they end (eq. 26), one record a walk.
+    Walks score at every step; those `from_b`, which have a step before, from the row of b to where
+    they start, score where they end (eq. 26), one record a walk.
     """
 
     coefficients: np.ndarray
@@ -211,7 +225,9 @@ class Lengths:
         scored = np.cumprod(np.append(1.0, chances[:-1]))
         if self.from_b:
             scored = scored * (1.0 - chances)
-        return np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0), chances
+        return np.divide(
+            self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0
+        ), chances
 
     def steps(self) -> np.ndarray:
         """The steps of `kernels/walk.cl`, (L, 2) or (L + 1, 2) uint32."""
@@ -240,7 +256,9 @@ class Sums:
         """Of the mean, by the spread of samples; infinite of a single one, which tells nothing about it."""
         if self.samples < 2:
             return np.full_like(self.total, np.inf)
-        with np.errstate(invalid="ignore", over="ignore"):  # of scores whose squares are beyond float32
+        with np.errstate(
+            invalid="ignore", over="ignore"
+        ):  # of scores whose squares are beyond float32
             spread = np.maximum(self.squares - self.total**2 / self.samples, 0.0)
         return np.sqrt(np.nan_to_num(spread, nan=np.inf) / (self.samples * (self.samples - 1.0)))
 
@@ -257,7 +275,8 @@ class Walker:
     def rows(self, b: Array, pixels: np.ndarray, samples: int, stream: int = 0) -> Sums:
         """`samples` samples of each of the `pixels`, (P,); those of another stream are independent of them.
 
-        All right-hand sides b, (N,) or (N, k), share the walks; of three channels column j is of j % 3.
+        All right-hand sides b, (N,) or (N, k), share the walks; of three channels column j is of j
+        % 3.
         """
         tables, device, channels = self.tables, self.tables.device, self.tables.channels
         steps = device.upload(self.lengths.steps(), np.uint32)
@@ -273,7 +292,9 @@ class Walker:
                     out = device.empty((place.size * count, channels * width, 2))
                     numbers = (*bounds, self.seed, stream, b.columns, here.start)
                     arrays = (place, tables.records, tables.entries, tables.links, steps, b, out)
-                    self._launch("walk_rows", place.size * count, channels * width, *numbers, *arrays)
+                    self._launch(
+                        "walk_rows", place.size * count, channels * width, *numbers, *arrays
+                    )
                     partial = out.get().reshape(place.size, count, -1, 2).astype(np.float64)
                     # One chunk after the other, so that no split changes a bit.
                     partial = np.concatenate([sums[some, None, here], partial], axis=1)
@@ -295,14 +316,18 @@ class Walker:
             arrays = (source, tables.records, tables.entries, steps, ends, scores)
             self._launch("walk_columns", -(-count // CHUNK), 1, *numbers, *arrays)
             score = scores.get().astype(np.float64)
-            where = np.where(score == 0.0, 0, ends.get())  # a walk that died may stand in the row of b
+            where = np.where(
+                score == 0.0, 0, ends.get()
+            )  # a walk that died may stand in the row of b
             total += np.bincount(where, score, n)
             squares += np.bincount(where, score**2, n)
             self.watch()
         return Sums(samples, total, squares)
 
     def _walks(self) -> int:
-        steps = np.sum(self.lengths.go_on ** np.arange(len(self.lengths.coefficients)))  # of a walk, mean
+        steps = np.sum(
+            self.lengths.go_on ** np.arange(len(self.lengths.coefficients))
+        )  # of a walk, mean
         return int(_STEPS * self.tables.device.compute_units / steps)
 
     def _launch(self, name: str, units: int, width: int, *arguments: object) -> None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Orthonormal 2-D wavelets, periodized, of grids of any size (`kernels/wavelet.cl`).
 
-Coefficients stand as PyWavelets arranges them (`coeffs_to_array`); where all sides halve evenly they equal
-those of its ``wavedec2(..., mode="periodization")``. Where one does not, PyWavelets repeats the last sample;
-here it stands for fewer pixels than the others and passes by the filters into the approximation: as many
-coefficients as pixels, and one of a constant picture on every grid.
+Coefficients stand as PyWavelets arranges them (`coeffs_to_array`); where all sides halve evenly
+they equal those of its ``wavedec2(..., mode="periodization")``. Where one does not, PyWavelets
+repeats the last sample; here it stands for fewer pixels than the others and passes by the filters
+into the approximation: as many coefficients as pixels, and one of a constant picture on every grid.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ class Wavelet(Basis):
     ----------
     grid : (h, w), of any sides
     name : str
-        An orthonormal wavelet of PyWavelets, "haar", "db2" (the paper's), "sym8", ...; InputError for others.
+        An orthonormal wavelet of PyWavelets, "haar", "db2" (the paper's), "sym8", ...; InputError
+        for others.
     levels : int, how often the approximation is split; until one pixel is left when not given
 
     Examples
@@ -51,7 +52,8 @@ class Wavelet(Basis):
         most = (max(self.grid) - 1).bit_length()
         self.levels = most if levels is None else checks.count("levels", levels, least=0, most=most)
         self._large = sum(h * w > _SMALL for h, w in map(self._sides, range(self.levels)))
-        # Where the approximations of levels 1, 2, ... begin, a spare pixel between: wide loads reach there.
+        # Where the approximations of levels 1, 2, ... begin, a spare pixel between: wide loads
+        # reach there.
         pixels = [h * w + 1 for h, w in map(self._sides, range(1, self.levels + 1))]
         self._starts = device.upload(np.cumsum([0, *pixels]), np.int32)
         self._room = sum(pixels)
@@ -65,7 +67,9 @@ class Wavelet(Basis):
         h, w = self.grid
         return -(-h // 2**level), -(-w // 2**level)
 
-    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
         if self.levels == 0:
             vectors.axpby(a, x, b, y, out)
             return
@@ -76,7 +80,21 @@ class Wavelet(Basis):
         launches = [(level, level + 1) for level in range(self._large)]
         launches += [(self._large, levels)] if self._large < levels else []
         for first, last in reversed(launches) if transpose else launches:
-            arguments = (*self.grid, first, last, levels, k, a, b, self._starts, self._taps, x, near, y, out)
+            arguments = (
+                *self.grid,
+                first,
+                last,
+                levels,
+                k,
+                a,
+                b,
+                self._starts,
+                self._taps,
+                x,
+                near,
+                y,
+                out,
+            )
             if last <= self._large:
                 launch_grid(kernel, pieces, *self._sides(last), *arguments)
             else:
@@ -91,7 +109,9 @@ def filters(name: Any) -> np.ndarray:
     wavelet = _pywt.Wavelet(name)
     taps = np.array([wavelet.rec_lo, wavelet.rec_hi])
     length = taps.shape[1]
-    shifted = [taps[:, s:] @ taps[:, : length - s].T - np.eye(2) * (s == 0) for s in range(0, length, 2)]
+    shifted = [
+        taps[:, s:] @ taps[:, : length - s].T - np.eye(2) * (s == 0) for s in range(0, length, 2)
+    ]
     if not np.max(np.abs(shifted)) < 1e-7:  # that of dmey is 2e-3
         raise InputError(f"wavelet {name} is not orthonormal; it must be {offered}")
     return taps

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Plots: pictures under their names, how solves converge, and what an analysis says.
 
-Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all. Figures are
-drawn by Agg without pyplot, so nothing here needs a screen or touches global state. matplotlib is imported
-by the first plot, not with this module.
+Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all.
+Figures are drawn by Agg without pyplot, so nothing here needs a screen or touches global state.
+matplotlib is imported by the first plot, not with this module.
 """
 
 from __future__ import annotations

@@ -10,12 +10,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.analysis import Analysis
 from ltcl.errors import InputError
 from ltcl.images import resize, to_srgb
 from ltcl.images.pictures import as_picture
-from ltcl.plots.page import COLOURS, FAINT, GRID, INK, OTHERS, PAPER, axes_at, figure_of, heading, label_at
+from ltcl.plots.page import (
+    COLOURS,
+    FAINT,
+    GRID,
+    INK,
+    OTHERS,
+    PAPER,
+    axes_at,
+    figure_of,
+    heading,
+    label_at,
+)
 from ltcl.solvers import Solution
+from ltcl.tasks.analysis import Analysis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,11 +35,13 @@ if TYPE_CHECKING:
 _LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
 
 
-def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence") -> Figure:
+def convergence(
+    solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence"
+) -> Figure:
     """Relative residual of several solves of one system against the products they took.
 
-    Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level line.
-    InputError: there is nothing to draw, or rtol is outside (0, 1).
+    Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level
+    line. InputError: there is nothing to draw, or rtol is outside (0, 1).
 
     Examples
     --------
@@ -47,8 +60,8 @@ def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Co
 def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
 
-    Left the interval that holds rho(R), with the 1 beyond which the paper's series diverges; right the
-    products of each method, where there is a forecast. InputError: there is nothing to draw.
+    Left the interval that holds rho(R), with the 1 beyond which the paper's series diverges; right
+    the products of each method, where there is a forecast. InputError: there is nothing to draw.
 
     Examples
     --------
@@ -101,12 +114,14 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     return figure
 
 
-def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", width: int = 1000) -> Figure:
+def pictures(
+    *rows: Mapping[str, Any], title: str = "", subtitle: str = "", width: int = 1000
+) -> Figure:
     r"""Linear pictures in rows, each row as wide as the page, under their names.
 
-    A picture is (h, w) or (h, w, 3), cut off beyond 0 and 1; black is the page, as beside the walls of a
-    view. Small ones are enlarged, each pixel a square. A second line of a name is a note, in small letters.
-    InputError: there is no picture, or one has another shape.
+    A picture is (h, w) or (h, w, 3), cut off beyond 0 and 1; black is the page, as beside the walls
+    of a view. Small ones are enlarged, each pixel a square. A second line of a name is a note, in
+    small letters. InputError: there is no picture, or one has another shape.
 
     Examples
     --------
@@ -124,7 +139,9 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
     shown = [{name: as_picture(name, image) for name, image in row.items()} for row in rows]
     scale = max(width / 1000, 0.85)  # of text
     margin, gap, top, drawn = round(0.025 * width), round(0.016 * width), 20 * scale, []
-    top += 34 * scale * bool(title) + 24 * scale * (subtitle.count("\n") + bool(subtitle)) + 6 * scale
+    top += (
+        34 * scale * bool(title) + 24 * scale * (subtitle.count("\n") + bool(subtitle)) + 6 * scale
+    )
     for row in shown:
         side = (width - 2 * margin - (len(row) - 1) * gap) / len(row)
         size = scale * float(np.clip(side / 300, 0.8, 1.15))
@@ -135,7 +152,9 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
         top = max(box[1] + box[3] for *_, box in drawn) + 16 * scale
     figure = figure_of(width, math.ceil(top))
     heading(figure, margin, 18 * scale, title, 17 * scale)
-    label_at(figure, margin, (18 + 34 * bool(title)) * scale, subtitle, size=11 * scale, color=FAINT)
+    label_at(
+        figure, margin, (18 + 34 * bool(title)) * scale, subtitle, size=11 * scale, color=FAINT
+    )
     for name, image, size, line, box in drawn:
         label, _, note = name.partition("\n")
         heading(figure, box[0], line, label, 12 * size)
@@ -144,8 +163,12 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
     return figure
 
 
-def _draw_picture(figure: Figure, box: tuple[float, float, float, float], image: np.ndarray) -> None:
-    left, top, w, h = (max(round(side), 1) for side in box)  # whole pixels, which Agg does not resample
+def _draw_picture(
+    figure: Figure, box: tuple[float, float, float, float], image: np.ndarray
+) -> None:
+    left, top, w, h = (
+        max(round(side), 1) for side in box
+    )  # whole pixels, which Agg does not resample
     black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) > 0.999
     if times := w // image.shape[1]:  # enlarged to more than is drawn: squares with sharp edges
         image = image.repeat(times + 1, axis=0).repeat(times + 1, axis=1)
@@ -186,7 +209,11 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     axes.minorticks_off()
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     axes.legend(
-        loc="upper left", bbox_to_anchor=(1.0, 1.03), frameon=False, labelcolor="linecolor", fontsize=11
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.03),
+        frameon=False,
+        labelcolor="linecolor",
+        fontsize=11,
     )
 
 

@@ -44,7 +44,9 @@ def figure_of(width: int, height: int) -> Figure:
 def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:
     """Text whose top is `y` pixels below the top of the figure; sizes in points, 1.4 pixels each."""
     width, height = figure.get_size_inches() * DPI
-    figure.text(x / width, 1 - y / height, text, fontsize=size, **{"va": "top", "color": INK, **style})
+    figure.text(
+        x / width, 1 - y / height, text, fontsize=size, **{"va": "top", "color": INK, **style}
+    )
 
 
 def heading(figure: Figure, x: float, y: float, text: str, size: float) -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Synthetic scenes with their light transport, and a picture to show on them.
 
-`builders` makes a `scene` of `walls` and blocks, cut into `patches`. Form factors: exact in `exchange`,
-past blocks by `visibility` (`rays`), computed in each product in `form_factor`. Gloss: `ltcl.scenes.gloss`.
+`builders` makes a `scene` of `walls` and blocks, cut into `patches`. Form factors: exact in
+`exchange`, past blocks by `visibility` (`rays`), computed in each product in `form_factor`. Gloss:
+`ltcl.scenes.gloss`.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Scenes of walls: a box, two walls at an angle, three that meet in a point (figures 4, 5 and 9).
 
-A block in a box: F_ij = V_ij F'_ij, with F' of the empty room exact and V the share of rays between i and j
-that pass. Only pairs of room patches need rays: of the room a face of the block sees what is in front of its
-plane, and as the block is convex, nothing of it is in between. V is found with 256 rays a pair. In closed
-rooms rows sum to 1 within 0.5 % from 8 patches along a wall on, 1 % at 4. Where a row came to more, its
-entries are scaled down, each by the smaller factor of its two patches: no row makes light, and reciprocity
-stays exact. Patches under a block that stands on them are dark: no light reaches or leaves them, but what a
-projector throws there.
+A block in a box: F_ij = V_ij F'_ij, with F' of the empty room exact and V the share of rays between
+i and j that pass. Only pairs of room patches need rays: of the room a face of the block sees what
+is in front of its plane, and as the block is convex, nothing of it is in between. V is found with
+256 rays a pair. In closed rooms rows sum to 1 within 0.5 % from 8 patches along a wall on, 1 % at
+4. Where a row came to more, its entries are scaled down, each by the smaller factor of its two
+patches: no row makes light, and reciprocity stays exact. Patches under a block that stands on them
+are dark: no light reaches or leaves them, but what a projector throws there.
 """
 
 from __future__ import annotations
@@ -58,36 +58,39 @@ def box(
     n : int
         Patches along each side of a wall.
     sides : int
-        Walls present, 1 to 6: left, right, floor, ceiling, near right (faces left), near left. Three make a
-        room corner, five an open box, six a closed one. One wall alone has no interreflection (A = 0).
+        Walls present, 1 to 6: left, right, floor, ceiling, near right (faces left), near left.
+        Three make a room corner, five an open box, six a closed one. One wall alone has no
+        interreflection (A = 0).
     albedo : array_like in [0, 1)
         A scalar; (sides,), one per wall; (3,), one colour; (sides, 3), one colour per wall. With
         three sides, three numbers could mean both and are refused: write (3, 1) or (1, 3).
     occluder : Block, optional
-        An opaque block inside the cube, which it may touch. It casts shadows; if it has an albedo, its faces
-        are part of the picture, except those that lie in a wall.
+        An opaque block inside the cube, which it may touch. It casts shadows; if it has an albedo,
+        its faces are part of the picture, except those that lie in a wall.
     device : Device or str, optional
-        What traces rays past the occluder; the best one if omitted. Without an occluder none is opened.
+        What traces rays past the occluder; the best one if omitted. Without an occluder none is
+        opened.
 
     Returns
     -------
     Scene
-        Grid (n, sides * n), walls side by side in the order above, then the faces of the occluder in the
-        order of `Block.faces`, n x n patches each. The floor's left edge meets the
-        left wall and its top edge the right one; the ceiling's are the other way round.
+        Grid (n, sides * n), walls side by side in the order above, then the faces of the occluder
+        in the order of `Block.faces`, n x n patches each. The floor's left edge meets the left wall
+        and its top edge the right one; the ceiling's are the other way round.
 
     Raises
     ------
     InputError
-        If n or sides or albedo is out of range, or albedo has another shape, or the occluder reaches out of
-        the cube.
+        If n or sides or albedo is out of range, or albedo has another shape, or the occluder
+        reaches out of the cube.
     MemoryLimitError
-        If form factors and transport would not fit in the memory of the host; nothing is allocated then.
+        If form factors and transport would not fit in the memory of the host; nothing is allocated
+        then.
 
     Notes
     -----
-    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.exchange`; past an occluder they are
-    sampled.
+    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.exchange`; past an occluder
+    they are sampled.
 
     Examples
     --------
@@ -119,20 +122,22 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (2,), one per wall; (3,), one colour; (2, 3), one colour per wall.
     angle : float
-        Between the walls, in degrees, above 0 and below 180. The smaller, the more light stays inside.
+        Between the walls, in degrees, above 0 and below 180. The smaller, the more light stays
+        inside.
 
     Returns
     -------
     Scene
-        Grid (n, 2n): the left half is the left wall, the right half the right one, and the seam runs
-        down the middle, as a viewer who faces the corner sees it unfolded.
+        Grid (n, 2n): the left half is the left wall, the right half the right one, and the seam
+        runs down the middle, as a viewer who faces the corner sees it unfolded.
 
     Raises
     ------
     InputError
         If n, albedo or angle is out of range, or albedo has another shape.
     MemoryLimitError
-        If form factors and transport would not fit in the memory of the host; nothing is allocated then.
+        If form factors and transport would not fit in the memory of the host; nothing is allocated
+        then.
 
     Notes
     -----
@@ -150,7 +155,8 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     viewer = Viewer(eye=(2.2, 2.2, 0.5), target=(0, 0, 0.5))
     if angle == 90:
         return _assemble("dihedral", WALLS[:2], n, albedo, viewer)
-    # Both walls are turned about the z axis, away from the viewer's line of sight by the same angle.
+    # Both walls are turned about the z axis, away from the viewer's line of sight by the same
+    # angle.
     x, y = math.cos(math.radians(45 - angle / 2)), math.sin(math.radians(45 - angle / 2))
     walls = (
         Wall("left", corner=(x, y, 1), right=(-x, -y, 0), down=(0, 0, -1)),
@@ -169,8 +175,8 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (1, 3), one colour; (3, 1), one per wall; (3, 3), one colour per wall.
     angle : float
-        Between any two of the three edges, in degrees, above 0 and below 120. 90 gives the corner of a cube,
-        120 would be a flat hexagon, and towards 0 it becomes a narrow tube.
+        Between any two of the three edges, in degrees, above 0 and below 120. 90 gives the corner
+        of a cube, 120 would be a flat hexagon, and towards 0 it becomes a narrow tube.
 
     Returns
     -------
@@ -233,7 +239,9 @@ def _assemble(
         of_block = np.atleast_1d(np.asarray(occluder.albedo, np.float64))
         channels = max(len(patches), len(of_block))
         both = (of_walls, len(walls)), (of_block, len(faces))
-        colours = np.concatenate([np.broadcast_to(colour, (count, channels)) for colour, count in both])
+        colours = np.concatenate(
+            [np.broadcast_to(colour, (count, channels)) for colour, count in both]
+        )
         patches = spread_albedo(colours, len(every), n)
     areas = np.tile(np.repeat([wall.area / n**2 for wall in every], n), n)
     blocks = () if occluder is None else (occluder,)
@@ -251,12 +259,18 @@ def _lit_faces(block: Block) -> tuple[Wall, ...]:
     if low.max() < _TOUCH and high.min() > 1 - _TOUCH:
         raise InputError("occluder fills the room; it must leave some of it free")
     faces = () if block.albedo is None else block.faces()
-    free = np.concatenate([1 - high, low])[[0, 3, 1, 4, 2, 5]] >= _TOUCH  # in the order of `Block.faces`
+    free = (
+        np.concatenate([1 - high, low])[[0, 3, 1, 4, 2, 5]] >= _TOUCH
+    )  # in the order of `Block.faces`
     return tuple(face for face, lit in zip(faces, free, strict=False) if lit)
 
 
 def _past_block(
-    walls: tuple[Wall, ...], faces: tuple[Wall, ...], block: Block, n: int, device: Device | str | None
+    walls: tuple[Wall, ...],
+    faces: tuple[Wall, ...],
+    block: Block,
+    n: int,
+    device: Device | str | None,
 ) -> np.ndarray:
     """Form factors (N, N) of a room and of the lit faces of a block in it, walls before faces."""
     every, room = (*walls, *faces), len(walls)

@@ -2,19 +2,22 @@
 """Exact form factors between flat patches at any angle and distance, without occlusion.
 
     a_i F_ij = int_i int_j  cos(t_i) cos(t_j) / (pi r^2)  da_j da_i
-             = 1 / (2 pi)  sum over the edges p of i, q of j:  (p . q)  int int ln r  ds dt,   0 < s, t < 1
+             = 1 / (2 pi)  sum over the edges p of i, q of j:  (p . q)  int int ln r  ds dt,   0 <
+             s, t < 1
 
-(the second line by Stokes' theorem; p and q run around the fronts). Pairs farther apart than they are large
-take Gauss-Legendre points on both patches: the kernel is smooth there and every term positive. Nearer pairs,
-and those where the plane of one patch cuts the other, take the integral over both outlines, of what lies in
-front: along q it has a closed form, and along p it is smooth but for logarithms where p passes the ends of q
-and where both lines come closest, so p is cut there and Gauss points crowd towards the ends of each piece.
-Far patches would lose digits so, a factor (distance / side)^2 to ^4, as the sum cancels.
+(the second line by Stokes' theorem; p and q run around the fronts). Pairs farther apart than they
+are large take Gauss-Legendre points on both patches: the kernel is smooth there and every term
+positive. Nearer pairs, and those where the plane of one patch cuts the other, take the integral
+over both outlines, of what lies in front: along q it has a closed form, and along p it is smooth
+but for logarithms where p passes the ends of q and where both lines come closest, so p is cut there
+and Gauss points crowd towards the ends of each piece. Far patches would lose digits so, a factor
+(distance / side)^2 to ^4, as the sum cancels.
 
-Tests hold all of it to 1e-9 of the closed forms at right angles, for patches that touch along an edge, at a
-corner or nearly as well, and closed rooms of slanted walls to rows that sum to 1.
+Tests hold all of it to 1e-9 of the closed forms at right angles, for patches that touch along an
+edge, at a corner or nearly as well, and closed rooms of slanted walls to rows that sum to 1.
 
-Source: Sparrow, "A new and simpler formulation for radiative angle factors", J. Heat Transfer 85, 1963.
+Source: Sparrow, "A new and simpler formulation for radiative angle factors", J. Heat Transfer 85,
+1963.
 """
 
 from __future__ import annotations
@@ -35,20 +38,24 @@ _TIERS = ((20.0, 3), (7.0, 4), (4.0, 5), (3.0, 6), (2.0, 8))
 _TOUCHING, _APART = 40, 16  # points on each piece of an edge: nearer than all tiers, and farther
 _FLAT = 1e-12  # of the patches' size: heights above a plane that are rounding errors
 _SLAB = 4096  # pairs of patches at a time, so that temporary arrays stay in the cache
-_TURNS = {  # where (down, right) of a picture lie after quarter turns, and mirrored: order and signs
+# where (down, right) of a picture lie after quarter turns, and mirrored: order and signs
+_TURNS = {
     (turn, mirror): (order[::step], sign[::step])
     for turn, (order, sign) in enumerate(
         (((0, 1), (1, 1)), ((1, 0), (1, -1)), ((0, 1), (-1, -1)), ((1, 0), (-1, 1)))
     )
     for mirror, step in ((False, 1), (True, -1))
 }
-_AROUND = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2  # corners of a patch, in edges (down, right)
+_AROUND = (
+    np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
+)  # corners of a patch, in edges (down, right)
 
 
 def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
     """Form factors of all patches of walls, (N, N) float64, N = n * n * len(walls), without occlusion.
 
-    None of the walls may cut through another. MemoryLimitError: the host has no room for the matrix.
+    None of the walls may cut through another. MemoryLimitError: the host has no room for the
+    matrix.
 
     >>> from ltcl.scenes.builders import WALLS
     >>> bool(np.allclose(form_factors(WALLS, 2).sum(axis=1), 1))  # a closed room loses no light
@@ -71,7 +78,9 @@ def fill(matrix: np.ndarray, walls: Sequence[Wall], pairs: Iterable[tuple[int, i
         if key not in known:
             both = np.rot90(of_walls(walls[i], walls[j], n), -turn, axes=(0, 1))
             known[key] = np.rot90(both, -other_turn, axes=(2, 3)).transpose(axes)
-        both = np.rot90(np.rot90(known[key].transpose(axes), turn, axes=(0, 1)), other_turn, axes=(2, 3))
+        both = np.rot90(
+            np.rot90(known[key].transpose(axes), turn, axes=(0, 1)), other_turn, axes=(2, 3)
+        )
         matrix[:, i, :, :, j, :] = both * (n**2 / walls[i].area)
         matrix[:, j, :, :, i, :] = both.transpose(2, 3, 0, 1) * (n**2 / walls[j].area)
 
@@ -79,11 +88,14 @@ def fill(matrix: np.ndarray, walls: Sequence[Wall], pairs: Iterable[tuple[int, i
 def _congruent(first: Wall, second: Wall) -> tuple[bytes, int, int, bool]:
     """What congruent pairs of walls have in common, and the turns of their pictures that make it so.
 
-    That is the lengths and angles of edges (down, right), normals, and the way from middle to middle, of all
-    quarter turns of both pictures the first in order. Mirror images have rows for columns.
+    That is the lengths and angles of edges (down, right), normals, and the way from middle to
+    middle, of all quarter turns of both pictures the first in order. Mirror images have rows for
+    columns.
     """
     edges = [np.array([wall.down, wall.right], np.float64) for wall in (first, second)]
-    offset = np.subtract(second.corner, first.corner) + (edges[1].sum(axis=0) - edges[0].sum(axis=0)) / 2
+    offset = (
+        np.subtract(second.corner, first.corner) + (edges[1].sum(axis=0) - edges[0].sum(axis=0)) / 2
+    )
     vectors = np.array([*edges[0], first.normal, *edges[1], second.normal, offset])
     vectors[[0, 1, 3, 4, 6]] /= np.linalg.norm(edges[0][0])
     gram = (vectors @ vectors.T).round(9)
@@ -100,22 +112,28 @@ def _congruent(first: Wall, second: Wall) -> tuple[bytes, int, int, bool]:
 def of_walls(first: Wall, second: Wall, n: int) -> np.ndarray:
     """a_i F_ij between the patches of two walls, (n, n, n, n) float64: rows, columns of both.
 
-    It depends on the offset of the patches alone, so each offset is computed once: about 2 n^3 for walls that
-    share an edge, 4 n^2 for walls that face each other.
+    It depends on the offset of the patches alone, so each offset is computed once: about 2 n^3 for
+    walls that share an edge, 4 n^2 for walls that face each other.
     """
-    edges, others = (np.stack([wall.down, wall.right]).astype(np.float64) / n for wall in (first, second))
+    edges, others = (
+        np.stack([wall.down, wall.right]).astype(np.float64) / n for wall in (first, second)
+    )
     index = np.ogrid[:n, :n, :n, :n]
     steps, counts, free = [], [], {0, 1, 2, 3}
     for i, j, sign in itertools.product((0, 1), (2, 3), (1, -1)):
         tolerance = _FLAT * np.linalg.norm(edges[i])
         alike = np.allclose(edges[i], sign * others[j - 2], rtol=0, atol=tolerance)
-        if alike and {i, j} <= free:  # only the difference of the counts along a shared edge matters
+        if (
+            alike and {i, j} <= free
+        ):  # only the difference of the counts along a shared edge matters
             free -= {i, j}
             steps.append(others[j - 2])
             counts.append(index[j] - sign * index[i])
     steps += [others[k - 2] if k > 1 else -edges[k] for k in sorted(free)]
     counts += [index[k] for k in sorted(free)]
-    ranges = np.meshgrid(*(np.arange(count.min(), count.max() + 1) for count in counts), indexing="ij")
+    ranges = np.meshgrid(
+        *(np.arange(count.min(), count.max() + 1) for count in counts), indexing="ij"
+    )
     start = np.subtract(second.corner, first.corner) + (others.sum(axis=0) - edges.sum(axis=0)) / 2
     offsets = start + np.stack(ranges, axis=-1) @ np.array(steps)
     table = exchange(edges, others, offsets.reshape(-1, 3)).reshape(offsets.shape[:-1])
@@ -139,7 +157,8 @@ def of_pairs(patches: Patches, i: np.ndarray, j: np.ndarray) -> np.ndarray:
 def exchange(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """a_i F_ij of pairs of patches whose centres are `offset` (P, 3) apart, (P,).
 
-    The edges (down, right) are those of all pairs, (2, 3), or of each, (P, 2, 3): these take outlines only.
+    The edges (down, right) are those of all pairs, (2, 3), or of each, (P, 2, 3): these take
+    outlines only.
     """
     result = np.empty(len(offset))
     for start in range(0, len(offset), _SLAB):
@@ -178,11 +197,15 @@ def _slab(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.ndarr
             opposite = _outline(second[some], offset[some]) / scale
             if clipped:
                 outline, opposite = _clip(outline, under[some]), _clip(opposite, over[some])
-            result[some] = _stokes(outline, opposite, _TOUCHING if near else _APART) * unit[some] ** 2
+            result[some] = (
+                _stokes(outline, opposite, _TOUCHING if near else _APART) * unit[some] ** 2
+            )
     return result
 
 
-def _quadrature(first: np.ndarray, second: np.ndarray, offset: np.ndarray, points: int) -> np.ndarray:
+def _quadrature(
+    first: np.ndarray, second: np.ndarray, offset: np.ndarray, points: int
+) -> np.ndarray:
     """By points x points Gauss-Legendre points on each patch."""
     node, weight = np.polynomial.legendre.leggauss(points)
     place = np.stack(np.meshgrid(node, node, indexing="ij"), axis=-1).reshape(-1, 2) / 2
@@ -191,7 +214,8 @@ def _quadrature(first: np.ndarray, second: np.ndarray, offset: np.ndarray, point
     between = (there[None, :] - here[:, None]).reshape(-1, 3)
     normal, other = _normal(first), _normal(second)
     areas = [np.linalg.norm(np.cross(*edges)) for edges in (first, second)]
-    # The height of a point over the first plane is that of its patch's centre and its own from there.
+    # The height of a point over the first plane is that of its patch's centre and its own from
+    # there.
     moments = np.stack([weights, weights * (there @ normal)], axis=1)
     result = np.empty(len(offset))
     step = max(1, (1 << 16) // len(between))
@@ -273,13 +297,17 @@ def _outline(edges: np.ndarray, centre: np.ndarray) -> np.ndarray:
 def _clip(outlines: np.ndarray, height: np.ndarray) -> np.ndarray:
     """The part in front of a plane of outlines (P, E, 2, 3) whose starts are `height` (P, E) above it.
 
-    (P, E + 1, 2, 3): the same edges, shortened, to nothing where they lie behind, and one more along the cut.
+    (P, E + 1, 2, 3): the same edges, shortened, to nothing where they lie behind, and one more
+    along the cut.
     """
     after = np.roll(height, -1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         cut = np.clip(np.nan_to_num(height / (height - after)), 0, 1)
     hidden = (height < 0) & (after < 0)
-    first, last = np.where((height < 0) & ~hidden, cut, 0), np.where(hidden, 0, np.where(after < 0, cut, 1))
+    first, last = (
+        np.where((height < 0) & ~hidden, cut, 0),
+        np.where(hidden, 0, np.where(after < 0, cut, 1)),
+    )
     starts = outlines[:, :, 0] + first[..., None] * outlines[:, :, 1]
     edges = (last - first)[..., None] * outlines[:, :, 1]
     # The outline leaves the front along one edge at most; what closes it starts there.

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Form factors as an operator that stores no matrix: A = diag(albedo) F for scenes of 100 000 patches.
 
-Every product computes all N^2 form factors anew, by `kernels/form_factor.cl`: about 20 operations each, no
-memory traffic to speak of, 52 bytes a patch stored. Distant pairs are taken at their centres, nearer ones
-with the curvature between them, still nearer ones at eight pairs of points. Within `_NEAR` sizes that is not
-good enough: there the exact form factors come from the host, and what they differ from the kernel's is added
-as a sparse matrix.
+Every product computes all N^2 form factors anew, by `kernels/form_factor.cl`: about 20 operations
+each, no memory traffic to speak of, 52 bytes a patch stored. Distant pairs are taken at their
+centres, nearer ones with the curvature between them, still nearer ones at eight pairs of points.
+Within `_NEAR` sizes that is not good enough: there the exact form factors come from the host, and
+what they differ from the kernel's is added as a sparse matrix.
 
-Measured on boxes of 6 to 131424 patches, and walls at 30, 70 and 130 degrees: for smooth x, F x is within
-1e-4 of its largest value (row sums of the largest box: 6e-5), and F within 1e-4 in the 2-norm; a single
-entry may be off by 2 %. With blocks, light is blocked or not at the same pairs of points (36 between near
-patches, 1 or 8 between others), which adds the error of so few rays at the borders of shadows: an entry with
-a border in it may be off by half of itself. Against the host's matrices of rooms with a block, on the patch
-grid or off it, F was within 1.2 % in the Frobenius norm, and row sums at most 1.02 and within 0.05 of
-theirs, the most where a block covers half of a patch.
+Measured on boxes of 6 to 131424 patches, and walls at 30, 70 and 130 degrees: for smooth x, F x is
+within 1e-4 of its largest value (row sums of the largest box: 6e-5), and F within 1e-4 in the
+2-norm; a single entry may be off by 2 %. With blocks, light is blocked or not at the same pairs of
+points (36 between near patches, 1 or 8 between others), which adds the error of so few rays at the
+borders of shadows: an entry with a border in it may be off by half of itself. Against the host's
+matrices of rooms with a block, on the patch grid or off it, F was within 1.2 % in the Frobenius
+norm, and row sums at most 1.02 and within 0.05 of theirs, the most where a block covers half of a
+patch.
 """
 
 from __future__ import annotations
@@ -30,7 +31,16 @@ from ltcl.errors import InputError
 from ltcl.operators import CSR, Operator
 from ltcl.operators.base import Epilogue, widths
 from ltcl.scenes import exchange
-from ltcl.scenes.patches import Patches, check_blocks, check_patches, cut, lanes, padded, scaled, squared_size
+from ltcl.scenes.patches import (
+    Patches,
+    check_blocks,
+    check_patches,
+    cut,
+    lanes,
+    padded,
+    scaled,
+    squared_size,
+)
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import check_albedo
@@ -65,7 +75,8 @@ class FormFactor(Operator):
     Raises
     ------
     InputError
-        If a patch has no area or a box no volume, an albedo is outside [0, 1), or a value is not finite.
+        If a patch has no area or a box no volume, an albedo is outside [0, 1), or a value is not
+        finite.
 
     Examples
     --------
@@ -94,12 +105,16 @@ class FormFactor(Operator):
             value = checks.finite("albedo", checks.real("albedo", albedo)).astype(np.float64)
             check_albedo(checks.shape("albedo", value, (), (count,)))
             shares = np.broadcast_to(value, (count,))
-        super().__init__(device if isinstance(device, Device) else open_device(device), (count, count))
+        super().__init__(
+            device if isinstance(device, Device) else open_device(device), (count, count)
+        )
         self.device.require(60 * count, f"the geometry of {count} patches")
         self.error = _ERROR * float(shares.max())
         placed, self._blocks = scaled(self.device, patches, blocks)
         vectors = (placed.centre, placed.right, placed.down, placed.normal)
-        rows = np.concatenate([*(vector.T for vector in vectors), squared_size(placed)[None]])  # (13, N)
+        rows = np.concatenate(
+            [*(vector.T for vector in vectors), squared_size(placed)[None]]
+        )  # (13, N)
         self._geometry = padded(self.device, rows)
         self._defines = {"LANES": lanes(self.device), "BLOCKS": len(blocks)}
         self._albedo, self._area = self.device.upload(shares), self.device.upload(placed.area)
@@ -144,12 +159,23 @@ class FormFactor(Operator):
         for offset, width in widths(x.columns):
             packed = {"PACKED": 1} if width == x.columns else {}
             weigh, matvec = (
-                self.device.kernel("form_factor", f"form_factor_{name}", K=width, **packed, **self._defines)
+                self.device.kernel(
+                    "form_factor", f"form_factor_{name}", K=width, **packed, **self._defines
+                )
                 for name in ("weigh", "matvec")
             )
             z = self.device.empty((width, pitch))
             weigh(pitch, 64, count, pitch, x.columns, offset, right, x, z)
-            vectors = (x, out if y is None else y, out, pitch, self._geometry, self._blocks, left, z)
+            vectors = (
+                x,
+                out if y is None else y,
+                out,
+                pitch,
+                self._geometry,
+                self._blocks,
+                left,
+                z,
+            )
             for first in range(0, count, rows):
                 size = min(rows, count - first)
                 place = (size, first, x.columns, offset, scale, b, c)
@@ -172,13 +198,24 @@ class FormFactor(Operator):
 
     def _kernel_pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """The kernel's own value per area of listed pairs, (P,) float64."""
-        kernel = self.device.kernel("form_factor", "form_factor_pairs", K=1, PACKED=1, **self._defines)
+        kernel = self.device.kernel(
+            "form_factor", "form_factor_pairs", K=1, PACKED=1, **self._defines
+        )
         most = max(1, _LAUNCH // (64 * (1 + self._defines["BLOCKS"])))
         parts = [np.zeros(0)]
         for start in range(0, len(i), most):
             ends = [self.device.upload(end[start : start + most], np.int32) for end in (i, j)]
             out = self.device.empty(ends[0].shape)
-            kernel(out.size, 64, out.size, self._geometry.shape[1], *ends, self._geometry, self._blocks, out)
+            kernel(
+                out.size,
+                64,
+                out.size,
+                self._geometry.shape[1],
+                *ends,
+                self._geometry,
+                self._blocks,
+                out,
+            )
             parts.append(out.get().astype(np.float64))
         return np.concatenate(parts)
 
@@ -191,9 +228,13 @@ def _near_pairs(patches: Patches) -> tuple[np.ndarray, np.ndarray]:
     i, j = np.sort(pairs, axis=1).T if len(pairs) else np.zeros((2, 0), int)
     offset = patches.centre[j] - patches.centre[i]
     close = np.square(offset).sum(axis=1) < _NEAR**2 * (squared[i] + squared[j])
-    for plane, other, sign in ((i, j, 1), (j, i, -1)):  # does any point of the other rise above the plane?
+    for plane, other, sign in (
+        (i, j, 1),
+        (j, i, -1),
+    ):  # does any point of the other rise above the plane?
         rise = sum(
-            np.abs((edge[other] * normal[plane]).sum(axis=1)) for edge in (patches.right, patches.down)
+            np.abs((edge[other] * normal[plane]).sum(axis=1))
+            for edge in (patches.right, patches.down)
         )
         height = sign * (offset * normal[plane]).sum(axis=1) + rise / 2
         close &= height > 1e-6 * np.sqrt(squared[other])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A picture to show on walls: sunset over mountains and a lake, painted by a program of this project.
 
-It asks much of a projector on purpose: saturated blues and oranges, whites, deep blacks and fine detail.
+It asks much of a projector on purpose: saturated blues and oranges, whites, deep blacks and fine
+detail.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ def landscape(h: int, w: int) -> np.ndarray:
     Parameters
     ----------
     h, w : int
-        Pixels, up to 32766 each. The stored picture has 640 x 1024; of other shapes it is cut around the sun.
+        Pixels, up to 32766 each. The stored picture has 640 x 1024; of other shapes it is cut
+        around the sun.
 
     Returns
     -------

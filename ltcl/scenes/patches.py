@@ -2,9 +2,9 @@
 """Walls cut into flat patches: the geometry that form factors, rays and visibility are computed from.
 
 A picture on the walls has grid (n, walls * n), row-major: patch (r, c) of wall w is number
-r * walls * n + w * n + c. Kernels compute in float32, so for them lengths are counted from the middle of the
-scene in parts of its size, and boxes are shrunk by a hair: light that leaves a face of a box, or runs along
-it, is not blocked by that very box.
+r * walls * n + w * n + c. Kernels compute in float32, so for them lengths are counted from the
+middle of the scene in parts of its size, and boxes are shrunk by a hair: light that leaves a face
+of a box, or runs along it, is not blocked by that very box.
 """
 
 from __future__ import annotations
@@ -75,7 +75,9 @@ def cut(walls: Sequence[Wall], n: int) -> Patches:
     if not walls:
         raise InputError("walls is empty; there must be at least one wall to cut")
     place = (np.arange(n) + 0.5) / n
-    centre = np.stack([wall.points(place, place[:, None]) for wall in walls], axis=1)  # (n, walls, n, 3)
+    centre = np.stack(
+        [wall.points(place, place[:, None]) for wall in walls], axis=1
+    )  # (n, walls, n, 3)
     edges = (
         np.broadcast_to(
             np.array([getattr(wall, name) for wall in walls], np.float64)[:, None] / n, centre.shape
@@ -104,7 +106,9 @@ def check_patches(patches: Any) -> Patches:
         checks.finite(f"patches.{name}", checks.shape(f"patches.{name}", value, (count, 3)))
     flat = np.flatnonzero(patches.area == 0)
     if len(flat):
-        raise InputError(f"patches has {len(flat)} without area, the first at {flat[0]}; edges must span one")
+        raise InputError(
+            f"patches has {len(flat)} without area, the first at {flat[0]}; edges must span one"
+        )
     return patches
 
 
@@ -116,7 +120,9 @@ def check_blocks(blocks: Any) -> np.ndarray:
     if value.size == 0:
         return np.zeros((0, 2, 3))
     if value.ndim != 3 or value.shape[1:] != (2, 3):
-        raise InputError(f"blocks has shape {value.shape}; it must be (B, 2, 3), two corners of each box")
+        raise InputError(
+            f"blocks has shape {value.shape}; it must be (B, 2, 3), two corners of each box"
+        )
     bad = np.flatnonzero((value[:, 0] >= value[:, 1]).any(axis=1))
     if len(bad):
         low, high = value[bad[0]]

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What rays meet first, and what a point sees of patches: walls with a front, and opaque black blocks.
 
-Walls stop light from both sides; from behind they are black, as blocks are from everywhere. With o + t d
-on the plane of a wall at o + t d = corner + u right + v down, the wall is met where u and v are in [0, 1].
-All rays are tried against all walls, which suits rooms of a few walls and millions of rays.
+Walls stop light from both sides; from behind they are black, as blocks are from everywhere. With o
++ t d on the plane of a wall at o + t d = corner + u right + v down, the wall is met where u and v
+are in [0, 1]. All rays are tried against all walls, which suits rooms of a few walls and millions
+of rays.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ _NEAR = 1e-6  # of a wall's side: a projector or camera this near lies on the wa
 class Hits:
     """What rays met first, one entry per ray.
 
-    `wall` is the number of the wall whose front was met; -1 where that was nothing, a block, or a wall's
-    back. `u`, `v` say where on it, in [0, 1] along its right and down edges, or 0. `distance` counts lengths
-    of the ray's direction; it is infinite where nothing was met.
+    `wall` is the number of the wall whose front was met; -1 where that was nothing, a block, or a
+    wall's back. `u`, `v` say where on it, in [0, 1] along its right and down edges, or 0.
+    `distance` counts lengths of the ray's direction; it is infinite where nothing was met.
     """
 
     wall: np.ndarray
@@ -42,10 +43,13 @@ class Hits:
     distance: np.ndarray
 
 
-def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blocks: Any = ()) -> Hits:
+def cast(
+    walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blocks: Any = ()
+) -> Hits:
     """Follow rays, origins and directions (R, 3), to the nearest wall or block.
 
-    Blocks (B, 2, 3) are opaque boxes along the axes, lowest and highest corner; walls on their faces reflect.
+    Blocks (B, 2, 3) are opaque boxes along the axes, lowest and highest corner; walls on their
+    faces reflect.
 
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
     >>> start, down = np.array([[0.25, 0.5, 2.0]]), np.array([[0.0, 0.0, -1.0]])
@@ -64,7 +68,9 @@ def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blo
     return hits
 
 
-def clear(walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks: Any = ()) -> np.ndarray:
+def clear(
+    walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks: Any = ()
+) -> np.ndarray:
     """Whether nothing stands between points (R, 3) and a place (3,), or a place (R, 3) each; (R,) bool.
 
     Walls, from either side, and blocks are as in `cast`. The points and the place may lie on them.
@@ -80,15 +86,18 @@ def clear(walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks:
 class Sight:
     """What a point sees of patches.
 
-    `towards` (N, 3) are unit vectors from the middle of each patch to the point, in the patch's frame;
-    `share` (N,) is the part of each patch that the point sees, of a lattice of 16 places, 0 from behind.
+    `towards` (N, 3) are unit vectors from the middle of each patch to the point, in the patch's
+    frame; `share` (N,) is the part of each patch that the point sees, of a lattice of 16 places, 0
+    from behind.
     """
 
     towards: np.ndarray
     share: np.ndarray
 
 
-def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks: Any = ()) -> Sight:
+def sight(
+    name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks: Any = ()
+) -> Sight:
     """What a projector or camera that stands at `stand` (3,) sees of the patches of walls.
 
     InputError: it is no place, lies on a wall or in a block, or sees no patch from its front.
@@ -108,7 +117,9 @@ def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks
     if any(((place >= low) & (place <= high)).all() for low, high in boxes):
         raise InputError(f"{here}, in a block; it must stand outside")
     towards = place - patches.centre
-    towards = np.einsum("nij,nj->ni", patches.frames, towards / np.linalg.norm(towards, axis=1)[:, None])
+    towards = np.einsum(
+        "nij,nj->ni", patches.frames, towards / np.linalg.norm(towards, axis=1)[:, None]
+    )
     step = (np.arange(_SIGHT_POINTS) + 0.5) / _SIGHT_POINTS - 0.5
     v, u = (coordinate.ravel()[:, None] for coordinate in np.meshgrid(step, step, indexing="ij"))
     origins = patches.centre[:, None] + u * patches.right[:, None] + v * patches.down[:, None]
@@ -122,7 +133,9 @@ def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks
     return Sight(towards, share)
 
 
-def _meet_wall(hits: Hits, number: int, wall: Wall, origins: np.ndarray, directions: np.ndarray) -> None:
+def _meet_wall(
+    hits: Hits, number: int, wall: Wall, origins: np.ndarray, directions: np.ndarray
+) -> None:
     """Enter the rays that meet this wall before all that was met so far."""
     start, step = (
         wall.coordinates(origins - wall.corner),

@@ -22,7 +22,7 @@ from ltcl.scenes import viewer as viewing
 from ltcl.scenes.rays import clear
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Block, Wall, check_albedo, point, refuse_crossing
-from ltcl.transport import Transport
+from ltcl.transport.transport import Transport
 
 _BLOCK = 512  # rows and columns touched at a time where a matrix meets its transpose
 _LIGHT_POINTS = 8  # along a patch
@@ -40,7 +40,8 @@ class Scene:
     grid : (h, w)
         The patches as a picture, row-major; N = h * w. The walls lie side by side in it.
     form_factors : ndarray, (N, N), float64
-        Entry [i, j]: share of the light leaving patch i that meets patch j. Stored once for all colours.
+        Entry [i, j]: share of the light leaving patch i that meets patch j. Stored once for all
+        colours.
     albedo : ndarray, (channels, N), float64
         Share of the light a patch gives back, in [0, 1); one channel or three.
     area : ndarray, (N,), float64
@@ -50,13 +51,15 @@ class Scene:
     viewer : Viewer
         Who looks in `view` and `sample`.
     blocks : tuple of Block
-        What hides walls from the viewer and from lights; the form factors must know of them already.
+        What hides walls from the viewer and from lights; the form factors must know of them
+        already.
 
     Raises
     ------
     InputError
-        If shapes disagree, a value is NaN, infinite or negative, an albedo is not below 1, rows of the
-        form factors sum to more than 1, they break reciprocity, walls cross, or the viewer sees no wall.
+        If shapes disagree, a value is NaN, infinite or negative, an albedo is not below 1, rows of
+        the form factors sum to more than 1, they break reciprocity, walls cross, or the viewer sees
+        no wall.
 
     Examples
     --------
@@ -81,9 +84,15 @@ class Scene:
         if not self.walls:
             raise InputError("walls are 0; a scene needs at least one")
         if w % len(self.walls):
-            raise InputError(f"walls are {len(self.walls)}; they must divide the {w} columns of the grid")
+            raise InputError(
+                f"walls are {len(self.walls)}; they must divide the {w} columns of the grid"
+            )
         n = h * w
-        for name, shapes in {"form_factors": [(n, n)], "albedo": [(1, n), (3, n)], "area": [(n,)]}.items():
+        for name, shapes in {
+            "form_factors": [(n, n)],
+            "albedo": [(1, n), (3, n)],
+            "area": [(n,)],
+        }.items():
             value = checks.real(name, getattr(self, name)).astype(np.float64, copy=False)
             # A view, so that the caller's own array stays writeable.
             value = checks.finite(name, checks.shape(name, value, *shapes)).view()
@@ -155,8 +164,8 @@ class Scene:
         device : Device or str, optional
             The device that `Transport` computes on; the best one if omitted.
         on_dark : "mask" or "raise"
-            What `Transport` does about patches of albedo 0, or hidden from the camera or projector of a
-            glossy scene: never light them, or refuse.
+            What `Transport` does about patches of albedo 0, or hidden from the camera or projector
+            of a glossy scene: never light them, or refuse.
 
         Examples
         --------
@@ -166,7 +175,9 @@ class Scene:
         """
         matrices = self.matrices()
         matrix = matrices[0] if self.channels == 1 else matrices
-        return Transport(matrix, grid=self.grid, first_bounce=first_bounce, device=device, on_dark=on_dark)
+        return Transport(
+            matrix, grid=self.grid, first_bounce=first_bounce, device=device, on_dark=on_dark
+        )
 
     def picture(self, patches: Any) -> np.ndarray:
         """Values per patch, (N,) or (3, N), as a picture on the grid, (h, w) or (h, w, 3).
@@ -180,7 +191,9 @@ class Scene:
         """
         values, pixels = np.asarray(patches), len(self.area)
         checks.shape("patches", values, (pixels,), (3, pixels))
-        return np.moveaxis(values.reshape(*values.shape[:-1], *self.grid), 0, -1 if values.ndim == 2 else 0)
+        return np.moveaxis(
+            values.reshape(*values.shape[:-1], *self.grid), 0, -1 if values.ndim == 2 else 0
+        )
 
     def view(self, picture: Any, size: int = 480, supersample: int = 3) -> np.ndarray:
         """What a viewer who looks into the room sees of a picture on its walls; backs of walls are left out.
@@ -222,8 +235,8 @@ class Scene:
     def sample(self, image: Any) -> np.ndarray:
         """The picture on the walls that looks like a flat image from where the viewer stands.
 
-        Each patch takes the mean of the image over its footprint in `view`; the image is centred and
-        just covers the walls, undistorted. The target of a compensation is made like this.
+        Each patch takes the mean of the image over its footprint in `view`; the image is centred
+        and just covers the walls, undistorted. The target of a compensation is made like this.
 
         Parameters
         ----------
@@ -248,16 +261,18 @@ class Scene:
         """
         image = checks.finite("image", checks.real("image", image))
         if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
-            raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
+            raise InputError(
+                f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty"
+            )
         checks.count("image", max(image.shape), most=viewing.LONGEST)
         return viewing.read(self.viewer, self.walls, image, self.grid, self._screens)
 
     def irradiance(self, light: Any) -> np.ndarray:
         """Light that falls on each patch straight from a point, shadows included, largest value 1.
 
-        It serves as a pattern: ``T @ scene.irradiance(light)`` is the room under that light. Of each patch it
-        is the mean of cos(t) / r^2 over 8 x 8 points, 0 where something stands in between: at the edge of a
-        shadow good to 1/64 of a patch's light or so.
+        It serves as a pattern: ``T @ scene.irradiance(light)`` is the room under that light. Of
+        each patch it is the mean of cos(t) / r^2 over 8 x 8 points, 0 where something stands in
+        between: at the edge of a shadow good to 1/64 of a patch's light or so.
 
         Parameters
         ----------
@@ -276,7 +291,10 @@ class Scene:
         >>> picture.shape, float(picture.max())
         ((8, 24), 1.0)
         """
-        where, boxes = np.array(point("light", light)), [(block.low, block.high) for block in self.blocks]
+        where, boxes = (
+            np.array(point("light", light)),
+            [(block.low, block.high) for block in self.blocks],
+        )
         if any(((where > low) & (where < high)).all() for low, high in boxes):
             raise InputError(f"light is {light}, inside a block; move it out")
         h, w = self.grid[0], self.grid[1] // len(self.walls)
@@ -290,13 +308,17 @@ class Scene:
             parts.append(arrives.reshape(h, _LIGHT_POINTS, w, _LIGHT_POINTS).mean(axis=(1, 3)))
         picture = np.concatenate(parts, axis=1)
         if picture.max() <= 0:
-            raise InputError(f"light is {light}, from where it reaches no patch; move it in front of a wall")
+            raise InputError(
+                f"light is {light}, from where it reaches no patch; move it in front of a wall"
+            )
         return (picture / picture.max()).astype(np.float32)
 
     @property
     def _screens(self) -> tuple[Wall, ...]:
         """Faces of the blocks that carry no part of the picture: black."""
-        return tuple(face for block in self.blocks for face in block.faces() if face not in self.walls)
+        return tuple(
+            face for block in self.blocks for face in block.faces() if face not in self.walls
+        )
 
     def _fits(self, matrices: int) -> None:
         pixels = len(self.area)
@@ -311,8 +333,9 @@ def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) ->
 
         B = diag(s) diag(a) F diag(s) = B^T,    T = diag(s) (I - B)^-1 diag(s) diag(a)
 
-    where I - B is positive definite for albedos below one. Cholesky inverts it with half the work of a
-    general inverse and in the memory of the result alone; black patches (r = 0) need no special case.
+    where I - B is positive definite for albedos below one. Cholesky inverts it with half the work
+    of a general inverse and in the memory of the result alone; black patches (r = 0) need no
+    special case.
 
     InputError: the gain of one bounce is 1 or more.
 
@@ -331,7 +354,9 @@ def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) ->
     if not failed:
         columns, failed = potri(columns, lower=1, overwrite_c=1)
     if failed:
-        raise InputError("albedo and form_factors give a bounce a gain of 1 or more; lower the albedo")
+        raise InputError(
+            "albedo and form_factors give a bounce a gain of 1 or more; lower the albedo"
+        )
     # The result stands in the upper triangle of the rows only.
     for rows, right in _blocks(len(matrix)):
         block = matrix[rows, right]
@@ -349,10 +374,14 @@ def _check_exchange(form_factors: np.ndarray, area: np.ndarray) -> None:
     if area.min() <= 0:
         raise InputError(f"area has the value {area.min():g}; all must be above 0")
     if form_factors.min() < 0:
-        raise InputError(f"form_factors has the value {form_factors.min():g}; all must be at least 0")
+        raise InputError(
+            f"form_factors has the value {form_factors.min():g}; all must be at least 0"
+        )
     most = form_factors.sum(axis=1).max()
     if most > 1 + _TOLERANCE:
-        raise InputError(f"form_factors has a row that sums to {most:g}; no patch can send out more than 1")
+        raise InputError(
+            f"form_factors has a row that sums to {most:g}; no patch can send out more than 1"
+        )
     worst, largest = 0.0, (area * form_factors.max(axis=1)).max()
     for rows, columns in _blocks(len(area)):
         there = area[rows, None] * form_factors[rows, columns]

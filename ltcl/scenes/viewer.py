@@ -3,12 +3,13 @@
 
 A point u right + v down of a wall, (u, v) in [0, 1]^2, appears at H (u, v, 1) in the image plane,
 so each wall has one homography H (3 x 3), which also tells its depth there: the last coordinate. Of
-walls that overlap in the image the nearest shows, point by point. Walls seen from behind are left out, and
-screens, which are walls without a picture, show black. All values are linear and pass unclipped.
+walls that overlap in the image the nearest shows, point by point. Walls seen from behind are left
+out, and screens, which are walls without a picture, show black. All values are linear and pass
+unclipped.
 
 Drawing interpolates linearly between patch centres and averages supersample^2 points per pixel;
-reading averages a lattice of points per patch, about one per pixel of its footprint, 16 x 16 at most,
-without those that are hidden.
+reading averages a lattice of points per patch, about one per pixel of its footprint, 16 x 16 at
+most, without those that are hidden.
 """
 
 from __future__ import annotations
@@ -115,7 +116,9 @@ def draw(
     seen = [(viewer.homography(wall), painting) for wall, painting in pictured if viewer.sees(wall)]
     image = np.zeros((height, width, *picture.shape[2:]), dtype=np.float32)
     x = (np.arange(width * supersample) + 0.5 - width * supersample / 2) / scale + visible.centre[0]
-    y = (np.arange(height * supersample) + 0.5 - height * supersample / 2) / scale + visible.centre[1]
+    y = (np.arange(height * supersample) + 0.5 - height * supersample / 2) / scale + visible.centre[
+        1
+    ]
     for row in range(0, height, _BAND):
         rows = y[row * supersample : (row + _BAND) * supersample]
         points = _lattice(x, rows)
@@ -132,12 +135,16 @@ def draw(
 
 
 def read(
-    viewer: Viewer, walls: Sequence[Wall], image: Any, grid: tuple[int, int], screens: Sequence[Wall] = ()
+    viewer: Viewer,
+    walls: Sequence[Wall],
+    image: Any,
+    grid: tuple[int, int],
+    screens: Sequence[Wall] = (),
 ) -> np.ndarray:
     """Picture (h, w[, 3]) float32 on the walls' grid: means of an image (H, W[, 3]) over the patches.
 
-    The image just covers the frame, centred. Of patches partly hidden the mean is over what shows; those
-    hidden or seen from behind are 0.
+    The image just covers the frame, centred. Of patches partly hidden the mean is over what shows;
+    those hidden or seen from behind are 0.
     """
     visible = frame(viewer, (*walls, *screens))
     height, width = image.shape[:2]
@@ -147,9 +154,13 @@ def read(
     to_pixels = np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1]])
     patches = (grid[0], grid[1] // len(walls))
     image = np.asarray(image, dtype=np.float32)
-    seen = {i: viewer.homography(wall) for i, wall in enumerate((*walls, *screens)) if viewer.sees(wall)}
+    seen = {
+        i: viewer.homography(wall) for i, wall in enumerate((*walls, *screens)) if viewer.sees(wall)
+    }
     corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
-    outlines = {i: np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for i, homography in seen.items()}
+    outlines = {
+        i: np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for i, homography in seen.items()
+    }
     parts = []
     for i in range(len(walls)):
         if i in seen:
@@ -192,7 +203,9 @@ def _read_wall(
 ) -> np.ndarray:
     """Mean of the image over the footprint of each patch of one wall, where walls `hiding` leave it open."""
     h, w = patches
-    borders = _apply(to_pixels @ homography, _lattice(np.linspace(0, 1, w + 1), np.linspace(0, 1, h + 1)))
+    borders = _apply(
+        to_pixels @ homography, _lattice(np.linspace(0, 1, w + 1), np.linspace(0, 1, h + 1))
+    )
     sides = [np.linalg.norm(np.diff(borders, axis=axis), axis=-1).max() for axis in (0, 1)]
     points = int(np.clip(np.ceil(max(sides)), 2, _MOST_POINTS))
     u = (np.arange(w * points) + 0.5) / (w * points)

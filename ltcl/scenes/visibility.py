@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which part of a patch another one sees past opaque boxes: V (N, N), symmetric, 1 where nothing is between.
 
-V_ij is the share of the rays between the fronts of patches i and j that meet no box. Rays that leave or
-meet a back carry no light and do not count: where the plane of one patch cuts the other, V is that of the
-part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or next to it.
+V_ij is the share of the rays between the fronts of patches i and j that meet no box. Rays that
+leave or meet a back carry no light and do not count: where the plane of one patch cuts the other, V
+is that of the part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or next
+to it.
 
-Each patch has s x s points, one at random in each cell of a regular division, and ray k joins point k of one
-patch with point partner(k) of the other, where partner is a fixed random exchange: both directions have the
-same rays, so V = V^T to the bit.
+Each patch has s x s points, one at random in each cell of a regular division, and ray k joins point
+k of one patch with point partner(k) of the other, where partner is a fixed random exchange: both
+directions have the same rays, so V = V^T to the bit.
 
-Known limit: V counts rays, it is not weighted by the cosines along them; the standard error of an entry in
-a penumbra is at most 1 / (2 s), less as the points are spread evenly.
+Known limit: V counts rays, it is not weighted by the cosines along them; the standard error of an
+entry in a penumbra is at most 1 / (2 s), less as the points are spread evenly.
 """
 
 from __future__ import annotations
@@ -23,17 +24,28 @@ from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.scenes.patches import Patches, check_blocks, check_patches, lanes, padded, scaled
 
-_LAUNCH = 1 << 30  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
+_LAUNCH = (
+    1 << 30
+)  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
 
 
 class Rays:
     """The samples^2 rays between any two of the patches, past boxes (B, 2, 3), on a device."""
 
     def __init__(self, patches: Patches, blocks: np.ndarray, device: Device, samples: int) -> None:
-        self.device, self.count, self.rays, self.boxes = device, len(patches), samples**2, len(blocks)
+        self.device, self.count, self.rays, self.boxes = (
+            device,
+            len(patches),
+            samples**2,
+            len(blocks),
+        )
         placed, self._blocks = scaled(device, patches, blocks)
-        cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-        place = (cell + np.random.default_rng(1).random(cell.shape)) / samples - 0.5  # (s^2, 2) in edges
+        cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(
+            -1, 2
+        )
+        place = (
+            cell + np.random.default_rng(1).random(cell.shape)
+        ) / samples - 0.5  # (s^2, 2) in edges
         edges = np.stack([placed.right, placed.down])  # (2, N, 3)
         points = (placed.centre + np.tensordot(place, edges, 1)).transpose(0, 2, 1)  # (s^2, 3, N)
         partner, order = np.arange(self.rays), np.random.default_rng(2).permutation(self.rays)
@@ -67,7 +79,9 @@ class Rays:
     def _launch(self, i: np.ndarray, start: np.ndarray, columns: int) -> np.ndarray:
         """V of patches i and the `columns` from `start` on, in whole lanes: (columns or more, len(i))."""
         width = lanes(self.device)
-        kernel = self.device.kernel("form_factor", "form_factor_visible", K=1, LANES=width, BLOCKS=self.boxes)
+        kernel = self.device.kernel(
+            "form_factor", "form_factor_visible", K=1, LANES=width, BLOCKS=self.boxes
+        )
         stretches = -(-columns // width)
         out = self.device.empty((stretches * width, len(i)))
         lists = (self.device.upload(i, np.int32), self.device.upload(start, np.int32))
@@ -120,4 +134,6 @@ def visibility(
     checks.fits_host(f"the visibility of {count} x {count} patches", 4 * count**2)
     if not len(blocks):
         return np.ones((count, count), np.float32)
-    return Rays(patches, blocks, device if isinstance(device, Device) else open_device(device), samples).all()
+    return Rays(
+        patches, blocks, device if isinstance(device, Device) else open_device(device), samples
+    ).all()

@@ -16,7 +16,14 @@ from ltcl.errors import InputError, InputTypeError
 Vector = tuple[float, float, float]
 
 _TOUCH = 1e-9  # of the larger wall: overlaps that are rounding errors
-_FACES = {"+x": (0, 1), "-x": (0, -1), "+y": (1, 1), "-y": (1, -1), "top": (2, 1), "bottom": (2, -1)}
+_FACES = {
+    "+x": (0, 1),
+    "-x": (0, -1),
+    "+y": (1, 1),
+    "-y": (1, -1),
+    "top": (2, 1),
+    "bottom": (2, -1),
+}
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,9 @@ class Wall:
 
     def __post_init__(self) -> None:
         if not np.any(np.cross(self.down, self.right)):
-            raise InputError(f"wall {self.name!r} has edges {self.right} and {self.down}; they span no area")
+            raise InputError(
+                f"wall {self.name!r} has edges {self.right} and {self.down}; they span no area"
+            )
 
     @property
     def normal(self) -> np.ndarray:
@@ -87,8 +96,8 @@ class Block:
     corner, size : (3,) floats
         Its corner nearest to the origin, and its lengths along x, y and z.
     albedo : float or (3,) floats, optional
-        Of all its faces, one number or one colour: they become walls of the picture then, lit and seen.
-        Without it the block is black.
+        Of all its faces, one number or one colour: they become walls of the picture then, lit and
+        seen. Without it the block is black.
 
     Raises
     ------
@@ -162,8 +171,8 @@ def point(name: str, value: Any) -> Vector:
 def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
     """Albedo of every patch, (channels, n * walls * n), from one number, one per wall, per colour or both.
 
-    A scalar; (walls,), one per wall; (3,), one colour for all walls; (walls, 3) or (walls, 1) or (1, 3) to
-    say it in full. Three numbers for three walls could be either, and are refused.
+    A scalar; (walls,), one per wall; (3,), one colour for all walls; (walls, 3) or (walls, 1) or
+    (1, 3) to say it in full. Three numbers for three walls could be either, and are refused.
 
     >>> spread_albedo([0.5, 0.2], walls=2, n=1)
     array([[0.5, 0.2]])
@@ -196,23 +205,32 @@ def check_albedo(albedo: np.ndarray) -> None:
 def refuse_crossing(walls: Sequence[Wall]) -> None:
     """Refuse walls that cut through each other, or cover each other facing the same way.
 
-    Light could not tell which side it is on. Walls may touch: along an edge, at a corner, or one with its
-    edge in the middle of the other.
+    Light could not tell which side it is on. Walls may touch: along an edge, at a corner, or one
+    with its edge in the middle of the other.
     """
     for first, second in itertools.combinations(walls, 2):
         a, b, problem = first.outline, second.outline, ""
         touch = _TOUCH * max(np.abs(np.diff(corners, axis=0)).max() for corners in (a, b))
         over, under = (a - b[0]) @ _normal(b), (b - a[0]) @ _normal(a)
-        if first.normal @ second.normal > 0 and max(np.abs(over).max(), np.abs(under).max()) <= touch:
+        if (
+            first.normal @ second.normal > 0
+            and max(np.abs(over).max(), np.abs(under).max()) <= touch
+        ):
             problem = "lie on top of each other" if overlap(a, b, touch) else ""
         elif min(-over.min(), over.max(), -under.min(), under.max()) > touch:
             # Both planes are cut. On their common line each wall fills an interval.
             line = np.cross(_normal(a), _normal(b))
             line /= np.linalg.norm(line)
             (low, high), (other_low, other_high) = _span(a, over, line), _span(b, under, line)
-            problem = "cut through each other" if min(high, other_high) - max(low, other_low) > touch else ""
+            problem = (
+                "cut through each other"
+                if min(high, other_high) - max(low, other_low) > touch
+                else ""
+            )
         if problem:
-            raise InputError(f"walls {first.name!r} and {second.name!r} {problem}; move or shorten one")
+            raise InputError(
+                f"walls {first.name!r} and {second.name!r} {problem}; move or shorten one"
+            )
 
 
 def overlap(first: np.ndarray, second: np.ndarray, touch: float) -> bool:

@@ -9,4 +9,13 @@ from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.solve import METHODS, solve, solve_each
 from ltcl.solvers.stationary import matrix_series
 
-__all__ = ["METHODS", "Bounded", "Inverse", "Solution", "Status", "matrix_series", "solve", "solve_each"]
+__all__ = [
+    "METHODS",
+    "Bounded",
+    "Inverse",
+    "Solution",
+    "Status",
+    "matrix_series",
+    "solve",
+    "solve_each",
+]

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`auto`: choosing a method before the first step, and saying why.
 
-Row sums show whether the plain iteration is best. Else the first solve with S tries GMRES, for no more steps
-than a survey and Chebyshev within free bounds: a survey pays where that fails, or S is solved again. Made
-once in the life of S, it is three steps of GMRES from a random picture: Ritz values estimate the spectrum,
-residuals how fast Krylov methods converge, directions whether S is self-adjoint. The least estimated time
-decides: bytes over bandwidth, launches, waits. Speeds that matter are measured, once per device.
+Row sums show whether the plain iteration is best. Else the first solve with S tries GMRES, for no
+more steps than a survey and Chebyshev within free bounds: a survey pays where that fails, or S is
+solved again. Made once in the life of S, it is three steps of GMRES from a random picture: Ritz
+values estimate the spectrum, residuals how fast Krylov methods converge, directions whether S is
+self-adjoint. The least estimated time decides: bytes over bandwidth, launches, waits. Speeds that
+matter are measured, once per device.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ LARGEST_DIRECT = 8192  # pixels: above, a dense factorization takes gigabytes an
 PRECISE = 1e-6  # relative residual that float32 products reach for certain
 STEPS = 3  # of a survey
 _AT_ONCE = 8  # right-hand sides in one product
-_SELF_ADJOINT = 0.02  # defect of R up to which inner products are nearly those of a self-adjoint one
+_SELF_ADJOINT = (
+    0.02  # defect of R up to which inner products are nearly those of a self-adjoint one
+)
 _SLENDER = 0.25  # of the smallest real part: imaginary parts that an interval may leave out
 _LAUNCHES = 16  # timed together
 # Vectors read or written, launches and waits for each product.
@@ -45,8 +48,9 @@ _STEPS = {"chebyshev": (4, 1, 0.5), "cg": (9, 3, 0.5), "gmres": (12, 5, 1.0)}
 class Survey:
     """Complex Ritz values of S, an interval around their real parts, within the free bounds, and more.
 
-    `residuals` are those of GMRES after 0, 1, ... products, relative; `defect` is the part of R that is
-    not self-adjoint in the inner product of `S.weights`, or the plain one: 0 where it is, 1 of a rotation.
+    `residuals` are those of GMRES after 0, 1, ... products, relative; `defect` is the part of R
+    that is not self-adjoint in the inner product of `S.weights`, or the plain one: 0 where it is, 1
+    of a rotation.
     """
 
     ritz: np.ndarray
@@ -70,13 +74,17 @@ class Survey:
         if self.residuals[-1] <= rtol:  # they never grow
             return float(np.argmax(np.array(self.residuals) <= rtol))
         factor = self.residuals[-1] / self.residuals[-2]
-        missing = math.log(rtol / self.residuals[-1]) / math.log(factor) if factor < 1.0 else math.inf
+        missing = (
+            math.log(rtol / self.residuals[-1]) / math.log(factor) if factor < 1.0 else math.inf
+        )
         return len(self.residuals) - 1.0 + float(np.ceil(missing))
 
     def __str__(self) -> str:
         real, imaginary = np.real(self.ritz), np.imag(self.ritz)
         least, most = np.min(real, initial=np.inf), np.max(real, initial=-np.inf)
-        rotation = "" if self.in_an_interval else f" with imaginary parts up to {np.max(imaginary):.2g}"
+        rotation = (
+            "" if self.in_an_interval else f" with imaginary parts up to {np.max(imaginary):.2g}"
+        )
         spectrum = f"eigenvalues of S seen between {least:.2g} and {most:.2g}{rotation}"
         return f"{self.defect:.2g} of R is not self-adjoint, {spectrum} by {len(self.residuals) - 1} products"
 
@@ -90,7 +98,11 @@ def survey(S: Operator) -> Survey:
     if S in _surveys:
         return _surveys[S]
     start = S.device.upload(np.random.default_rng(0).uniform(size=S.shape[0]))
-    space, residuals, ended = KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0])), [1.0], False
+    space, residuals, ended = (
+        KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0])),
+        [1.0],
+        False,
+    )
     while space.count < space.steps and not ended:
         ended = space.extend()[0]
         residuals.append(float(space.residuals[0]))
@@ -135,11 +147,15 @@ class _Trial(GMRES):
     """One cycle, however many steps the caller allows."""
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
-        monitor.rule = dataclasses.replace(monitor.rule, maxiter=min(self.restart, monitor.rule.maxiter))
+        monitor.rule = dataclasses.replace(
+            monitor.rule, maxiter=min(self.restart, monitor.rule.maxiter)
+        )
         super().iterate(system, x, r, monitor)
 
 
-def plan(S: Operator, rtol: float, columns: int, refines: bool = False) -> Iterator[tuple[Any, str, int]]:
+def plan(
+    S: Operator, rtol: float, columns: int, refines: bool = False
+) -> Iterator[tuple[Any, str, int]]:
     """Methods to try for S x = b to `rtol`, one where those before fail; why; products it took to know."""
     n = S.shape[0]
     if n <= SMALL:
@@ -157,10 +173,16 @@ def plan(S: Operator, rtol: float, columns: int, refines: bool = False) -> Itera
     free = _Candidate(Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
     if plain.products <= free.products:
         yield plain.method, f"{plain}, {free}; row sums of R are at most {rho:.2g}", 0
-    elif not (refines or columns > _AT_ONCE or any(S in known for known in (_tried, _surveys, factors))):
+    elif not (
+        refines or columns > _AT_ONCE or any(S in known for known in (_tried, _surveys, factors))
+    ):
         _tried.add(S)
         most = min(STEPS + int(free.products), GMRES.restart)
-        yield _Trial(most), f"gmres: at most {most} products, without a survey at the first solve", 0
+        yield (
+            _Trial(most),
+            f"gmres: at most {most} products, without a survey at the first solve",
+            0,
+        )
     made_before = S in _surveys
     surveyed = survey(S)
     products = surveyed.krylov_products(rtol)

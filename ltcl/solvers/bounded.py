@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Least squares within bounds: min ||w (A x - b)|| over lower <= x <= upper, by products with A and A^T.
 
-Projected conjugate directions. With r = w (b - A x), g = -A^T w r, and z = -g but for what the bounds forbid,
+Projected conjugate directions. With r = w (b - A x), g = -A^T w r, and z = -g but for what the
+bounds forbid,
 
     p = z + beta d,   d' = clip(x + alpha p) - x,   x' = x + lambda d'
 
-with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda exact along
-d' or as far as the bounds allow: conjugate gradients on a face of the box, and many bounds at once (Moré and
-Toraldo, SIAM J. Optimization 1, 1991). Where the last lambda was short, or 0, p = z. A step is two products.
+with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda
+exact along d' or as far as the bounds allow: conjugate gradients on a face of the box, and many
+bounds at once (Moré and Toraldo, SIAM J. Optimization 1, 1991). Where the last lambda was short, or
+0, p = z. A step is two products.
 
-The certificate: with the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), by Cauchy and
-Schwarz
+The certificate: with the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), by
+Cauchy and Schwarz
 
     ||r*|| >= r.r* / ||r|| >= ||r|| - gap / ||r||,
 
-and the largest of these bounds so far is kept. Done when the error is within the tolerance, of 0 or of that,
-with what rounding of A x may hide: of S = I + R, whose columns may be far below 1, at least that of x itself.
+and the largest of these bounds so far is kept. Done when the error is within the tolerance, of 0 or
+of that, with what rounding of A x may hide: of S = I + R, whose columns may be far below 1, at
+least that of x itself.
 """
 
 from __future__ import annotations
@@ -79,16 +82,19 @@ def minimise(
 ) -> Bounded:
     """The x within the bounds for which A x is nearest to b; STAGNATED where rounding hides any further gain.
 
-    A is (M, N) with columns of like size, for instance S; b and the weights w >= 0, ones when not given, are
-    (M, k), the finite bounds (N,), and the start x0 (N, k) is moved within. Done when the error, or what it
-    is above the least possible one, is at most ``max(rtol ||w b||, atol)`` in every column; where b = 0, rtol
-    is of the error at the start. ``callback(iteration, relative gap)`` is called after each step.
+    A is (M, N) with columns of like size, for instance S; b and the weights w >= 0, ones when not
+    given, are (M, k), the finite bounds (N,), and the start x0 (N, k) is moved within. Done when
+    the error, or what it is above the least possible one, is at most ``max(rtol ||w b||, atol)`` in
+    every column; where b = 0, rtol is of the error at the start. ``callback(iteration, relative
+    gap)`` is called after each step.
     """
     start = time.perf_counter()
     largest = float(np.max(np.abs(b)))
     unit = _power(largest or float(np.max(np.abs([lower, upper]))))
     unit_w = 1.0 if weights is None else _power(float(np.max(weights)))
-    box = inwards(*(np.clip(np.asarray(bound, np.float64) / unit, -_FAR, _FAR) for bound in (lower, upper)))
+    box = inwards(
+        *(np.clip(np.asarray(bound, np.float64) / unit, -_FAR, _FAR) for bound in (lower, upper))
+    )
     first = np.clip((x0 / unit).astype(np.float32), *(bound[:, None] for bound in box))
     descent = _Descent(A, b / unit, None if weights is None else weights / unit_w, box, first)
     initial, _ = descent.read()
@@ -118,23 +124,37 @@ def minimise(
             break
         descent.step(unsolved)
     x, worse = descent.x.get(), ~(errors <= initial)  # rounding alone can do that
-    errors, saturated = np.where(worse, initial, errors), np.where(worse, False, descent.saturated(x))
+    errors, saturated = (
+        np.where(worse, initial, errors),
+        np.where(worse, False, descent.saturated(x)),
+    )
     excess = np.where(worse, np.maximum(initial - least + 2.0 * hidden, _ROUNDING * scale), excess)
     x = (np.where(worse, first, x) * unit).astype(np.float32)
     x = np.clip(x, *(bound[:, None] for bound in inwards(lower, upper)))
     history = len(residuals) - 1, descent.products, tuple(residuals), time.perf_counter() - start
     least = np.maximum(least - hidden, 0.0) * unit * unit_w
-    certificate = {"errors": errors * unit * unit_w, "least": least, "gap": float(np.max(excess / scale))}
+    certificate = {
+        "errors": errors * unit * unit_w,
+        "least": least,
+        "gap": float(np.max(excess / scale)),
+    }
     return Bounded(x, status, *history, "bounded", saturated=saturated, **certificate)
 
 
 def least_squares(
-    A: Operator, b: np.ndarray, free: np.ndarray, weights: np.ndarray, *, rtol: float, maxiter: int = 100
+    A: Operator,
+    b: np.ndarray,
+    free: np.ndarray,
+    weights: np.ndarray,
+    *,
+    rtol: float,
+    maxiter: int = 100,
 ) -> np.ndarray:
     """The x (N, ...), 0 but where `free`, for which w A x is nearest to w b (M, ...), by conjugate gradients.
 
-    Each column has free entries and weights of its own, which broadcast to x and b. Done when the gradient
-    of every column is at most rtol times the first one, or after `maxiter` steps of two products.
+    Each column has free entries and weights of its own, which broadcast to x and b. Done when the
+    gradient of every column is at most rtol times the first one, or after `maxiter` steps of two
+    products.
     """
 
     def product(matrix: Any, a: np.ndarray) -> np.ndarray:
@@ -173,7 +193,9 @@ def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
 class _Descent:
     """The iterate and, on the device, r = b - A x, u = w^2 r, g = -A^T u, d, and h = A^T w^2 A d."""
 
-    def __init__(self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray) -> None:
+    def __init__(
+        self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray
+    ) -> None:
         device, self.A, self.products, self._box = A.device, A, 0, box
         self.scale = np.linalg.norm(b if w is None else w * b, axis=0)
         self._largest_weight = 1.0 if w is None else float(np.max(w))

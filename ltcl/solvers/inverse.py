@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """S^-1 = I - A, kept: a solution is one product, x = b - A b, and its error was bounded when A was made.
 
-A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ...; by `ltcl.invert`.
+A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ...; by
+`ltcl.invert`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks, layout
+from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus, Operator, stored
@@ -22,6 +23,7 @@ from ltcl.operators.interreflection import nbytes
 from ltcl.solvers.bounded import inwards
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import scale_rhs, unscale
+from ltcl.transport import frames as layout
 
 _ARRAYS = ("grid", "first_bounce", "errors", "confidence")
 
@@ -59,19 +61,27 @@ class Inverse:
         confidence: float = 1.0,
     ) -> None:
         if len(bounces) not in (1, 3) or len(errors) != len(bounces):
-            raise InputError(f"an inverse has {len(bounces)} A and {len(errors)} errors; both must be 1 or 3")
+            raise InputError(
+                f"an inverse has {len(bounces)} A and {len(errors)} errors; both must be 1 or 3"
+            )
         self.systems = tuple(IdentityPlus(A, sign=-1) for A in bounces)
         self._arrays, self._index = dict[str, np.ndarray](), ""  # of an unpickled one
         n = bounces[0].shape[0]
         self.grid = checks.grid("grid", grid, n)
         self.errors = tuple(checks.number("error", error, least=0.0) for error in errors)
-        F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
+        F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(
+            np.float64
+        )
         self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
         self.mixing = None if mixing is None else layout.mixing(mixing, len(bounces), None)
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
 
     def __repr__(self) -> str:
-        (h, w), kind, size = self.grid, {1: "grey", 3: "colour"}[self.channels], checks.size(self.nbytes)
+        (h, w), kind, size = (
+            self.grid,
+            {1: "grey", 3: "colour"}[self.channels],
+            checks.size(self.nbytes),
+        )
         shape = f"{h * w} x {h * w}, {kind}, grid {h} x {w}"
         return f"<ltcl Inverse {shape}, {size} with an error of {self.error:.2g}>"
 
@@ -121,8 +131,8 @@ class Inverse:
     def solve(self, b: Any, channel: int = 0, *, rtol: float | None = None) -> Solution:
         """x = b - A b of b, (N,) or (N, k), by one product; no residual is computed.
 
-        `rtol` is the relative error of x that is allowed: an InputError where that of the inverse is above.
-        The status is PRECOMPUTED, `error` the bound.
+        `rtol` is the relative error of x that is allowed: an InputError where that of the inverse
+        is above. The status is PRECOMPUTED, `error` the bound.
         """
         start = time.perf_counter()
         self.refuse_beyond(rtol)
@@ -144,8 +154,9 @@ class Inverse:
     ) -> np.ndarray:
         """The projector pattern for a picture or frames of a video, by one product a channel.
 
-        l_in = F^-1 (b - A b) of b = gain * desired - background, float32, clamped to the bounds, which other
-        pixels do not make up for; `ltcl.compensate`, whose options these are, does. `background` is a number.
+        l_in = F^-1 (b - A b) of b = gain * desired - background, float32, clamped to the bounds,
+        which other pixels do not make up for; `ltcl.compensate`, whose options these are, does.
+        `background` is a number.
         """
         low, high = checks.interval("bounds", bounds)
         gain, dark = checks.number("gain", gain, above=0.0), checks.number("background", background)
@@ -153,17 +164,24 @@ class Inverse:
         solved = [self.solve(gain * b - dark, channel).x for channel, b in enumerate(columns)]
         light = layout.to_light(solved, self._F, self.mixing)
         limited = [np.clip(p.astype(np.float32), *inwards(low, high)) for p in light]
-        lit = [np.where(f[:, None] > 0.0, p, np.float32(0)) for p, f in zip(limited, self._F, strict=True)]
+        lit = [
+            np.where(f[:, None] > 0.0, p, np.float32(0))
+            for p, f in zip(limited, self._F, strict=True)
+        ]
         return shape.pack(lit, self.grid)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays by name, as files hold them; `from_arrays` makes the same of them, to the bit."""
         own = dict(zip(_ARRAYS, (self.grid, self._F, self.errors, self.confidence), strict=True))
         own |= {} if self.mixing is None else {"mixing": self.mixing}
-        return {name: np.array(value) for name, value in own.items()} | stored.to_arrays(self.systems)
+        return {name: np.array(value) for name, value in own.items()} | stored.to_arrays(
+            self.systems
+        )
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: Device | str | None = None) -> Inverse:
+    def from_arrays(
+        cls, arrays: Mapping[str, np.ndarray], device: Device | str | None = None
+    ) -> Inverse:
         """Of what `to_arrays` gave, on a device that is opened at once; InputError where they do not fit."""
         for name in _ARRAYS:
             if name not in arrays:

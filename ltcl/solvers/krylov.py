@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Krylov methods: CG, BiCGStab and GMRES, with coefficients of their own for each right-hand side.
 
-The kernels leave partial sums of each column in a few slices of the rows; a group of the next kernel adds
-them up and computes the coefficients of its columns: CG and BiCGStab queue several steps between readings.
+The kernels leave partial sums of each column in a few slices of the rows; a group of the next
+kernel adds them up and computes the coefficients of its columns: CG and BiCGStab queue several
+steps between readings.
 
-Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed.; of BiCGStab algorithm 7.7, of
-GMRES 6.2 in blocks, 6.9 and 6.11, section 6.5.3 of the rotations.
+Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed.; of BiCGStab
+algorithm 7.7, of GMRES 6.2 in blocks, 6.9 and 6.11, section 6.5.3 of the rotations.
 """
 
 from __future__ import annotations
@@ -24,18 +25,31 @@ from ltcl.operators import Operator
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import SLOTS, Monitor, System
 
-STATE = 16  # rows of numbers that a method leaves in its state; residuals of SLOTS steps follow them
+STATE = (
+    16  # rows of numbers that a method leaves in its state; residuals of SLOTS steps follow them
+)
 _VALUES = 32  # an item should have, before there are more groups
 _SLICES = 256  # at most, as many as groups
 _PAIRS = 0b0001_0000  # <r, r> and <w, r>, of arrays r, w; the left operand in the lower bits
 _TWO = 0b0101_0001  # <a, b> and <b, b>, of arrays a, b
-_FIVE = 0b0101_0010_0110_0000_0100  # <t, s>, <t, t>, <r*, s>, <r*, t> and <s, s>, of arrays t, s, r*
+_FIVE = (
+    0b0101_0010_0110_0000_0100  # <t, s>, <t, t>, <r*, s>, <r*, t> and <s, s>, of arrays t, s, r*
+)
 _STEP, _ANEW, _COUNT = 3, 4, 2  # arguments: of all updates, of krylov_cg, of krylov_subtract
 _INDEFINITE = 2, 6  # rows of the state of CG, of even and of odd steps
-_RHO, _PHASE, _SHADOW, _AGAINST = (0, 4), (1, 5), 9, 10  # of that of BiCGStab; two of even and of odd steps
+_RHO, _PHASE, _SHADOW, _AGAINST = (
+    (0, 4),
+    (1, 5),
+    9,
+    10,
+)  # of that of BiCGStab; two of even and of odd steps
 _FRESH, _WAITS, _BROKEN, _RESTS = 1.0, 2.0, 3.0, 4.0  # phases
-_FALL = 2.0**-20  # of the first residual: below, a float32 cycle has to start again from the true one
-_SINGULAR = 2.0**-20  # of its length: what the rotations left of a column, and of H, is rounding of products
+_FALL = (
+    2.0**-20
+)  # of the first residual: below, a float32 cycle has to start again from the true one
+_SINGULAR = (
+    2.0**-20
+)  # of its length: what the rotations left of a column, and of H, is rounding of products
 
 
 def ratio(numerator: np.ndarray, denominator: np.ndarray, where: np.ndarray) -> np.ndarray:
@@ -43,8 +57,12 @@ def ratio(numerator: np.ndarray, denominator: np.ndarray, where: np.ndarray) -> 
 
     A denominator beyond float32 gives NaN, not a step of 0 that would be repeated for ever.
     """
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # the monitor sees what comes of it
-        return np.where(where, numerator / np.where(np.isfinite(denominator), denominator, np.nan), 0.0)
+    with np.errstate(
+        divide="ignore", invalid="ignore", over="ignore"
+    ):  # the monitor sees what comes of it
+        return np.where(
+            where, numerator / np.where(np.isfinite(denominator), denominator, np.nan), 0.0
+        )
 
 
 class Columns:
@@ -59,11 +77,15 @@ class Columns:
         most = 4 * self.device.compute_units if on_cpu else _SLICES
         self.slices = max(1, min(-(-x.size // (_VALUES * self.group)), most, _SLICES))
 
-    def bind(self, name: str, *arguments: object, extra: int = 0, across: int = 1, rows: int = 0) -> Launch:
+    def bind(
+        self, name: str, *arguments: object, extra: int = 0, across: int = 1, rows: int = 0
+    ) -> Launch:
         """Kernel `name` on `rows` rows, `across` times, with local memory for `extra` reals a column."""
         scratch = self.device.local(self.group + extra * min(self.k, self.group))
         sizes = rows or self.rows, self.k
-        return self._kernels[name].bind(self.items(across), (self.group, 1, 1), *sizes, *arguments, scratch)
+        return self._kernels[name].bind(
+            self.items(across), (self.group, 1, 1), *sizes, *arguments, scratch
+        )
 
     def items(self, across: int) -> tuple[int, int, int]:
         """Work-items of a launch, `across` times."""
@@ -78,7 +100,11 @@ class Columns:
         return vectors.fill(self.device.empty((STATE + SLOTS * self.slices, self.k)), 0.0)
 
     def run(
-        self, queued: Sequence[Callable[[], object]], updates: Sequence[Launch], steps: range, state: Array
+        self,
+        queued: Sequence[Callable[[], object]],
+        updates: Sequence[Launch],
+        steps: range,
+        state: Array,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Queue these steps; then the numbers of the state (STATE, k), and residual norms (steps, k)."""
         for step in steps:
@@ -96,9 +122,11 @@ class CG:
     """Conjugate gradients, the fewest products where S is self-adjoint. Options: ``weights``, of <x, y>.
 
     Of a Lambertian scene S is self-adjoint in <x, y> = sum_i w_i x_i y_i with w = area / albedo, by
-    reciprocity: with pixels of equal area w = 1 / F, the default where S = T F^-1 comes from a transport.
+    reciprocity: with pixels of equal area w = 1 / F, the default where S = T F^-1 comes from a
+    transport.
 
-    Recurrences of Chronopoulos and Gear (J. Comput. Appl. Math. 25, 1989, section 3): one update a step.
+    Recurrences of Chronopoulos and Gear (J. Comput. Appl. Math. 25, 1989, section 3): one update a
+    step.
     """
 
     name: ClassVar[str] = "cg"
@@ -124,7 +152,9 @@ class CG:
         w, p, q = r.like(), vectors.fill(r.like(), 0.0), vectors.fill(r.like(), 0.0)
         state, sums, unsolved = columns.state(), columns.sums(2), monitor.unsolved
         rest = r.device.upload(~unsolved, np.int32)
-        dots = columns.bind("vector_dots", 0, _PAIRS, int(weights is not r), weights, r, w, w, sums, across=2)
+        dots = columns.bind(
+            "vector_dots", 0, _PAIRS, int(weights is not r), weights, r, w, w, sums, across=2
+        )
         moves = (columns.slices, 0, 1, rest, sums, state, w, p, q, x, r)
         update = columns.bind("krylov_cg", *moves, extra=2)
         queued = [system.S.bind(r, w), dots, update, lambda: update.set(_ANEW, 0)]
@@ -140,7 +170,9 @@ class CG:
             if broken.any() and broken[monitor.unsolved].all():
                 monitor.status = Status.INDEFINITE
                 return
-            update.set(_ANEW, int(not np.array_equal(monitor.norms, norms[-1])))  # r is the true residual now
+            update.set(
+                _ANEW, int(not np.array_equal(monitor.norms, norms[-1]))
+            )  # r is the true residual now
             if (monitor.unsolved != unsolved).any():
                 unsolved = monitor.unsolved
                 rest.set(~unsolved)
@@ -150,9 +182,9 @@ class CG:
 class BiCGStab:
     """Any S, two products a step, eight vectors of memory however many steps it takes. No options.
 
-    Where a step does not exist (a division by 0) a column starts anew, or rests where a fresh start has none
-    either. A step is five launches: as <r*, S p> = <S^T r*, p>, the first coefficient is known before S p is.
-    Where S has no transpose a sixth finds it.
+    Where a step does not exist (a division by 0) a column starts anew, or rests where a fresh start
+    has none either. A step is five launches: as <r*, S p> = <S^T r*, p>, the first coefficient is
+    known before S p is. Where S has no transpose a sixth finds it.
     """
 
     name: ClassVar[str] = "bicgstab"
@@ -169,7 +201,12 @@ class BiCGStab:
         moves = (slices, 0, five, state, two, g, half, t, v, p, x, r)
         to_next = columns.bind("krylov_bicgstab", *moves, extra=5)
         queued = [S.bind(p, v), to_half, S.bind(half, t), of_t, to_next]  # 4. to 9.
-        numbers, phase, step, transposes = np.zeros((STATE, r.columns)), np.full(r.columns, _WAITS), 0, True
+        numbers, phase, step, transposes = (
+            np.zeros((STATE, r.columns)),
+            np.full(r.columns, _WAITS),
+            0,
+            True,
+        )
         while True:
             anew = monitor.unsolved & ((phase == _WAITS) | (phase == _RESTS))
             changed, now = numbers.copy(), step % 2
@@ -177,7 +214,9 @@ class BiCGStab:
             changed[_PHASE[now]] = np.where(anew, _FRESH, np.where(rests, _RESTS, phase))
             if anew.any():
                 for vector in (shadow, p):  # 1., 2.
-                    vector.copy_from(r.device.upload(np.where(anew, r.get(), vector.get())) if step else r)
+                    vector.copy_from(
+                        r.device.upload(np.where(anew, r.get(), vector.get())) if step else r
+                    )
                 for row in (_RHO[now], _SHADOW):
                     changed[row] = np.where(anew, monitor.norms**2, changed[row])
                 changed[_AGAINST] = changed[_SHADOW]
@@ -203,7 +242,9 @@ class BiCGStab:
             if (phase == _BROKEN).any() and (phase[monitor.unsolved] == _BROKEN).all():
                 monitor.status = Status.NO_STEP
                 return
-            if not np.array_equal(monitor.norms, norms[-1]):  # r is the true residual now, p is not of it
+            if not np.array_equal(
+                monitor.norms, norms[-1]
+            ):  # r is the true residual now, p is not of it
                 phase = np.where(phase == _BROKEN, phase, _WAITS)
 
 
@@ -211,9 +252,10 @@ class BiCGStab:
 class GMRES:
     """The least residual for any S, in m + 1 pictures of memory. Options: ``restart``, m, steps of a cycle.
 
-    Step j makes 2 j + 1 inner products: where products are cheap Chebyshev takes less time. x is formed at
-    the end of a cycle, with its residual V (beta e_1 - H y). Gram-Schmidt is done twice, which is enough for
-    orthogonality to rounding (Giraud, Langou, Rozloznik, Comput. Math. Appl. 50, 2005).
+    Step j makes 2 j + 1 inner products: where products are cheap Chebyshev takes less time. x is
+    formed at the end of a cycle, with its residual V (beta e_1 - H y). Gram-Schmidt is done twice,
+    which is enough for orthogonality to rounding (Giraud, Langou, Rozloznik, Comput. Math. Appl.
+    50, 2005).
     """
 
     name: ClassVar[str] = "gmres"
@@ -234,9 +276,10 @@ class GMRES:
 class KrylovSpace:
     """An orthonormal basis v_0, v_1, ... of what products with S reach from r (N, k), S V = V H, by columns.
 
-    V is (steps + 1, N k) on the device, H (k, steps + 1, steps) float64; `residuals` (k,) are those of min
-    ||beta e_1 - H y|| so far, beta being the norms of r; `complete` are the columns whose space holds all of
-    S and no solution. Of `steps` that there is room for, perhaps fewer than asked for, `count` are made.
+    V is (steps + 1, N k) on the device, H (k, steps + 1, steps) float64; `residuals` (k,) are those
+    of min ||beta e_1 - H y|| so far, beta being the norms of r; `complete` are the columns whose
+    space holds all of S and no solution. Of `steps` that there is room for, perhaps fewer than
+    asked for, `count` are made.
     """
 
     def __init__(self, S: Operator, r: Array, beta: np.ndarray, steps: int) -> None:
@@ -245,27 +288,34 @@ class KrylovSpace:
         room = (device.local_memory // 4 - columns.group) // min(columns.k, columns.group)
         self.steps = min(steps, room - 3)  # whose coefficients a work-group holds
         rows = self.steps + 1
-        device.require(rows * r.nbytes, f"restart={steps}, {rows} directions of {r.size} values each,")
+        device.require(
+            rows * r.nbytes, f"restart={steps}, {rows} directions of {r.size} values each,"
+        )
         self.V, self.H = device.empty((rows, r.size)), np.zeros((r.columns, rows, rows - 1))
         self.residuals = self._beta = np.asarray(beta, np.float64)
         self.complete = np.zeros(r.columns, bool)
         self._is_step = np.zeros((r.columns, rows - 1), bool)
         self._q = np.ones((r.columns, 1))  # q^T H = 0, the last row of all Givens rotations
         v, w = r.like(), r.copy()
-        sums, self._h = columns.sums(rows + 1), [device.empty((rows + 1, columns.k)) for _ in range(2)]
+        sums, self._h = (
+            columns.sums(rows + 1),
+            [device.empty((rows + 1, columns.k)) for _ in range(2)],
+        )
         self._product = S.bind(v, w)
         self._dots = columns.bind("vector_dots", 0, 0, 0, w, self.V, w, w, sums)
         passes = [(0, 0, sums, self._h[0], self._h[0], self.V, w, w)]
         passes.append((1, 1, sums, self._h[0], self._h[1], self.V, w, v))
         self._subtract = [
-            columns.bind("krylov_subtract", 0, columns.slices, *arrays, extra=rows + 2) for arrays in passes
+            columns.bind("krylov_subtract", 0, columns.slices, *arrays, extra=rows + 2)
+            for arrays in passes
         ]
         self._orthogonalize()
 
     def extend(self, active: np.ndarray | bool = True) -> np.ndarray:
         """One step of the `active` columns, (k,) bool; where S v lies in the space but for rounding.
 
-        There the next direction is 0. A column of H that is 0 once rotated leaves its problem as it was.
+        There the next direction is 0. A column of H that is 0 once rotated leaves its problem as it
+        was.
         """
         j = self.count
         self._product()  # 3.
@@ -273,7 +323,9 @@ class KrylovSpace:
         h = np.where(active, self._h[1].get()[: j + 2].astype(np.float64), 0.0).T
         turned, below = np.einsum("kj,kj->k", self._q, h[:, :-1]), h[:, -1]
         length = np.hypot(turned, below)
-        step = ~(length <= _SINGULAR * np.linalg.norm(h, axis=1))  # NaN is a step; the residual will tell
+        step = ~(
+            length <= _SINGULAR * np.linalg.norm(h, axis=1)
+        )  # NaN is a step; the residual will tell
         s = np.where(step, ratio(below, length, step), 1.0)
         self._q = np.column_stack([s[:, None] * self._q, -ratio(turned, length, step)])
         self.residuals = self._beta * np.abs(self._q[:, 0])
@@ -286,7 +338,9 @@ class KrylovSpace:
         used = H * self._is_step[:, None, : self.count]
         finite = np.all(np.isfinite(H), axis=(1, 2), keepdims=True)
         right = self._beta[:, None, None] * e_1
-        y = np.where(finite, np.linalg.pinv(np.where(finite, used, 0.0), rcond=_SINGULAR) @ right, np.nan)
+        y = np.where(
+            finite, np.linalg.pinv(np.where(finite, used, 0.0), rcond=_SINGULAR) @ right, np.nan
+        )
         left = right - used @ y
         self.residuals = np.linalg.norm(left[..., 0], axis=1)
         self._add(x, y[..., 0])  # 12.
@@ -297,7 +351,9 @@ class KrylovSpace:
         """Eigenvalues of the square parts of all H, complex: estimates of those of S."""
         values: list[np.ndarray] = [np.zeros(0)]
         for H in self.H:
-            steps = int(np.argmin([*np.any(H[:, : self.count], axis=0), False]))  # before a column of 0
+            steps = int(
+                np.argmin([*np.any(H[:, : self.count], axis=0), False])
+            )  # before a column of 0
             if np.isfinite(H).all():
                 values.append(np.linalg.eigvals(H[:steps, :steps]))
         return np.concatenate(values)
@@ -305,7 +361,9 @@ class KrylovSpace:
     def _add(self, x: Array, y: np.ndarray) -> None:
         """x = x + sum_j y_j v_j with y (k, j)."""
         count = y.shape[1]
-        minus_y = x.device.upload(np.pad(-y.T, ((0, 1), (0, 0))))  # as sums of one slice, <w, w> among them
+        minus_y = x.device.upload(
+            np.pad(-y.T, ((0, 1), (0, 0)))
+        )  # as sums of one slice, <w, w> among them
         arguments = (count, 1, 0, 0, minus_y, *self._h, self.V, x, x)
         self._columns.bind("krylov_subtract", *arguments, extra=count + 2)()
 

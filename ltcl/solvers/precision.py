@@ -2,9 +2,9 @@
 """S in float64 on the host, where its numbers are at hand: products, LU, and what float32 products hide.
 
 A residual b - S x in float32 deviates from the true one by at most about c eps || |S| || ||x||, eps = 2^-23
-(Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.5, with random signs in place of
-the worst case). A claim rests on a residual that is within the tolerance with this added; where it is not,
-S x is computed in float64 with the numbers that were given.
+(Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.5, with random signs in
+place of the worst case). A claim rests on a residual that is within the tolerance with this added;
+where it is not, S x is computed in float64 with the numbers that were given.
 """
 
 from __future__ import annotations
@@ -27,13 +27,18 @@ from ltcl.operators.parts import MultiDevice, Streamed
 
 Product = Callable[[np.ndarray], np.ndarray]  # (N, k) float64 -> (M, k) float64
 EPS = 2.0**-23
-# c eps. Measured for rows of CSR, dense and tiles: at most 0.1 eps of random signs; of nonnegative numbers,
-# whose sums grow on the way, 0.3 eps at 64 a row, 0.5 at 4096, 0.8 at 16384 and 1.5 at 65536.
+# c eps. Measured for rows of CSR, dense and tiles: at most 0.1 eps of random signs; of nonnegative
+# numbers, whose sums grow on the way, 0.3 eps at 64 a row, 0.5 at 4096, 0.8 at 16384 and 1.5 at
+# 65536.
 UNIT = 4.0 * EPS
-_SMALL = 4 << 20  # bytes of S on the device, up to which a float64 product takes no longer than a few waits
+_SMALL = (
+    4 << 20
+)  # bytes of S on the device, up to which a float64 product takes no longer than a few waits
 _FINE = 4.0 * 2.0**-52  # c eps of float64
 
-_Factors = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # S, LU, pivots; what rounding hides, over |x|
+_Factors = tuple[
+    np.ndarray, np.ndarray, np.ndarray, float
+]  # S, LU, pivots; what rounding hides, over |x|
 _getrf, _gecon = scipy.linalg.get_lapack_funcs(("getrf", "gecon"), dtype=np.float64)
 # What is known of operators, as long as they live; nothing in it may refer to its operator.
 _known: weakref.WeakKeyDictionary[Operator, tuple[Any, Any, Any]] = weakref.WeakKeyDictionary()
@@ -43,8 +48,8 @@ factors: weakref.WeakKeyDictionary[Operator, _Factors] = weakref.WeakKeyDictiona
 def _numbers(S: Operator, read: bool = False) -> tuple[Any, Any, Any] | None:
     """(A, d, e) with S = A diag(d) + diag(e), as they were given; None where only the device has them.
 
-    A is an array, a csr_array, a Host or Streamed; d and e are numbers or (N,). Blocks of a store are read
-    on demand.
+    A is an array, a csr_array, a Host or Streamed; d and e are numbers or (N,). Blocks of a store
+    are read on demand.
     """
     if isinstance(S, IdentityPlus | ScaledColumns):
         if (inner := _numbers(S.R if isinstance(S, IdentityPlus) else S.A, read)) is None:
@@ -94,7 +99,13 @@ def dense(S: Operator) -> tuple[np.ndarray, bool]:
         return S.to_dense(), False
     A, d, e = numbers
     A: Any = A.to_dense() if isinstance(A, Streamed) else A
-    A = A.product(np.eye(n)) if isinstance(A, Host) else A.toarray() if scipy.sparse.issparse(A) else A
+    A = (
+        A.product(np.eye(n))
+        if isinstance(A, Host)
+        else A.toarray()
+        if scipy.sparse.issparse(A)
+        else A
+    )
     matrix = np.multiply(A, d, dtype=np.float64)
     matrix[np.diag_indices(n)] += e
     return matrix, True
@@ -143,7 +154,9 @@ def _factorize(S: Operator) -> _Factors | None:
     except MemoryLimitError:
         raise
     except MemoryError as error:
-        raise MemoryLimitError(f"{what} needs {checks.size(24 * n * n)}, more than the host gives") from error
+        raise MemoryLimitError(
+            f"{what} needs {checks.size(24 * n * n)}, more than the host gives"
+        ) from error
     if info != 0 or not rcond >= np.finfo(np.float64).eps:
         return None
     norm = min(norm, float(np.linalg.norm(numbers)))

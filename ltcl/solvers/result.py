@@ -19,12 +19,16 @@ class Status(enum.Enum):
     CONVERGED = "the true residual is within the tolerance"
     MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
     DIVERGED = "the residual grew"
-    STAGNATED = "the residual stopped falling, or rounding may hide more than the tolerance; loosen rtol"
+    STAGNATED = (
+        "the residual stopped falling, or rounding may hide more than the tolerance; loosen rtol"
+    )
     INDEFINITE = (
         "S is not positive definite in the inner product of cg, which then has no next step; "
         "give the weights= that make S self-adjoint, or try method='gmres' or 'chebyshev'"
     )
-    NO_STEP = "the method has no next step here, not even started anew; try method='gmres' or 'direct'"
+    NO_STEP = (
+        "the method has no next step here, not even started anew; try method='gmres' or 'direct'"
+    )
     SAMPLED = "an estimate with noise; .reason tells what was reached and what to try next"
     PRECOMPUTED = "one product with an inverse whose error is bounded; no residual was computed"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
@@ -36,26 +40,28 @@ class Solution:
 
     Attributes
     ----------
-    x : like b, float32 (float64 of "direct", of values beyond float32, and where `exact` was so refined)
-        The solution; where `converged` is False, the iterate with the smallest residual, or what was sampled.
-        Of `pixels=` (P,) or (P, k), in their order; of three S (3, P) or (3, P, k).
+    x : like b, float32 (float64 of "direct", of values beyond float32, and where `exact` was so
+    refined)
+        The solution; where `converged` is False, the iterate with the smallest residual, or what
+        was sampled. Of `pixels=` (P,) or (P, k), in their order; of three S (3, P) or (3, P, k).
     status : Status
     iterations : int
     products : int
-        Products with S, those for checks included; of "auto" those of all methods tried, and of the survey
-        in the solve that made it, but not the one for the row sums of an operator.
+        Products with S, those for checks included; of "auto" those of all methods tried, and of the
+        survey in the solve that made it, but not the one for the row sums of an operator.
     residuals : tuple of float
         ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
     seconds : float
         Wall time, transfers included.
     method, reason : str
-        The one that ran; why "auto" chose it, or what a method that samples has sampled, else empty.
+        The one that ran; why "auto" chose it, or what a method that samples has sampled, else
+        empty.
     lowest : float, optional
         Residual of the best iterate; the least of `residuals` when not given.
     standard_error : like x, optional
-        Of "monte_carlo": of the noise of n samples, without the bias of alias tables, which leave out entries
-        drawn less than once in about 2^19 times the entries of their row. It falls as 1 / sqrt(n), and as
-        1 / n for light that no sample may have met.
+        Of "monte_carlo": of the noise of n samples, without the bias of alias tables, which leave
+        out entries drawn less than once in about 2^19 times the entries of their row. It falls as 1
+        / sqrt(n), and as 1 / n for light that no sample may have met.
     least_rtol : float, optional
         Of "direct" that did not converge: the smallest rtol that this x can be claimed to meet.
     error : float, optional
@@ -119,14 +125,18 @@ class Solution:
         if self.status is Status.SAMPLED:
             return self.reason or why
         if self.least_rtol is not None:
-            return f"rounding may hide up to {checks.upwards(self.least_rtol)} of it; ask for no less"
+            return (
+                f"rounding may hide up to {checks.upwards(self.least_rtol)} of it; ask for no less"
+            )
         if self.status is Status.STAGNATED and method != "direct":
             return f"{why} or try method='direct'"
         if self.status is not Status.DIVERGED:
             return why
         if method in ("jacobi", "neumann", "matrix_series"):
             why += ": the series converges only where the spectral radius of R is below 1"
-        return f"{why}; try method='{'gmres' if method == 'chebyshev' else 'chebyshev'}' or 'direct'"
+        return (
+            f"{why}; try method='{'gmres' if method == 'chebyshev' else 'chebyshev'}' or 'direct'"
+        )
 
 
 def joined(channels: Sequence[Solution]) -> Solution:
@@ -136,7 +146,9 @@ def joined(channels: Sequence[Solution]) -> Solution:
     return dataclasses.replace(
         channels[0],
         x=np.stack([channel.x for channel in channels]),
-        status=Status.CONVERGED if all(channel.converged for channel in channels) else Status.SAMPLED,
+        status=Status.CONVERGED
+        if all(channel.converged for channel in channels)
+        else Status.SAMPLED,
         iterations=max(channel.iterations for channel in channels),
         products=sum(channel.products for channel in channels),
         residuals=tuple(map(max, zip(*(channel.residuals for channel in channels), strict=True))),

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`solve`: validate, scale right-hand sides, choose a method, run it, unscale.
 
-A method is a frozen dataclass whose fields are its options, with `name`, and `iterate(system, x, r, monitor)`
-or, where it draws random numbers, `sample(channels, callback)`.
+A method is a frozen dataclass whose fields are its options, with `name`, and `iterate(system, x, r,
+monitor)` or, where it draws random numbers, `sample(channels, callback)`.
 
-Of S = I + W^T C W in an orthonormal basis W, S x = b is (I + C) a = W b with x = W^T a: two transforms in
-all. Where W has but some coefficients of such a basis, x = b + W^T (a - W b). `cg` with weights, diagonal in
-pixels alone, runs there.
+Of S = I + W^T C W in an orthonormal basis W, S x = b is (I + C) a = W b with x = W^T a: two
+transforms in all. Where W has but some coefficients of such a basis, x = b + W^T (a - W b). `cg`
+with weights, diagonal in pixels alone, runs there.
 
 Where an exact S judges, a compressed S~ = S + E makes the steps of an iterative refinement,
 
@@ -27,7 +27,13 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
-from ltcl.errors import ConvergenceError, InputError, InputTypeError, MemoryLimitError, ToleranceError
+from ltcl.errors import (
+    ConvergenceError,
+    InputError,
+    InputTypeError,
+    MemoryLimitError,
+    ToleranceError,
+)
 from ltcl.operators import Compressed, Dense, IdentityPlus, Operator, as_operator
 from ltcl.solvers import auto, krylov, stationary
 from ltcl.solvers.monte_carlo import Channel, Hybrid, MonteCarlo, of_channel
@@ -39,12 +45,19 @@ ITERATIVE = {kind.name: kind for kind in (*stationary.METHODS, *krylov.METHODS)}
 SAMPLED = {kind.name: kind for kind in (MonteCarlo, Hybrid)}
 KINDS: dict[str, Any] = {**ITERATIVE, **SAMPLED, Direct.name: Direct}
 METHODS: tuple[str, ...] = (*KINDS, "auto")
-OPTIONS = {name: [own.name for own in dataclasses.fields(kind) if own.init] for name, kind in KINDS.items()}
+OPTIONS = {
+    name: [own.name for own in dataclasses.fields(kind) if own.init] for name, kind in KINDS.items()
+}
 
 _FLOAT32 = 2.0**-20  # relative residual, below which float32 products are left
-_LEAST, _MOST = 1e-3, 0.1  # of the tolerance of a step: many short steps waste products by S, long ones by S~
+_LEAST, _MOST = (
+    1e-3,
+    0.1,
+)  # of the tolerance of a step: many short steps waste products by S, long ones by S~
 _HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
-_on_coefficients: weakref.WeakKeyDictionary[IdentityPlus, IdentityPlus] = weakref.WeakKeyDictionary()
+_on_coefficients: weakref.WeakKeyDictionary[IdentityPlus, IdentityPlus] = (
+    weakref.WeakKeyDictionary()
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +101,8 @@ def solve(
     Parameters
     ----------
     S : (N, N) Operator, array, scipy.sparse matrix or LinearOperator
-        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call. Of a T in
-        colour those are three Operators, which "monte_carlo" and "hybrid" take together.
+        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call. Of a
+        T in colour those are three Operators, which "monte_carlo" and "hybrid" take together.
     b : (N,) or (N, k), or (3, N) or (3, N, k) of three S
         k right-hand sides are solved together, each to its own tolerance.
     method : str
@@ -103,24 +116,26 @@ def solve(
     callback : callable(iteration, relative residual), optional
         Called with every entry of `residuals`, and at each step of a method that samples, with NaN.
     throw : bool
-        Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
-        whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
+        Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that
+        sample, whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
     exact : like S, optional
-        What a compressed S stands for, ``T.interreflection`` of the uncompressed T: S makes the steps of an
-        iterative refinement, and the residual is that of `exact`. Down to 1e-6 by products in float32, and
-        to about 1e-15 in float64 where the numbers of `exact` are at hand.
+        What a compressed S stands for, ``T.interreflection`` of the uncompressed T: S makes the
+        steps of an iterative refinement, and the residual is that of `exact`. Down to 1e-6 by
+        products in float32, and to about 1e-15 in float64 where the numbers of `exact` are at hand.
     **options
         Of the method, as in the table below.
 
     Returns
     -------
     Solution
-        x is like b; of ``pixels=`` (P,) or (P, k), with an infinite `residual`, which nobody knows then.
+        x is like b; of ``pixels=`` (P,) or (P, k), with an infinite `residual`, which nobody knows
+        then.
 
     Raises
     ------
     InputError, InputTypeError
-        Shapes that do not fit, NaN, a tolerance or option out of range, or below the error of a compressed S.
+        Shapes that do not fit, NaN, a tolerance or option out of range, or below the error of a
+        compressed S.
     ToleranceError
         A tolerance below what float32 keeps of an S that is too large to factorize.
     ConvergenceError
@@ -128,9 +143,10 @@ def solve(
 
     Notes
     -----
-    "auto" factorizes small systems; else the row sums of S decide, or "gmres" is tried; at the second solve,
-    or where it fails, a survey of three products shows what takes the least time: see ``.reason``. Below
-    rtol = 1e-6 its choice takes the steps of a refinement in float64. `ltcl.solvers.matrix_series` inverts S.
+    "auto" factorizes small systems; else the row sums of S decide, or "gmres" is tried; at the
+    second solve, or where it fails, a survey of three products shows what takes the least time: see
+    ``.reason``. Below rtol = 1e-6 its choice takes the steps of a refinement in float64.
+    `ltcl.solvers.matrix_series` inverts S.
 
     ====================  =======================================================================
     method                options: what they are; their defaults
@@ -181,7 +197,8 @@ def solve_each(
 ) -> tuple[Solution, ...]:
     """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
 
-    `settings` are those of `solve`, but for x0; `with_residual` asks for b - S x where it costs little.
+    `settings` are those of `solve`, but for x0; `with_residual` asks for b - S x where it costs
+    little.
     """
     exacts = exact or [None] * len(systems)
     if len(systems) == 1 or method not in SAMPLED or any(E is not None for E in exacts):
@@ -198,7 +215,9 @@ def _solve(S: Any, b: Any, method: str, throw: bool = True, **settings: Any) -> 
     start = time.perf_counter()
     with np.errstate(all="ignore"):  # what leaves its range ends the solve, with a status
         problem = _validate(S, b, method, **settings)
-        solution = _automatic(problem) if problem.method is None else _attempt(problem.method, problem)
+        solution = (
+            _automatic(problem) if problem.method is None else _attempt(problem.method, problem)
+        )
     solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
     if throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
         raise ConvergenceError(str(solution), solution)
@@ -211,7 +230,9 @@ def _in_colour(
     """Three channels by samples that they share."""
     start, n = time.perf_counter(), len(systems)
     if method not in SAMPLED or n != 3:
-        raise InputTypeError(f"S is {n} operators, one per colour channel; it must be one: solve each")
+        raise InputTypeError(
+            f"S is {n} operators, one per colour channel; it must be one: solve each"
+        )
     shapes = [_shape("S", S) for S in systems]
     if len(set(shapes)) > 1:
         raise InputError(f"S is operators of shapes {shapes}; all must be the same")
@@ -255,7 +276,9 @@ def _validate(
     if rtol == 0.0 and atol == 0.0:
         raise InputError("rtol is 0; it must be above 0 and below 1, or atol above 0")
     if callback is not None and not callable(callback):
-        raise InputTypeError(f"callback is {callback!r}; it must be callable(iteration, relative residual)")
+        raise InputTypeError(
+            f"callback is {callback!r}; it must be callable(iteration, relative residual)"
+        )
     maxiter = 1000 if maxiter is None else checks.count("maxiter", maxiter)
     if x0 is not None:
         x0 = checks.shape("x0", checks.finite("x0", checks.real("x0", x0)), b.shape)
@@ -266,10 +289,14 @@ def _validate(
             raise InputTypeError(f"unknown option {option!r}; method {method!r} has {has}")
         if method not in owners:
             several = " or ".join(map(repr, owners))
-            raise InputTypeError(f"option {option!r} is one of method={several}, but method is {method!r}")
+            raise InputTypeError(
+                f"option {option!r} is one of method={several}, but method is {method!r}"
+            )
     chosen = KINDS[method](**options) if method in KINDS else None  # of "auto"
     if exact is not None and method in SAMPLED:
-        raise InputTypeError(f"exact= corrects iterates, but method {method!r} samples; leave it out")
+        raise InputTypeError(
+            f"exact= corrects iterates, but method {method!r} samples; leave it out"
+        )
     if isinstance(chosen, MonteCarlo):
         chosen.check(n)
     rule = Rule(rtol, atol / unit if atol else 0.0, maxiter, callback)
@@ -287,7 +314,9 @@ def _validate(
             f"rtol is {rtol:g}{also}; S is compressed and its solutions may be off by "
             f"{checks.upwards(A.solution_error)}: ask for no less, or give exact=T, the uncompressed one"
         )
-    x0 = None if x0 is None else np.where(np.any(b, axis=0), x0 / unit, 0.0)  # no light: x = 0 is exact
+    x0 = (
+        None if x0 is None else np.where(np.any(b, axis=0), x0 / unit, 0.0)
+    )  # no light: x = 0 is exact
     return _Problem(A, b, x0, rule, unit, required, chosen, exact, with_residual)
 
 
@@ -312,7 +341,9 @@ def _exact_operator(exact: Any, S: Operator) -> Operator:
 def _shape(name: str, S: Any) -> tuple[int, ...]:
     """The shape of a square S before it becomes an operator on a device."""
     if hasattr(type(S), "interreflection"):  # asked of the object, it would upload
-        raise InputTypeError(f"{name} is a {type(S).__name__}; give its operator, T.interreflection")
+        raise InputTypeError(
+            f"{name} is a {type(S).__name__}; give its operator, T.interreflection"
+        )
     own = getattr(S, "shape", None) or checks.real(name, S).shape
     if len(own) != 2 or own[0] != own[1]:
         raise InputError(f"{name} has shape {own}; it must be square, (N, N)")
@@ -329,7 +360,9 @@ def _automatic(problem: _Problem) -> Solution:
     if problem.exact is None and target < auto.PRECISE and S.shape[0] > auto.SMALL:
         if product(S) is not None:
             problem = dataclasses.replace(problem, exact=S)
-            reasons.append(f"refined in float64, since rtol={target:g} is below what float32 products reach")
+            reasons.append(
+                f"refined in float64, since rtol={target:g} is below what float32 products reach"
+            )
         elif S.shape[0] > auto.LARGEST_DIRECT:
             raise ToleranceError(
                 f"rtol is {target:g}, less than float32 products tell of S, whose numbers are on the device "
@@ -357,7 +390,11 @@ def _automatic(problem: _Problem) -> Solution:
             problem = dataclasses.replace(problem, x0=attempts[-1].x / problem.unit)
     if failure is not None and not attempts:
         raise failure
-    best = attempts[-1] if attempts[-1].converged else min(attempts, key=lambda attempt: attempt.residual)
+    best = (
+        attempts[-1]
+        if attempts[-1].converged
+        else min(attempts, key=lambda attempt: attempt.residual)
+    )
     return dataclasses.replace(best, products=products, reason="; ".join(reasons))
 
 
@@ -370,7 +407,9 @@ def _attempt(method: Any, problem: _Problem) -> Solution:
     S, x0, rest = problem.S, problem.x0, None
     if problem.exact is None:
         guess, b = None if x0 is None else S.device.upload(x0), S.device.upload(problem.b)
-        x, monitor, r = _iterate(method, S, b, guess, problem.rule, problem.b, problem.with_residual)
+        x, monitor, r = _iterate(
+            method, S, b, guess, problem.rule, problem.b, problem.with_residual
+        )
         x, rest = x.get(), r and unscale(r.get(), problem.unit)
     else:
         x, monitor = _refine(method, problem, problem.exact)
@@ -393,11 +432,19 @@ def _iterate(
     """
     W, right = None, b
     weighted = isinstance(method, krylov.CG) and method.inner(S) is not None
-    if isinstance(S, IdentityPlus) and isinstance(S.R, Compressed) and S.R.two_sided and not weighted:
+    if (
+        isinstance(S, IdentityPlus)
+        and isinstance(S.R, Compressed)
+        and S.R.two_sided
+        and not weighted
+    ):
         W, core = S.R.into, S.R.core
         if S not in _on_coefficients:  # what is learnt of it serves all solves
             inside = _on_coefficients[S] = IdentityPlus(core, S.sign)
-            inside.weights, inside._row_sums = S.weights, S.row_sums()  # in pixels these bound the spectrum
+            inside.weights, inside._row_sums = (
+                S.weights,
+                S.row_sums(),
+            )  # in pixels these bound the spectrum
         S = _on_coefficients[S]
     if W is None:
         norms = vectors.norms(b)
@@ -482,8 +529,12 @@ def _sample(method: Any, problems: Sequence[_Problem]) -> list[Solution]:
     """A method that samples, on colour channels of one size at once; one solution a channel."""
     channels = [Channel(method.name, problem) for problem in problems]
     solutions = []
-    for p, estimate in zip(problems, method.sample(channels, problems[0].rule.callback), strict=True):
+    for p, estimate in zip(
+        problems, method.sample(channels, problems[0].rule.callback), strict=True
+    ):
         error = estimate.standard_error
         error = None if error is None else unscale(error, p.unit)
-        solutions.append(dataclasses.replace(estimate, x=unscale(estimate.x, p.unit), standard_error=error))
+        solutions.append(
+            dataclasses.replace(estimate, x=unscale(estimate.x, p.unit), standard_error=error)
+        )
     return solutions

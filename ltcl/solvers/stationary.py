@@ -1,30 +1,32 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Jacobi, the Neumann series, Richardson, Chebyshev; relaxation, row by row; the whole inverse.
 
-Jacobi to Chebyshev take one launch a step (`Operator.stepper`), with x the iterate and r its residual:
+Jacobi to Chebyshev take one launch a step (`Operator.stepper`), with x the iterate and r its
+residual:
 
     x += d,   r -= S d,   d = keep d + gain r
 
-Jacobi (eq. 20), keep = 0 and gain = 1: from zero, k steps are the k-term inverse Neumann series (eq. 10),
-whose next term is the residual; the forward dual (eq. 18) is the same on I - A. Both need rho(R) < 1.
+Jacobi (eq. 20), keep = 0 and gain = 1: from zero, k steps are the k-term inverse Neumann series
+(eq. 10), whose next term is the residual; the forward dual (eq. 18) is the same on I - A. Both need
+rho(R) < 1.
 
-Richardson, gain = omega, converges for every albedo below one. On a spectrum in [a, b] the best omega is
-2 / (a + b) (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
+Richardson, gain = omega, converges for every albedo below one. On a spectrum in [a, b] the best
+omega is 2 / (a + b) (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
 
-Chebyshev (Saad, algorithm 12.1, whose numbers are in comments): the best polynomial in S for a spectrum in an
-interval, here the free bounds, drawn in by a few steps of GMRES. Where they leave out eigenvalues, the
-residual grows: more steps of GMRES find those, and the iteration goes on with wider bounds. Not for spectra
-with large imaginary parts, nor with eigenvalues on both sides of 0.
+Chebyshev (Saad, algorithm 12.1, whose numbers are in comments): the best polynomial in S for a
+spectrum in an interval, here the free bounds, drawn in by a few steps of GMRES. Where they leave
+out eigenvalues, the residual grows: more steps of GMRES find those, and the iteration goes on with
+wider bounds. Not for spectra with large imaginary parts, nor with eigenvalues on both sides of 0.
 
 Gauss-Seidel, SOR, block Gauss-Seidel and Southwell relax one row or block of rows after the other:
 
-    l_i += omega (l_out_i - sum_(j<i) S_ij l_j^(k+1) - sum_(j>=i) S_ij l_j^(k)) / S_ii,  row i after row i
-    l_B += (S_BB)^-1 (l_out - S l)_B,  block B after block
-    i = argmax |r_i|,  l_i += r_i / S_ii,  r -= S[:, i] r_i / S_ii
+    l_i += omega (l_out_i - sum_(j<i) S_ij l_j^(k+1) - sum_(j>=i) S_ij l_j^(k)) / S_ii,  row i after
+    row i l_B += (S_BB)^-1 (l_out - S l)_B,  block B after block i = argmax |r_i|,  l_i += r_i /
+    S_ii,  r -= S[:, i] r_i / S_ii
 
-Where S is self-adjoint, sweeps converge for every albedo (Saad, theorem 4.10). The residual of an iterate
-comes with the next sweep: k iterations take k + 1, each about one product. Southwell takes the largest
-residual first, as progressive radiosity does (Cohen et al., SIGGRAPH 1988).
+Where S is self-adjoint, sweeps converge for every albedo (Saad, theorem 4.10). The residual of an
+iterate comes with the next sweep: k iterations take k + 1, each about one product. Southwell takes
+the largest residual first, as progressive radiosity does (Cohen et al., SIGGRAPH 1988).
 """
 
 from __future__ import annotations
@@ -47,20 +49,30 @@ from ltcl.solvers import krylov
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import GROWTH, SLOTS, Monitor, System
 
-_BEYOND = 10.0  # times what a residual should be in theory: above what weights of surfaces may do to norms
-_SEEN = 1e-4  # relative residual down to which bounds are judged: below, rounding has its part in it
+# times what a residual should be in theory: above what weights of surfaces may do to norms
+_BEYOND = 10.0
+_SEEN = (
+    1e-4  # relative residual down to which bounds are judged: below, rounding has its part in it
+)
 _REPAIRS = 3  # times that bounds are widened before the monitor alone decides
 _REPAIR_STEPS = 5
 _FIRST_STEPS = 2
 _DEEPER = 4.0  # what a lower bound that failed is divided by: small eigenvalues are found last
-_MARGIN = 0.25  # of the width of the Ritz values, added on both sides: the outermost are not found at once
+# of the width of the Ritz values, added on both sides: the outermost are not found at once
+_MARGIN = 0.25
 _SAFETY = 1.05
-_STEPS = 64  # of an iteration of Southwell's, where `rows` is not given and there are that many pixels
+_STEPS = (
+    64  # of an iteration of Southwell's, where `rows` is not given and there are that many pixels
+)
 _CHUNK = 64  # columns of the matrix series in one product
 
 
 def steps(
-    system: System, x: Array, r: Array, monitor: Monitor, coefficients: Iterator[tuple[float, float]]
+    system: System,
+    x: Array,
+    r: Array,
+    monitor: Monitor,
+    coefficients: Iterator[tuple[float, float]],
 ) -> Iterator[None]:
     """Take steps with (keep, gain), the first for d = gain r alone, until the monitor ends it.
 
@@ -96,7 +108,8 @@ class Jacobi:
         omega = self.omega
         if omega is None:
             lower, upper = theory.free_bounds(system.S)
-            # Row sums that leave float32 tell nothing; a first step without damping shows that S does, too.
+            # Row sums that leave float32 tell nothing; a first step without damping shows that S
+            # does, too.
             omega = 2.0 / (lower + upper) if math.isfinite(upper) else 1.0
         for _ in steps(system, x, r, monitor, itertools.repeat((0.0, float(omega)))):
             pass
@@ -155,7 +168,9 @@ class Chebyshev:
 
     def __post_init__(self) -> None:
         if self.arnoldi is not None and checks.count("arnoldi", self.arnoldi, least=0) == 1:
-            raise InputError("arnoldi is 1; it must be 0 or at least 2, since one step tells no width")
+            raise InputError(
+                "arnoldi is 1; it must be 0 or at least 2, since one step tells no width"
+            )
         if self.spectrum is None:
             return
         try:
@@ -183,7 +198,8 @@ class Chebyshev:
                     break
             if not has_grown and not (math.isfinite(limit) and monitor.resume(x, r)):
                 return
-            # What has grown are the eigenvectors that the bounds leave out; few steps find their eigenvalues.
+            # What has grown are the eigenvectors that the bounds leave out; few steps find their
+            # eigenvalues.
             space = krylov.cycle(system, x, r, monitor, _REPAIR_STEPS)
             lower, upper = _hull(bounds, [*theory.free_bounds(S), *_positive(space.ritz_values())])
             bounds = lower / _DEEPER, upper
@@ -192,7 +208,8 @@ class Chebyshev:
 def drawn_in(bounds: tuple[float, float], S: Operator, ritz: np.ndarray) -> tuple[float, float]:
     """Bounds drawn in to a quarter of the width of the Ritz values around these, and out to hold them.
 
-    With them the mean row sum: near the eigenvalue that dominates R, which a picture may have no part of.
+    With them the mean row sum: near the eigenvalue that dominates R, which a picture may have no
+    part of.
     """
     values = _positive(np.append(ritz, theory.row_sum_range(S)[1]))
     if len(ritz) < 2 or not len(values):
@@ -262,8 +279,9 @@ class SOR(GaussSeidel):
 class Southwell:
     """Options: ``rows`` relaxed in one step; a 64th of the picture when not given.
 
-    With ``rows=1`` it converges for every self-adjoint S. With more, as many equal pieces of the picture
-    relax their largest residuals at once, which may diverge. An iteration relaxes N rows: one product.
+    With ``rows=1`` it converges for every self-adjoint S. With more, as many equal pieces of the
+    picture relax their largest residuals at once, which may diverge. An iteration relaxes N rows:
+    one product.
     """
 
     name: ClassVar[str] = "southwell"
@@ -287,7 +305,9 @@ class Southwell:
         _repeat(relax_all, system, x, r, monitor)
 
 
-def _repeat(iteration: Callable[[], None], system: System, x: Array, r: Array, monitor: Monitor) -> None:
+def _repeat(
+    iteration: Callable[[], None], system: System, x: Array, r: Array, monitor: Monitor
+) -> None:
     """Queue iterations, each of which leaves `r` of `x`, until the monitor ends it; few readings of norms."""
     squares = x.device.empty((SLOTS, x.columns))
     while True:
@@ -311,7 +331,8 @@ def matrix_series(
     Parameters
     ----------
     S : (N, N) Operator, or anything `solve` takes
-        ``T.interreflection`` inverts light transport, ``IdentityPlus(A, sign=-1)`` makes it from one bounce.
+        ``T.interreflection`` inverts light transport, ``IdentityPlus(A, sign=-1)`` makes it from
+        one bounce.
     rtol : float
         Done when ``||e_j - S x_j|| <= rtol`` for every column x_j.
     steps : int, optional
@@ -320,7 +341,8 @@ def matrix_series(
     Returns
     -------
     Solution
-        `x` is the inverse, (N, N) float32; `products` counts those of N x N matrices, one for the residual.
+        `x` is the inverse, (N, N) float32; `products` counts those of N x N matrices, one for the
+        residual.
 
     Raises
     ------
@@ -334,7 +356,9 @@ def matrix_series(
     """
     start = time.perf_counter()
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
-    most = checks.count("maxiter", maxiter) if steps is None else checks.count("steps", steps, least=0)
+    most = (
+        checks.count("maxiter", maxiter) if steps is None else checks.count("steps", steps, least=0)
+    )
     S = as_operator(S)
     n, device = S.shape[1], S.device
     if S.shape[0] != n:
@@ -353,7 +377,9 @@ def matrix_series(
             for chunk, rs in enumerate(r):
                 vectors.axpy(1.0, rs, x[chunk])
                 r[chunk] = S.apply(rs, scale=-1.0, add=rs)  # the next term, -R r = r - S r
-        residual = float(max(vectors.norm(columns).max() for columns in r))  # columns of I have norm 1
+        residual = float(
+            max(vectors.norm(columns).max() for columns in r)
+        )  # columns of I have norm 1
         residuals.append(residual)
         if steps is None and residual <= rtol:
             status = Status.CONVERGED

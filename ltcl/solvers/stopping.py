@@ -2,7 +2,8 @@
 """One stopping rule for every method, and the system it is asked about.
 
 ``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2) for each column of b. CONVERGED is claimed only of a residual
-within the tolerance with all that rounding may hide (`ltcl.solvers.precision`), computed anew where needed.
+within the tolerance with all that rounding may hide (`ltcl.solvers.precision`), computed anew where
+needed.
 """
 
 from __future__ import annotations
@@ -27,8 +28,11 @@ from ltcl.theory import row_sum_range
 
 SLOTS = 8  # steps between two readings, at most
 
-# Residuals of Chebyshev swing: what counts is the start and the largest of a long window, not the best.
-GROWTH = 100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
+# Residuals of Chebyshev swing: what counts is the start and the largest of a long window, not the
+# best.
+GROWTH = (
+    100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
+)
 _RISES = 20  # residuals in a row, each above the one before, up to more than the first
 _WINDOW = 100  # steps whose largest residual must be 1 % below that of as many steps before
 _PATIENCE = 25  # steps without a new best residual once they are near rounding
@@ -46,9 +50,10 @@ _norms: weakref.WeakKeyDictionary[Operator, float] = weakref.WeakKeyDictionary()
 class System:
     """S x = b on the device, counting products.
 
-    `norms` (k,) are what tolerances are relative to: those of the whole right-hand side. `host` is b before
-    it became float32. Of a `fine` system x is float64 on the host, residuals are computed in float64, and r
-    is rounded once. With `on_coefficients` x comes back to pixels in float32: float64 proves nothing.
+    `norms` (k,) are what tolerances are relative to: those of the whole right-hand side. `host` is
+    b before it became float32. Of a `fine` system x is float64 on the host, residuals are computed
+    in float64, and r is rounded once. With `on_coefficients` x comes back to pixels in float32:
+    float64 proves nothing.
     """
 
     S: Operator
@@ -101,9 +106,10 @@ class Rule:
 class Monitor:
     """Watches a solve: decides when it ends, keeps the history and the best iterate.
 
-    A method asks `steps_ahead()` how many steps it may queue, and calls `check` after them; where it has no
-    next step, it sets `status`. `factor` is what a step shrinks its residual by in theory, where it knows.
-    After a check `norms` (k,) are those of the residual, and `unsolved` the columns above the tolerance.
+    A method asks `steps_ahead()` how many steps it may queue, and calls `check` after them; where
+    it has no next step, it sets `status`. `factor` is what a step shrinks its residual by in
+    theory, where it knows. After a check `norms` (k,) are those of the residual, and `unsolved` the
+    columns above the tolerance.
     """
 
     system: System
@@ -150,9 +156,10 @@ class Monitor:
     def check(self, x: Any, r: Array, norms: np.ndarray, travelled: Any = None) -> bool:
         """Whether the solve ends with the iterate `x`, whose residual is `r`; sets `status` when it does.
 
-        `norms` (m, k) are those of the residuals of the m steps since the last check, the newest last.
-        `travelled` is None where r was computed from x itself; of a residual by recursion, computed anew into
-        `r` before convergence is claimed where rounding could hide it, the way (k,) of x, `inf` if unknown.
+        `norms` (m, k) are those of the residuals of the m steps since the last check, the newest
+        last. `travelled` is None where r was computed from x itself; of a residual by recursion,
+        computed anew into `r` before convergence is claimed where rounding could hide it, the way
+        (k,) of x, `inf` if unknown.
         """
         *before, last = norms
         if travelled is None:
@@ -162,9 +169,13 @@ class Monitor:
         self.norms, claimed = self._confirm(x, r, last)
         troubles = [self._judge(norms) for norms in (*before, self.norms)]
         self.unsolved = self.above(self.norms)
-        if not claimed and not self.unsolved.any():  # within the tolerance, but for what rounding may hide
+        if (
+            not claimed and not self.unsolved.any()
+        ):  # within the tolerance, but for what rounding may hide
             self.unsolved = self.norms > 0.0
-        if self._finite and self.residuals[-1] <= self.lowest:  # equal: one column stuck, others improve
+        if (
+            self._finite and self.residuals[-1] <= self.lowest
+        ):  # equal: one column stuck, others improve
             if self.residuals[-1] < self.lowest:
                 self.lowest, self._lowest_at = self.residuals[-1], self.iterations
             self.best = x if claimed else x.copy()
@@ -181,7 +192,8 @@ class Monitor:
     def due(self, norms: np.ndarray) -> bool:
         """Whether a method that need not form its iterate after every step has to after this one.
 
-        `norms` are what it knows of the residual without; where the answer is no, they are recorded.
+        `norms` are what it knows of the residual without; where the answer is no, they are
+        recorded.
         """
         if self.iterations + 1 >= self.rule.maxiter or not np.all(np.isfinite(norms)):
             return True
@@ -191,7 +203,11 @@ class Monitor:
 
     def resume(self, x: Array, r: Array) -> bool:
         """Whether a solve that grew may go on, with another choice of its method, from its best iterate."""
-        if self.status is not Status.DIVERGED or self.best is None or self.iterations >= self.rule.maxiter:
+        if (
+            self.status is not Status.DIVERGED
+            or self.best is None
+            or self.iterations >= self.rule.maxiter
+        ):
             return False
         self.status, self._rises, self._finite = None, 0, True
         self._steps, self._travelled = 0, 0.0
@@ -267,13 +283,22 @@ class Monitor:
 def scale_rhs(b: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     """b, (n,) or (n, k), in units near the largest value of each column, float32 where it is so already.
 
-    The units come with it: powers of two, so that squares of any light stay in float32 and no digit is lost.
+    The units come with it: powers of two, so that squares of any light stay in float32 and no digit
+    is lost.
     """
     b = checks.finite("b", checks.real("b", b))
     if b.ndim not in (1, 2) or b.shape[0] != n or b.size == 0:
         raise InputError(f"b has shape {b.shape}; it must be ({n},) or ({n}, k)")
-    whole = len(b) // 256 * 256  # 256 rows side by side: NumPy reduces an axis of few columns slowly
-    sizes = np.abs(b[:whole]).reshape(256, -1).max(axis=0).reshape(-1, *b.shape[1:]).max(axis=0, initial=0)
+    whole = (
+        len(b) // 256 * 256
+    )  # 256 rows side by side: NumPy reduces an axis of few columns slowly
+    sizes = (
+        np.abs(b[:whole])
+        .reshape(256, -1)
+        .max(axis=0)
+        .reshape(-1, *b.shape[1:])
+        .max(axis=0, initial=0)
+    )
     sizes = np.maximum(sizes, np.abs(b[whole:]).max(axis=0, initial=0)).astype(np.float64)
     unit = np.exp2(np.floor(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
     is_float32 = b.dtype == np.float32 and np.all(unit >= _NORMAL)
@@ -299,8 +324,8 @@ def relative(residuals: np.ndarray, norms: np.ndarray) -> float:
 def norm_bound(S: Operator) -> tuple[float, bool]:
     """A bound on the 2-norm of |S|, entry by entry, and whether it is one, computed once in the life of S.
 
-    The Frobenius norm of the numbers, between isometric bases that of the core; of other operators the
-    largest row sum, a bound of symmetric S >= 0, an estimate else.
+    The Frobenius norm of the numbers, between isometric bases that of the core; of other operators
+    the largest row sum, a bound of symmetric S >= 0, an estimate else.
     """
     if isinstance(S, IdentityPlus):
         norm, is_bound = norm_bound(S.R)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`BlockStore`: a transport on disk that grows by batches of columns, and is never half of one.
 
-A growing store is a folder of `zarr.json` (sizes, provenance, attributes, checksum) and `log/`, an .npz and
-its SHA-256 a batch or small array, each written in a temporary and renamed. `finalize` lets zarr write T next
-to the log: rows in `channel_0/block_000000.0` and so on, in binsparse CSR layout, small arrays in
-`extra/NAME.0`, each array one chunk with crc32c. With the rename of zarr.json, which then has the SHA-256 of
-every file, the store is final, and the log goes. Ended at any moment, all that was committed stays.
+A growing store is a folder of `zarr.json` (sizes, provenance, attributes, checksum) and `log/`, an
+.npz and its SHA-256 a batch or small array, each written in a temporary and renamed. `finalize`
+lets zarr write T next to the log: rows in `channel_0/block_000000.0` and so on, in binsparse CSR
+layout, small arrays in `extra/NAME.0`, each array one chunk with crc32c. With the rename of
+zarr.json, which then has the SHA-256 of every file, the store is final, and the log goes. Ended at
+any moment, all that was committed stays.
 """
 
 from __future__ import annotations
@@ -27,24 +28,39 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks, first_bounce
+from ltcl import checks
 from ltcl.errors import FileError, InputError
-from ltcl.files import as_path, fill_folder, flush_tree, input_file, locked, replace_file, restore, sweep
-from ltcl.noise import Noise
+from ltcl.files import (
+    as_path,
+    fill_folder,
+    flush_tree,
+    input_file,
+    locked,
+    replace_file,
+    restore,
+    sweep,
+)
 from ltcl.store.record import CSR, EXTRAS, Parts, Record, StoredRows, about, declared, sparse
+from ltcl.transport import first_bounce
+from ltcl.transport.noise import Noise
 
 _START, _UNSEALED = b'{"attributes": {"checksum": "', b"0" * 64
 _ENTRY = re.compile(r"([A-Za-z][A-Za-z0-9_.-]{0,120})\.npz")
-_ARRAY = re.compile(r"((.+)\.\d+/(\w+))/zarr\.json")  # of a final store: place, name of the group, name
+_ARRAY = re.compile(
+    r"((.+)\.\d+/(\w+))/zarr\.json"
+)  # of a final store: place, name of the group, name
 _BINSPARSE: dict[str, str] = dict(zip(("values", "indices_1", "pointers_to_1"), CSR, strict=True))
-Block = namedtuple("Block", "matrix variance")  # rows of T, or columns, and the variance of their entries
+Block = namedtuple(
+    "Block", "matrix variance"
+)  # rows of T, or columns, and the variance of their entries
 
 
 @dataclass
 class Layout:
     """Sizes of a stored transport: `shape` (M, N), `grid` and `camera_grid` (h, w), 1 or 3 `channels`.
 
-    A block is `block_rows` rows of T, or columns in the log; "compressed", all of T is in extra arrays.
+    A block is `block_rows` rows of T, or columns in the log; "compressed", all of T is in extra
+    arrays.
     """
 
     shape: tuple[int, int]
@@ -99,7 +115,9 @@ class ArrayLog:
     def put(self, name: str, **arrays: Any) -> None:
         """Commit arrays of numbers or texts; what has that name already is replaced whole, or stays."""
         if not _ENTRY.fullmatch(f"{name}.npz"):
-            raise InputError(f"name is {name!r:.60}; it must be letters, digits, _, - and ., a letter first")
+            raise InputError(
+                f"name is {name!r:.60}; it must be letters, digits, _, - and ., a letter first"
+            )
         with replace_file(self.path / f"{name}.npz") as temporary:
             np.savez(temporary, **arrays)
             raw = temporary.read_bytes()
@@ -117,8 +135,8 @@ class ArrayLog:
 class BlockStore:
     """A transport that grows by batches of its columns, made by `create` or opened by `open`.
 
-    Any number of processes may write at once; what they write is committed when the call returns. After
-    `finalize` it is `final`: T is there by rows, and nothing is written any more.
+    Any number of processes may write at once; what they write is committed when the call returns.
+    After `finalize` it is `final`: T is there by rows, and nothing is written any more.
 
     Examples
     --------
@@ -138,18 +156,26 @@ class BlockStore:
 
     @classmethod
     def create(
-        cls, path: str | os.PathLike[str], *, provenance: Any = None, overwrite: bool = False, **sizes: Any
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        provenance: Any = None,
+        overwrite: bool = False,
+        **sizes: Any,
     ) -> BlockStore:
         """An empty store at `path`, where nothing is yet, or a store to `overwrite`.
 
-        `sizes` are those of `Layout`, with `block_rows` columns a batch; `provenance` is plain JSON.
+        `sizes` are those of `Layout`, with `block_rows` columns a batch; `provenance` is plain
+        JSON.
         """
         from ltcl import __version__  # here, because it is set after this module is imported
 
         path, layout = as_path(path), Layout(**sizes)
         check_place(path, overwrite)
         with fill_folder(path, replace=True) as folder:
-            _write_document(folder, layout, {"versions": {"ltcl": __version__}, **(provenance or {})}, {})
+            _write_document(
+                folder, layout, {"versions": {"ltcl": __version__}, **(provenance or {})}, {}
+            )
         return cls(path)
 
     @classmethod
@@ -165,7 +191,9 @@ class BlockStore:
     @property
     def written(self) -> frozenset[tuple[int, int]]:
         """(channel, batch) of all in the log; asked of the disk, so other writers' batches count."""
-        return frozenset((int(n[8]), int(n[10:])) for n in self._log.names if n.startswith("columns_"))
+        return frozenset(
+            (int(n[8]), int(n[10:])) for n in self._log.names if n.startswith("columns_")
+        )
 
     def missing(self) -> list[tuple[int, int]]:
         """(channel, batch) of all that is not committed, in order."""
@@ -175,7 +203,8 @@ class BlockStore:
     def write(self, channel: int, block: int, matrix: Any, variance: Any = None) -> None:
         """Commit a batch: when this returns it is on the disk, whole; if it raises, what was there still is.
 
-        `matrix` is sparse (columns, M), kept as float32; `variance` (nnz,) of entries is NaN where unknown.
+        `matrix` is sparse (columns, M), kept as float32; `variance` (nnz,) of entries is NaN where
+        unknown.
         """
         name = self._name(channel, block)
         C, variance = _checked(matrix, variance, self.layout.block_shape(block, "columns"))
@@ -188,20 +217,30 @@ class BlockStore:
         with about(self.path, reading=True), about(name, reading=True):
             arrays = self._get(name)
             data, *places = (arrays[array] for array in CSR)
-            matrix = sparse(lambda: scipy.sparse.csr_array((data, *places), shape=shape), shape, len(data))
+            matrix = sparse(
+                lambda: scipy.sparse.csr_array((data, *places), shape=shape), shape, len(data)
+            )
             return Block(matrix, arrays.get("variance"))
 
     def rows_again(self, channel: int, block: int) -> tuple[int, scipy.sparse.csr_array]:
         """First row and matrix of a `block` checked before, read without checks: as fast as the disk."""
         first, shape = self.layout.span(block)[0], self.layout.block_shape(block)
-        places = (self.path / self._places[self._name(channel, block)][name] / "c/0" for name in CSR)
-        with contextlib.suppress(OSError, ValueError, IndexError):  # an array of no entries has no file
+        places = (
+            self.path / self._places[self._name(channel, block)][name] / "c/0" for name in CSR
+        )
+        with contextlib.suppress(
+            OSError, ValueError, IndexError
+        ):  # an array of no entries has no file
             bare = (np.fromfile(place, np.uint8)[:-4] for place in places)  # without crc32c
             types = self.layout.dtype, np.int32, np.int64
-            data, indices, indptr = (array.view(type_) for array, type_ in zip(bare, types, strict=True))
+            data, indices, indptr = (
+                array.view(type_) for array, type_ in zip(bare, types, strict=True)
+            )
             if len(data) == len(indices) == indptr[-1] and len(indptr) == shape[0] + 1:
                 kind = np.int32 if len(data) < 1 << 31 else np.int64  # SciPy makes both alike
-                return first, scipy.sparse.csr_array((data, indices, indptr.astype(kind)), shape=shape)
+                return first, scipy.sparse.csr_array(
+                    (data, indices, indptr.astype(kind)), shape=shape
+                )
         return first, self.block(channel, block).matrix  # in another layout, or damaged
 
     def extra(self, name: str, array: Any = None) -> np.ndarray:
@@ -226,13 +265,19 @@ class BlockStore:
             self._refresh()
 
     def finalize(
-        self, *, sigmas=0.0, change: Callable | None = None, compressed: Parts | None = None, memory=1 << 28
+        self,
+        *,
+        sigmas=0.0,
+        change: Callable | None = None,
+        compressed: Parts | None = None,
+        memory=1 << 28,
     ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
-        The diagonal is a first bounce where it is above 0 by `sigmas` standard deviations; `change`, of
-        channel, first row, rows (rows, N) and the variance of their entries, returns the last two anew. A
-        transport `compressed` takes the place of all columns. `memory` is about how many bytes are used.
+        The diagonal is a first bounce where it is above 0 by `sigmas` standard deviations;
+        `change`, of channel, first row, rows (rows, N) and the variance of their entries, returns
+        the last two anew. A transport `compressed` takes the place of all columns. `memory` is
+        about how many bytes are used.
         """
         with self._writing(finished=True):
             if not self.final:
@@ -242,7 +287,9 @@ class BlockStore:
                     layout, arrays, texts = _compressed(compressed)
                     rows, extras, state = (), extras | arrays, state | texts
                 elif missing := self.missing():
-                    raise FileError(f"lacks {len(missing)} blocks (channel, block) {missing[:6]}; resume it")
+                    raise FileError(
+                        f"lacks {len(missing)} blocks (channel, block) {missing[:6]}; resume it"
+                    )
                 _write_finished(self.path, layout, rows, extras, self.provenance, state, sigmas)
                 self._refresh()
             shutil.rmtree(self._log.path, ignore_errors=True)
@@ -259,7 +306,11 @@ class BlockStore:
     def _name(self, channel: int, block: int) -> str:
         checks.count("channel", channel, least=0, most=self.layout.channels - 1)
         checks.count("block", block, least=0, most=self.layout.blocks(self._orientation) - 1)
-        return f"channel_{channel}/block_{block:06d}" if self.final else f"columns_{channel}.{block:06d}"
+        return (
+            f"channel_{channel}/block_{block:06d}"
+            if self.final
+            else f"columns_{channel}.{block:06d}"
+        )
 
     def _get(self, name: str) -> dict[str, np.ndarray]:
         if not self.final:
@@ -298,11 +349,15 @@ class BlockStore:
             content["ltcl"].pop("orientation", None)  # of earlier stores
             self.layout, self.provenance = Layout(**content["ltcl"]), content["provenance"]
             self.attributes: dict[str, Any] = content["state"]
-            files = _files_1(self.path, content) if self.layout.schema == 1 else content.get("files")
+            files = (
+                _files_1(self.path, content) if self.layout.schema == 1 else content.get("files")
+            )
             self.final, self._files = files is not None, files or {}
             self._orientation = "rows" if self.final else "columns"
             self._places: dict[str, dict[str, str]] = {}  # of arrays in their groups
-            for place, group, array in (m.groups() for m in map(_ARRAY.fullmatch, self._files) if m):
+            for place, group, array in (
+                m.groups() for m in map(_ARRAY.fullmatch, self._files) if m
+            ):
                 arrays = self._places.setdefault(group.replace("extra/", "extra."), {})
                 arrays[_BINSPARSE.get(array, array)] = place
 
@@ -310,14 +365,18 @@ class BlockStore:
         """All blocks of rows; as many as fit the memory are gathered in a pass over the columns."""
         layout, span, batches = self.layout, self.layout.span, range(self.layout.blocks("columns"))
         size = sum(file.stat().st_size for file in self._log.path.iterdir()) // layout.channels
-        passes = min(4 * size // memory + 1, layout.blocks())  # entries as cut, joined and transposed
+        passes = min(
+            4 * size // memory + 1, layout.blocks()
+        )  # entries as cut, joined and transposed
         change = change or (lambda channel, first, *rows: rows)
         parts = np.array_split(np.arange(layout.blocks()), passes)
         for channel, blocks in itertools.product(range(layout.channels), parts):
             first, stop, columns = span(blocks[0])[0], span(blocks[-1])[1], []
             for C, variance in (self.block(channel, batch) for batch in batches):
                 data = np.stack([C.data, variance], axis=1).view(np.complex64).ravel()  # T + i V
-                columns.append(scipy.sparse.csr_array((data, C.indices, C.indptr), C.shape)[:, first:stop])
+                columns.append(
+                    scipy.sparse.csr_array((data, C.indices, C.indptr), C.shape)[:, first:stop]
+                )
             T = scipy.sparse.vstack(columns, "csr").T.tocsr()
             for block in blocks.tolist():
                 R = T[span(block)[0] - first : span(block)[1] - first]
@@ -331,8 +390,12 @@ def read(path: Path) -> Record | Parts:
     if not store.final:
         raise FileError("is a scan that is not finished; finalize it first")
     if store.layout.kind == "compressed":
-        arrays = {name: store.extra(name) for name in store.attributes["arrays"]}  # others are no part of it
-        return Parts(arrays | {name: np.array(str(text)) for name, text in store.attributes["texts"].items()})
+        arrays = {
+            name: store.extra(name) for name in store.attributes["arrays"]
+        }  # others are no part of it
+        return Parts(
+            arrays | {name: np.array(str(text)) for name, text in store.attributes["texts"].items()}
+        )
     matrices = tuple(StoredRows(store, channel) for channel in range(store.layout.channels))
     extras = {n: store.extra(n) for n in store.extras if n in EXTRAS or n.startswith("noise_")}
     F, grids = extras.get("first_bounce"), (store.layout.grid, store.layout.camera_grid)
@@ -350,10 +413,17 @@ def write(path: Path, content: Record | Parts) -> None:
         T: Any = content.matrices
         dtype = np.result_type(*(M.dtype for M in T), np.float32).name
         layout = Layout(content.shape, content.grid, content.camera_grid, len(T), dtype=dtype)
-        extras = {n: np.atleast_2d(a) for n, a in vars(content).items() if n in EXTRAS[2:] and a is not None}
+        extras = {
+            n: np.atleast_2d(a)
+            for n, a in vars(content).items()
+            if n in EXTRAS[2:] and a is not None
+        }
         extras |= {} if content.noise is None else content.noise.to_arrays()
         every = itertools.product(range(len(T)), range(layout.blocks()))
-        rows = ((c, k, Block(scipy.sparse.csr_array(T[c][slice(*layout.span(k))]), None)) for c, k in every)
+        rows = (
+            (c, k, Block(scipy.sparse.csr_array(T[c][slice(*layout.span(k))]), None))
+            for c, k in every
+        )
     with fill_folder(path, replace=True) as folder:
         _write_finished(folder, layout, rows, extras, {}, state)
 
@@ -367,7 +437,9 @@ def check_place(path: Path, overwrite: bool) -> None:
             document = target / "zarr.json"
             is_store = document.is_file() and document.read_bytes().startswith(_START)
             if not (is_store and overwrite):
-                raise FileError(f"exists; {'give overwrite=True' if is_store else 'it is no store of ltcl'}")
+                raise FileError(
+                    f"exists; {'give overwrite=True' if is_store else 'it is no store of ltcl'}"
+                )
 
 
 def _compressed(parts: Parts) -> tuple[Layout, dict[str, Any], dict[str, Any]]:
@@ -384,16 +456,26 @@ def _checked(matrix: Any, variance: Any, shape: tuple[int, int]) -> Block:
     checks.shape("matrix", matrix, shape)
     with np.errstate(over="ignore"):
         values = checks.finite("matrix as float32", matrix.data.astype(np.float32))
-    variance = np.full(matrix.nnz, np.nan) if variance is None else checks.real("variance", variance)
+    variance = (
+        np.full(matrix.nnz, np.nan) if variance is None else checks.real("variance", variance)
+    )
     checks.shape("variance", variance, (matrix.nnz,))
     if np.any(variance < 0) or np.any(np.isinf(variance)):
-        raise InputError("variance is negative or infinite; it must be at least 0, or NaN where unknown")
+        raise InputError(
+            "variance is negative or infinite; it must be at least 0, or NaN where unknown"
+        )
     rows = scipy.sparse.csr_array((values, matrix.indices, matrix.indptr), shape=shape)
     return Block(rows, variance.astype(np.float32))
 
 
 def _write_finished(
-    root: Path, layout: Layout, rows: Any, extras: Any, provenance: Any, state: Any, sigmas: float = 0.0
+    root: Path,
+    layout: Layout,
+    rows: Any,
+    extras: Any,
+    provenance: Any,
+    state: Any,
+    sigmas: float = 0.0,
 ) -> None:
     """Write T and all small arrays by zarr into `root`, flushed, and last the document with their SHA-256."""
     groups = ["extra", *(f"channel_{c}" for c in range(layout.channels))]
@@ -404,7 +486,9 @@ def _write_finished(
     is_square = layout.camera_grid in (None, layout.grid)  # only then T has a first bounce
     types = {"values": layout.dtype, "indices_1": "int32", "pointers_to_1": "int64"}
     for channel, number, (T, variance) in rows:
-        arrays = {name: np.asarray(getattr(T, _BINSPARSE[name]), dtype) for name, dtype in types.items()}
+        arrays = {
+            name: np.asarray(getattr(T, _BINSPARSE[name]), dtype) for name, dtype in types.items()
+        }
         arrays |= {} if variance is None else {"variance": variance}
         header = {"version": "0.1", "format": "CSR", "shape": T.shape, "data_types": types}
         header["number_of_stored_values"] = T.nnz
@@ -419,7 +503,9 @@ def _write_finished(
     for name, array in extras.items():
         _write_group(root / "extra" / f"{name}.0", {"array": np.asarray(array)})
     files = [file for group in groups for file in flush_tree(root / group)]
-    sums = {f.relative_to(root).as_posix(): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+    sums = {
+        f.relative_to(root).as_posix(): hashlib.sha256(f.read_bytes()).hexdigest() for f in files
+    }
     _write_document(root, layout, provenance, state, files=sums)
 
 
@@ -427,7 +513,10 @@ def _write_group(folder: Path, arrays: Mapping[str, np.ndarray], **attributes: A
     import zarr.codecs
 
     group = zarr.create_group(folder, attributes=attributes)
-    options: Any = {"compressors": zarr.codecs.Crc32cCodec(), "config": {"write_empty_chunks": True}}
+    options: Any = {
+        "compressors": zarr.codecs.Crc32cCodec(),
+        "config": {"write_empty_chunks": True},
+    }
     for name, array in arrays.items():
         chunks = tuple(max(n, 1) for n in array.shape)
         group.create_array(name, data=array, chunks=chunks, **options)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Transport files by extension: transports (`load`, `save`), and what files hold (`read`, `write`).
 
-An .npz holds SciPy's `save_npz` layouts; or named arrays, `T` (M, N) or (3, M, N) or the only matrix; or, by
-its `format`, a compressed transport, an inverse, or three sparse channels ("ltcl-rgb-csr-1": `shape`,
-`indptr_0`, `indices_0`, `data_0` to `data_2`); and perhaps `EXTRAS`. Not compressed, as light hardly shrinks.
+An .npz holds SciPy's `save_npz` layouts; or named arrays, `T` (M, N) or (3, M, N) or the only
+matrix; or, by its `format`, a compressed transport, an inverse, or three sparse channels
+("ltcl-rgb-csr-1": `shape`, `indptr_0`, `indices_0`, `data_0` to `data_2`); and perhaps `EXTRAS`.
+Not compressed, as light hardly shrinks.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.first_bounce import DARK
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
-from ltcl.transport import Transport, from_arrays, intact, require, to_arrays
+from ltcl.transport.first_bounce import DARK
+from ltcl.transport.transport import Transport, from_arrays, intact, require, to_arrays
 
 COMPRESSED, INVERSE, RGB = "ltcl-compressed-1", "ltcl-inverse-1", "ltcl-rgb-csr-1"
 _INDICES = ("indices", "indptr", "row", "col", "coords", "offsets")
@@ -51,18 +52,21 @@ def load(
     ----------
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
-        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or .mat file
-        (versions 5 and 7.3, `LTM` (M, N) or (M, N, 3)), or the folder of a store.
+        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or
+        .mat file (versions 5 and 7.3, `LTM` (M, N) or (M, N, 3)), or the folder of a store.
     variable
         Name of the matrix in a .npz, .h5 or .mat file; else T (in .mat LTM), or the only matrix.
     grid, camera_grid
-        (h, w) of projector and camera; needed where they are not in the file, and preferred to its own.
+        (h, w) of projector and camera; needed where they are not in the file, and preferred to its
+        own.
     first_bounce, on_dark, dark, device, noise
-        As in `Transport`; None takes what is in the file, or else the diagonal, and noise is estimated.
+        As in `Transport`; None takes what is in the file, or else the diagonal, and noise is
+        estimated.
 
-    Values of up to 16 bits and float32 become float32, all others float64; compressed ones keep their bits.
-    HDF5, .mtx and .mat keep no checksums: a flipped bit may be another number. FileError for a file that is
-    missing, damaged, without a grid or no transport; MemoryLimitError where host or device have no room.
+    Values of up to 16 bits and float32 become float32, all others float64; compressed ones keep
+    their bits. HDF5, .mtx and .mat keep no checksums: a flipped bit may be another number.
+    FileError for a file that is missing, damaged, without a grid or no transport; MemoryLimitError
+    where host or device have no room.
 
     Examples
     --------
@@ -73,7 +77,11 @@ def load(
     (6, 6)
     """
     options: dict[str, Any] = {"first_bounce": first_bounce, "on_dark": on_dark, "dark": dark}
-    again = options | {"variable": variable, "grid": grid, "camera_grid": camera_grid}  # on any device
+    again = options | {
+        "variable": variable,
+        "grid": grid,
+        "camera_grid": camera_grid,
+    }  # on any device
     options |= {"device": device, "noise": noise}
     content = read(path, variable=variable)
     with about(path):
@@ -109,12 +117,13 @@ def _grid(name: str, grid: Any, pixels: int, whose: str) -> tuple[int, int]:
 def save(path: str | os.PathLike[str], T: Transport) -> None:
     """Save a transport; an earlier file at `path` is replaced whole or not at all.
 
-    .npz and .zarr keep everything, and they alone compressed operators; .h5 all else, and .mat (version 5,
-    less than 4 GiB a variable), but for noise; .npy (dense only) the matrix; .mtx (one channel) matrix and
-    grids. An estimate of noise is not saved, and of pixels dropped by ``on_dark="mask"`` a first bounce of 0.
+    .npz and .zarr keep everything, and they alone compressed operators; .h5 all else, and .mat
+    (version 5, less than 4 GiB a variable), but for noise; .npy (dense only) the matrix; .mtx (one
+    channel) matrix and grids. An estimate of noise is not saved, and of pixels dropped by
+    ``on_dark="mask"`` a first bounce of 0.
 
-    FileError where the extension is unknown, the format cannot hold this transport, or the file cannot be
-    written; InputTypeError for 3 x 3 blocks, or operators that are no compressed S F.
+    FileError where the extension is unknown, the format cannot hold this transport, or the file
+    cannot be written; InputTypeError for 3 x 3 blocks, or operators that are no compressed S F.
 
     Examples
     --------
@@ -125,10 +134,14 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     (2, 3)
     """
     if require(T, square=False).blocks is not None:
-        raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
+        raise InputTypeError(
+            "T has 3 x 3 blocks between colours; only one matrix or three can be saved"
+        )
     if not any(isinstance(M, Matrix) for M in T.matrices):
         return write(path, Parts(to_arrays(T)))
-    matrices = [record.floats("T", intact(M)) if isinstance(M, np.ndarray) else M for M in T.matrices]
+    matrices = [
+        record.floats("T", intact(M)) if isinstance(M, np.ndarray) else M for M in T.matrices
+    ]
     F = T.first_bounce if T.is_square else None
     write(path, Record(tuple(matrices), T.grid, T.camera_grid, F, T.mixing, T.measured_noise))
 
@@ -146,7 +159,9 @@ def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
     True
     """
     if not isinstance(inverse, Inverse):
-        raise InputTypeError(f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives")
+        raise InputTypeError(
+            f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives"
+        )
     write(path, Parts(inverse.to_arrays(), INVERSE))
 
 
@@ -163,18 +178,24 @@ def read(path: str | os.PathLike[str], *, variable: str | None = None) -> Record
     """A `Record`, or `Parts` of a compressed transport or of an inverse; errors are those of `load`."""
     suffix = find(path := as_path(path))
     if variable is not None and suffix in (".npy", ".mtx", ".zarr"):
-        raise FileError(f"{path}: variable is {variable!r}, but the matrix of this format has no name")
+        raise FileError(
+            f"{path}: variable is {variable!r}, but the matrix of this format has no name"
+        )
     if suffix != ".zarr":
         input_file(path)
     elif path.is_dir() and not (path / "zarr.json").exists():
-        raise FileError(f"{path}: is a folder with neither zarr.json, of a store, nor acquisition.toml")
+        raise FileError(
+            f"{path}: is a folder with neither zarr.json, of a store, nor acquisition.toml"
+        )
     with about(path, reading=True):
         return FORMATS[suffix][0](path, *([] if variable is None else [variable]))
 
 
 def write(path: str | os.PathLike[str], content: Record | Parts) -> None:
     """Write a transport file whole or not at all; errors are those of `save`."""
-    suffix = find(path := as_path(path), inverse=isinstance(content, Parts) and content.format == INVERSE)
+    suffix = find(
+        path := as_path(path), inverse=isinstance(content, Parts) and content.format == INVERSE
+    )
     lost, bare = f"{path}: {path.suffix} does not keep", suffix in (".npy", ".mtx")
     if isinstance(content, Parts):
         if suffix not in (".npz", ".zarr"):
@@ -215,14 +236,18 @@ def _read_npz(path: Path, variable: str | None = None) -> Record | Parts:
         layout = str(load("format")) if "format" in headers else None
         if layout in (COMPRESSED, INVERSE):
             return Parts({name: load(name) for name in headers if name != "format"}, layout)
-        shapes = {n: s for n, (s, dtype) in headers.items() if dtype.kind in "fiubc" or n[:6] == "noise_"}
+        shapes = {
+            n: s for n, (s, dtype) in headers.items() if dtype.kind in "fiubc" or n[:6] == "noise_"
+        }
         matrices: dict[str, Any] = {}
         if layout and variable is None:
             if "shape" not in headers:
                 raise FileError(f"array 'format' is {layout!r:.60}, which is unknown")
             M, N = checks.grid("array 'shape'", load("shape").tolist())
             for name, (_, dtype) in headers.items():
-                if name.startswith(_INDICES) and dtype.kind not in "iu":  # SciPy would truncate them
+                if (
+                    name.startswith(_INDICES) and dtype.kind not in "iu"
+                ):  # SciPy would truncate them
                     raise FileError(f"array {name!r} holds {dtype}; it must hold integers")
             entries = path.stat().st_size // 8  # about, and enough to bound the rows
             if layout != RGB:
@@ -232,7 +257,9 @@ def _read_npz(path: Path, variable: str | None = None) -> Record | Parts:
                 make = functools.partial(scipy.sparse.csr_array, arrays, shape=(M, N))
                 matrices[channel] = record.sparse(make, (M, N), entries)
         shapes |= dict.fromkeys(matrices, (1, 1))
-        return record.assemble(shapes, lambda n: matrices[n] if n in matrices else load(n), variable)
+        return record.assemble(
+            shapes, lambda n: matrices[n] if n in matrices else load(n), variable
+        )
 
 
 def _headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -240,7 +267,10 @@ def _headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     headers, size = {}, path.stat().st_size
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
-            name, most = info.filename.removesuffix(".npy"), record.EXPANSION * min(info.compress_size, size)
+            name, most = (
+                info.filename.removesuffix(".npy"),
+                record.EXPANSION * min(info.compress_size, size),
+            )
             with archive.open(info) as stream:
                 version = "1_0" if np.lib.format.read_magic(stream) == (1, 0) else "2_0"
                 shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version}")(stream)
@@ -257,7 +287,11 @@ def _write_npz(path: Path, content: Record | Parts) -> None:
         arrays = content.arrays()
     else:  # one matrix as SciPy writes it: bytes, and a flag for csr_array
         ends = [""] if len(content.matrices) == 1 else ["_0", "_1", "_2"]
-        header = {"format": RGB if ends[1:] else np.array(b"csr"), "_is_array": True, "shape": content.shape}
+        header = {
+            "format": RGB if ends[1:] else np.array(b"csr"),
+            "_is_array": True,
+            "shape": content.shape,
+        }
         csr = zip(ends, content.matrices, strict=True)
         arrays = content.arrays() | header | {n + end: getattr(T, n) for end, T in csr for n in CSR}
     np.savez(path, **arrays)

@@ -25,6 +25,12 @@ from ltcl.theory.series import (
 from ltcl.theory.spectrum import SpectralRadius, free_bounds, row_sum_range, spectral_radius
 
 __all__ = ["Forecast", "SpectralRadius", "Terms", "TwoNorm"]
-__all__ += ["after_terms", "bounce_coefficients", "chebyshev_products", "forecasts", "forward_error_bound"]
+__all__ += [
+    "after_terms",
+    "bounce_coefficients",
+    "chebyshev_products",
+    "forecasts",
+    "forward_error_bound",
+]
 __all__ += ["free_bounds", "gauss_seidel_forecast", "inverse_error_bound", "richardson_products"]
 __all__ += ["row_sum_range", "series_products", "spectral_radius", "two_norm"]

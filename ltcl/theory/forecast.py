@@ -33,8 +33,9 @@ class Forecast:
     products : float
         Infinite where the method diverges, NaN where nothing is known.
     certificate : str
-        That of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the spectrum of S, which
-        are those of Lambertian scenes; "trial sweeps" and "ritz values", estimates; or "none".
+        That of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the spectrum of S,
+        which are those of Lambertian scenes; "trial sweeps" and "ritz values", estimates; or
+        "none".
     """
 
     products: float
@@ -51,11 +52,12 @@ def forecasts(
 ) -> dict[str, Forecast]:
     """What each iterative method will need for S x = b to a relative residual of `rtol`, its options default.
 
-    Where 1 lies between certified bounds on rho(R), they do not tell whether the series converges: its
-    forecast then rests on the power iteration alone. Krylov methods are foretold by the Chebyshev polynomial
-    on `spectrum`, an estimate of the positive interval that holds the eigenvalues of S, where there is one;
-    they may well need less. Nothing foretells Southwell's method, nor the blocks of block_gauss_seidel.
-    InputError where rtol is below what float32 products confirm, 1.2e-7.
+    Where 1 lies between certified bounds on rho(R), they do not tell whether the series converges:
+    its forecast then rests on the power iteration alone. Krylov methods are foretold by the
+    Chebyshev polynomial on `spectrum`, an estimate of the positive interval that holds the
+    eigenvalues of S, where there is one; they may well need less. Nothing foretells Southwell's
+    method, nor the blocks of block_gauss_seidel. InputError where rtol is below what float32
+    products confirm, 1.2e-7.
 
     >>> from ltcl.operators import IdentityPlus, as_operator
     >>> S = IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]]))
@@ -76,16 +78,22 @@ def forecasts(
     """
     require_operator("S", S)
     if not isinstance(rho, SpectralRadius):
-        raise InputTypeError(f"rho is a {type(rho).__name__}; it must be what theory.spectral_radius returns")
+        raise InputTypeError(
+            f"rho is a {type(rho).__name__}; it must be what theory.spectral_radius returns"
+        )
     checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     decided = not rho.lower < 1.0 <= rho.upper
-    series = Forecast(series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION)
+    series = Forecast(
+        series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION
+    )
     sweeps = gauss_seidel_forecast(S, rtol)
     degree = chebyshev_products(*spectrum, rtol) if spectrum else math.nan
     krylov = {
         "cg": degree + 1 if self_adjoint else math.nan,  # one to confirm the end, as of the others
         "gmres": degree + 1,
-        "bicgstab": 2 * math.ceil(degree / 2) + 2 if spectrum else math.nan,  # and one by S^T to begin
+        "bicgstab": 2 * math.ceil(degree / 2) + 2
+        if spectrum
+        else math.nan,  # and one by S^T to begin
     }
     return {
         "jacobi": series,
@@ -103,15 +111,17 @@ def forecasts(
 def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     """Sweeps of Gauss-Seidel until the residual of a random positive picture is below `rtol`.
 
-    The first ones are made, in float64; from there on errors grow as under -(D + L)^-1 U, S = L + D + U.
-    On the host, densely, so for small N only; others have no forecast.
+    The first ones are made, in float64; from there on errors grow as under -(D + L)^-1 U, S = L + D
+    + U. On the host, densely, so for small N only; others have no forecast.
 
     >>> from ltcl.operators import as_operator
     >>> gauss_seidel_forecast(as_operator([[1.0, 0.5], [0.5, 1.0]]), 1e-2).products  # rho is 1/4
     3
     """
     n = require_operator("S", S).shape[0]
-    compressed = isinstance(S, IdentityPlus) and isinstance(S.R, Compressed)  # sweeps go over coefficients
+    compressed = isinstance(S, IdentityPlus) and isinstance(
+        S.R, Compressed
+    )  # sweeps go over coefficients
     if compressed or n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
         return Forecast(math.nan, NOTHING)
     residuals = _trial_sweeps(S.to_dense(), rtol)
@@ -164,22 +174,28 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     lower, upper, rtol = _numbers(lower, upper, rtol)
     if upper <= lower:
         return 1
-    angle = 2.0 * math.asinh(math.sqrt(lower / (upper - lower)))  # acosh of the centre, which may round to 1
+    angle = 2.0 * math.asinh(
+        math.sqrt(lower / (upper - lower))
+    )  # acosh of the centre, which may round to 1
     return max(1, math.ceil(math.acosh(1.0 / rtol) / angle))
 
 
 def richardson_products(lower: float, upper: float, rtol: float) -> int:
     """Products of the Richardson iteration to `rtol` with the spectrum in [lower, upper].
 
-    Each step with omega = 2 / (lower + upper) shrinks the residual by (upper - lower) / (upper + lower)
-    (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
+    Each step with omega = 2 / (lower + upper) shrinks the residual by (upper - lower) / (upper +
+    lower) (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
 
     >>> richardson_products(0.5, 5.0, 1e-2)
     23
     """
     lower, upper, rtol = _numbers(lower, upper, rtol)
     factor = (upper - lower) / (upper + lower)
-    return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log1p(-2.0 * lower / (upper + lower)))
+    return (
+        1
+        if factor <= rtol
+        else math.ceil(math.log(rtol) / math.log1p(-2.0 * lower / (upper + lower)))
+    )
 
 
 def _numbers(lower: Any, upper: Any, rtol: Any) -> tuple[float, float, float]:

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The 2-norm of an operator, or of what two differ by, with an upper bound of stated confidence.
 
-Golub-Kahan steps A v_j = b_(j-1) u_(j-1) + a_j u_j, A^T u_j = a_j v_j + b_j v_(j+1) from a random unit
-vector v_1 give orthonormal v_(j+1) = p_j(A^T A) v_1, p_j of degree j. With s the norm, x the right singular
-vector of it and g = <x, v_1>, the parts <x, v_(j+1)> = p_j(s^2) g have squares that sum to at most one:
+Golub-Kahan steps A v_j = b_(j-1) u_(j-1) + a_j u_j, A^T u_j = a_j v_j + b_j v_(j+1) from a random
+unit vector v_1 give orthonormal v_(j+1) = p_j(A^T A) v_1, p_j of degree j. With s the norm, x the
+right singular vector of it and g = <x, v_1>, the parts <x, v_(j+1)> = p_j(s^2) g have squares that
+sum to at most one:
 
     g^2 (p_0^2 + p_1^2 + ... + p_k^2)(s^2) <= 1
 
-Beyond the largest Ritz value the sum grows, so that g^2 >= d^2 bounds s from above. How likely g^2 is below
-d^2 is a Beta distribution, whatever A is; of several independent starts one at least has g^2 >= d^2 but for
-the product of these probabilities. The largest of their bounds then holds, after any number of steps.
+Beyond the largest Ritz value the sum grows, so that g^2 >= d^2 bounds s from above. How likely g^2
+is below d^2 is a Beta distribution, whatever A is; of several independent starts one at least has
+g^2 >= d^2 but for the product of these probabilities. The largest of their bounds then holds, after
+any number of steps.
 
-For one start and p_k alone this is the bound of van Dorsselaer, Hochstenbach and van der Vorst, SIAM J.
-Matrix Anal. Appl. 22 (2000).
+For one start and p_k alone this is the bound of van Dorsselaer, Hochstenbach and van der Vorst,
+SIAM J. Matrix Anal. Appl. 22 (2000).
 """
 
 from __future__ import annotations
@@ -70,7 +72,8 @@ def two_norm(
     Parameters
     ----------
     A, minus : Operator, (M, N)
-        Products of each run on its device in float32; they are subtracted and orthogonalized in float64.
+        Products of each run on its device in float32; they are subtracted and orthogonalized in
+        float64.
     confidence : float
         The bound fails with probability 1 - confidence over the random starts, whatever A is.
     factor : float
@@ -85,7 +88,8 @@ def two_norm(
     Returns
     -------
     TwoNorm
-        What float32 sums of N products may round is added: sqrt(N) units of A's and `minus`'s own size.
+        What float32 sums of N products may round is added: sqrt(N) units of A's and `minus`'s own
+        size.
 
     Raises
     ------
@@ -106,7 +110,8 @@ def two_norm(
     miss = 1.0 - checks.number("confidence", confidence, above=0.0, below=1.0)
     factor = checks.number("factor", factor, above=1.0)
     starts, maxsteps = checks.count("starts", starts), checks.count("maxsteps", maxsteps)
-    # A random unit vector in n dimensions has <x, v>^2 < `least` with probability miss^(1 / starts).
+    # A random unit vector in n dimensions has <x, v>^2 < `least` with probability miss^(1 /
+    # starts).
     n, least = A.shape[1], 1.0
     if n > 1:
         least = float(scipy.special.betaincinv(0.5, 0.5 * (n - 1), miss ** (1.0 / starts)))
@@ -123,7 +128,10 @@ def two_norm(
     upper += process.rounding
     certain = frobenius <= upper
     return TwoNorm(
-        min(estimate, frobenius), min(upper, frobenius), 1.0 if certain else confidence, process.products
+        min(estimate, frobenius),
+        min(upper, frobenius),
+        1.0 if certain else confidence,
+        process.products,
     )
 
 
@@ -132,7 +140,9 @@ class _Bidiagonal:
 
     def __init__(self, A: Operator, minus: Operator | None, starts: int, seed: int) -> None:
         self.A, self.minus = A, minus
-        v = np.random.default_rng(checks.count("seed", seed, least=0)).standard_normal((A.shape[1], starts))
+        v = np.random.default_rng(checks.count("seed", seed, least=0)).standard_normal(
+            (A.shape[1], starts)
+        )
         self.vs, self.us = [v / np.linalg.norm(v, axis=0)], []
         self.alphas, self.betas = np.zeros((0, starts)), np.zeros((0, starts))  # (steps, starts)
         self.products, self._size = 0, 0.0

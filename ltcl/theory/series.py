@@ -20,10 +20,11 @@ from ltcl.errors import InputError
 def bounce_coefficients(n: int, bounces: int) -> tuple[int, ...]:
     """Coefficients of A^0, A^1, ..., A^bounces in the n-term inverse series (eq. 12), exactly.
 
-    R^k = (A + A^2 + ...)^k holds A^j binom(j-1, k-1) times; summed with alternating signs over k = 1 ..
-    min(j, n) these cancel for 2 <= j <= n (eq. 13), so that I - A remains and bounces above n.
+    R^k = (A + A^2 + ...)^k holds A^j binom(j-1, k-1) times; summed with alternating signs over k =
+    1 .. min(j, n) these cancel for 2 <= j <= n (eq. 13), so that I - A remains and bounces above n.
 
-    Both are whole numbers of at least 0, else an InputError; ``bounces + 1`` coefficients come back.
+    Both are whole numbers of at least 0, else an InputError; ``bounces + 1`` coefficients come
+    back.
 
     >>> bounce_coefficients(3, 6)  # I - A, bounces 2 and 3 gone, higher ones not yet
     (1, -1, 0, 0, -1, -3, -6)
@@ -33,7 +34,9 @@ def bounce_coefficients(n: int, bounces: int) -> tuple[int, ...]:
     return (
         1,
         *(
-            sum((-1) ** k * math.comb(j - 1, k - 1) for k in range(1, min(j, n) + 1))  # R^0 = I has none
+            sum(
+                (-1) ** k * math.comb(j - 1, k - 1) for k in range(1, min(j, n) + 1)
+            )  # R^0 = I has none
             for j in range(1, bounces + 1)
         ),
     )
@@ -47,9 +50,11 @@ class Terms:
     ----------
     n : int
     next_bounce : int
-        Coefficient of bounce n + 1 in the inverse, of which bounces 2 to n are gone: (-1)^n (eq. 13).
+        Coefficient of bounce n + 1 in the inverse, of which bounces 2 to n are gone: (-1)^n (eq.
+        13).
     forward, inverse : float
-        Bounds on the errors of S_n (eq. 15) and S_n^-1 (eq. 16); NaN where eq. 16 knows none, m >= 1/2.
+        Bounds on the errors of S_n (eq. 15) and S_n^-1 (eq. 16); NaN where eq. 16 knows none, m >=
+        1/2.
     """
 
     n: int
@@ -100,7 +105,9 @@ def inverse_error_bound(m: float, n: int) -> float:
             f"m is {m:g}; the bound of the inverse series (eq. 16) needs an albedo m below 1/2: "
             "above, use method 'chebyshev', which converges for every albedo"
         )
-    return m * (m / (1.0 - m)) ** n / (1.0 - 2.0 * m)  # no power on its own, which would underflow first
+    return (
+        m * (m / (1.0 - m)) ** n / (1.0 - 2.0 * m)
+    )  # no power on its own, which would underflow first
 
 
 def _albedo(m: float) -> float:

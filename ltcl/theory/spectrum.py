@@ -15,7 +15,9 @@ from ltcl.device import Array, vectors
 from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
 
-_ranges: weakref.WeakKeyDictionary[Operator, tuple[float, float, float]] = weakref.WeakKeyDictionary()
+_ranges: weakref.WeakKeyDictionary[Operator, tuple[float, float, float]] = (
+    weakref.WeakKeyDictionary()
+)
 _STEPS = 200  # at most
 _FLOOR = 1e-12  # of the largest value of a vector: far above what underflows
 
@@ -36,8 +38,9 @@ class SpectralRadius:
     lower, upper : float
         What `certificate` says of rho(R).
     certificate : str
-        "collatz-wielandt": rho(R) lies between `lower` and `upper` for certain. "power iteration": R has
-        negative entries or hides them, and the two are an estimate, from how fast the value settled.
+        "collatz-wielandt": rho(R) lies between `lower` and `upper` for certain. "power iteration":
+        R has negative entries or hides them, and the two are an estimate, from how fast the value
+        settled.
     """
 
     value: float
@@ -62,21 +65,26 @@ def require_operator(name: str, value: Any) -> Operator:
     """Return `value` if it is an Operator; refuse others."""
     if not isinstance(value, Operator):
         what = f"{name} is a {type(value).__name__}"
-        raise InputTypeError(f"{what}; it must be an Operator, as ltcl.operators.as_operator makes one")
+        raise InputTypeError(
+            f"{what}; it must be an Operator, as ltcl.operators.as_operator makes one"
+        )
     return value
 
 
-def spectral_radius(R: Operator, *, rtol: float = 1e-3, norms: Norms | None = None) -> SpectralRadius:
+def spectral_radius(
+    R: Operator, *, rtol: float = 1e-3, norms: Norms | None = None
+) -> SpectralRadius:
     """Largest modulus of the eigenvalues of R, (N, N), by power iteration from a positive random start.
 
-    R of a real scene is nonnegative up to noise, so that its dominant eigenvalue is real and positive
-    (Perron) and a positive start cannot miss it. Growth is averaged over two steps, which also settles
-    where -rho is an eigenvalue as well.
+    R of a real scene is nonnegative up to noise, so that its dominant eigenvalue is real and
+    positive (Perron) and a positive start cannot miss it. Growth is averaged over two steps, which
+    also settles where -rho is an eigenvalue as well.
 
-    With ``norms=R.norms()`` the signs of the entries are known, and those of a nonnegative R are certified:
-    min (R v)_i / v_i <= rho(R) <= max (R v)_i / v_i for every positive v (Collatz, Wielandt; Horn and
-    Johnson, Matrix Analysis, 2nd ed., theorem 8.1.26), here of the last v, widened by what rounding can do
-    in a sum of N products. The bounds are of R as it lies on the device; noise of the measurement is in R.
+    With ``norms=R.norms()`` the signs of the entries are known, and those of a nonnegative R are
+    certified: min (R v)_i / v_i <= rho(R) <= max (R v)_i / v_i for every positive v (Collatz,
+    Wielandt; Horn and Johnson, Matrix Analysis, 2nd ed., theorem 8.1.26), here of the last v,
+    widened by what rounding can do in a sum of N products. The bounds are of R as it lies on the
+    device; noise of the measurement is in R.
 
     >>> from ltcl.operators import as_operator
     >>> R = as_operator([[0.0, 0.5], [0.5, 0.0]])
@@ -127,15 +135,17 @@ def _certified(rho: SpectralRadius, R: Operator, v: Array, norms: Norms) -> Spec
     lower = float(np.min((y[seen] - others) / x[seen])) * (1.0 - rounding)
     upper = min(float(np.max(y / x)) * (1.0 + rounding), norms.one, norms.inf, norms.frobenius)
     value = min(max(rho.value, lower), upper)
-    return SpectralRadius(value, rho.change, rho.products + 1, max(lower, 0.0), upper, COLLATZ_WIELANDT)
+    return SpectralRadius(
+        value, rho.change, rho.products + 1, max(lower, 0.0), upper, COLLATZ_WIELANDT
+    )
 
 
 def free_bounds(S: Operator) -> tuple[float, float]:
     """Bounds on the spectrum of S that cost one product with a vector of ones, at the first call only.
 
     Of a Lambertian scene, S = (I - A)^-1 is self-adjoint in the area/albedo inner product and its
-    eigenvalues lie in [1 / (1 + m), 1 / (1 - m)], m < 1: above 1/2, and below the largest row sum of S
-    since S >= 0. The dual I - A has its own in [1 - g, 1 + g], g the largest row sum of A.
+    eigenvalues lie in [1 / (1 + m), 1 / (1 - m)], m < 1: above 1/2, and below the largest row sum
+    of S since S >= 0. The dual I - A has its own in [1 - g, 1 + g], g the largest row sum of A.
 
     >>> from ltcl.operators import as_operator
     >>> free_bounds(as_operator([[1.0, 0.5], [0.5, 1.0]]))

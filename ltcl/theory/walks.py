@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Where random walks have a mean and a variance, and how long they should be; where sampled products settle.
 
-The weight of a walk that goes on with chance q after each step has second moments that grow like powers of
+The weight of a walk that goes on with chance q after each step has second moments that grow like
+powers of
 
     Q / q,  Q_ij = R_ij^2 / p(j | i),  which is |R_i| |R_ij| where entries are drawn in proportion (eq. 25)
 
 so that its variance is finite where rho(Q) < q. Whenever it is, rho(|R|) < 1 too, and the mean exists: by
 Cauchy and Schwarz rho(|R|)^2 <= rho(Q).
 
-An iteration l = b - R l whose product is sampled, s samples of each row, makes of the covariance C of l
+An iteration l = b - R l whose product is sampled, s samples of each row, makes of the covariance C
+of l
 
     C' = R C R^T + diag(Q diag C - diag(R C R^T) + what the mean of l adds) / s
 
 since rows are drawn on their own. Hence trace C' <= ((1 - 1/s) ||R||_2^2 + ||Q||_1 / s) trace C + ..., and
-noise dies away where the bracket is below 1, and, with any s, where rho(Q) < 1, as diag(R C R^T) <= Q diag C.
+noise dies away where the bracket is below 1, and, with any s, where rho(Q) < 1, as diag(R C R^T) <=
+Q diag C.
 """
 
 from __future__ import annotations
@@ -30,8 +33,12 @@ from ltcl.theory.norms import two_norm
 from ltcl.theory.spectrum import spectral_radius
 
 LONGEST = 0.9999  # chance to go on; beyond, walks of many thousand steps would carry nothing
-_SHORTEST = 1 / 16  # below, terms that matter little are seen so rarely that nobody can tell their error
-_LONG = 3 / 4  # for heavy rows alone; beyond, walks from b, which score where they end, lose too much
+_SHORTEST = (
+    1 / 16
+)  # below, terms that matter little are seen so rarely that nobody can tell their error
+_LONG = (
+    3 / 4
+)  # for heavy rows alone; beyond, walks from b, which score where they end, lose too much
 
 
 class Weights(NamedTuple):
@@ -53,16 +60,18 @@ def weights(R: CSR | Dense, tables: Tables) -> Weights:
     if "weights" not in tables.moments:
         Qs = tables.second_moments(R)
         radius = float(np.max([spectral_radius(Q).value for Q in Qs]))
-        tables.moments["weights"] = Weights(radius, np.stack([Q.row_sums().astype(np.float64) for Q in Qs]))
+        tables.moments["weights"] = Weights(
+            radius, np.stack([Q.row_sums().astype(np.float64) for Q in Qs])
+        )
     return tables.moments["weights"]
 
 
 def chance_to_go_on(step: Weights, albedo: float | None) -> float:
     """q = m / (1 - m) of eq. 24; where no albedo m is given sqrt(rho(Q)), at which rho(Q) / q = q.
 
-    For equal row sums that is rho(R), hence the m of a closed scene (eq. 14). Light that goes one way has a
-    lower rho(Q), down to 0: q is then the root of the heaviest row of Q, up to 3/4, so that weights do not
-    grow while walks become rare.
+    For equal row sums that is rho(R), hence the m of a closed scene (eq. 14). Light that goes one
+    way has a lower rho(Q), down to 0: q is then the root of the heaviest row of Q, up to 3/4, so
+    that weights do not grow while walks become rare.
 
     >>> chance_to_go_on(Weights(0.25, np.array([[0.25, 0.25]])), None)
     0.5

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ltcl.transport import Transport, require
+from ltcl.transport.transport import Transport, require
 
 if TYPE_CHECKING:
     from ltcl.viewer.server import Viewer
@@ -24,12 +24,12 @@ def view(
 ) -> Viewer:
     """Show T in the browser: probe it, separate bounces, relight, compensate; feed a projector.
 
-    `picture` is linear light (h, w[, 3]), or a dict of such by names, to compensate for, separate or relight
-    with. `host` and `port` are the address: beyond this machine whoever has the URL can look and compute;
-    pages of a viewer that ended find the next one on the same `port`.
-    `setup` is the `ltcl.acquisition.Setup` of a measured T, whose codes projector windows then show, else
-    sRGB. Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame. InputError
-    for an address that cannot be had, or without the extra `view`.
+    `picture` is linear light (h, w[, 3]), or a dict of such by names, to compensate for, separate
+    or relight with. `host` and `port` are the address: beyond this machine whoever has the URL can
+    look and compute; pages of a viewer that ended find the next one on the same `port`. `setup` is
+    the `ltcl.acquisition.Setup` of a measured T, whose codes projector windows then show, else
+    sRGB. Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame.
+    InputError for an address that cannot be had, or without the extra `view`.
 
     Examples
     --------
@@ -43,5 +43,7 @@ def view(
     from ltcl.viewer.server import Viewer
 
     require(T, square=False)
-    pictures = picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
+    pictures = (
+        picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
+    )
     return Viewer(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port, open_browser)

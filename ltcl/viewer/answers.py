@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks, images, layout, report
-from ltcl.compensation import compensate
+from ltcl import checks, images
 from ltcl.errors import InputError, InputTypeError, LtclError
-from ltcl.first_bounce import ENTRIES
 from ltcl.images.pictures import BITS, as_picture, from_linear, to_linear
-from ltcl.separation import separate
+from ltcl.tasks import report
+from ltcl.tasks.compensation import compensate
+from ltcl.tasks.separation import separate
+from ltcl.transport import frames as layout
+from ltcl.transport.first_bounce import ENTRIES
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]  # facts and pictures
 Callback = Callable[[int, float], None]  # of `ltcl.solve`
@@ -26,16 +28,19 @@ PICTURES = ("pattern", "appearance", "target", "out_of_reach")  # of a compensat
 LARGEST_FILE, LARGEST_PICTURE = 64 << 20, 3 << 29  # bytes; decoded, 64 million pixels
 UPLOADS = 16  # that are kept
 _BOUNCES = 16
-_STEPS = 65535  # of light between black and white, of which each has a code: a table in place of powers
+_STEPS = (
+    65535  # of light between black and white, of which each has a code: a table in place of powers
+)
 _CODES = from_linear(np.linspace(0, 1, _STEPS + 1, dtype=np.float32), "srgb", 8, is_float=False)
 
 
 class Scene:
     """T and what is shown of it; methods take what a question holds, and raise LtclError for anything else.
 
-    T is None where there is none yet, or only patterns are shown: then nothing is computed. `setup` is the
-    `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the projector has now,
-    of at most `white`, or uint8 codes. `questions` may be asked, the largest of so many `pixels`.
+    T is None where there is none yet, or only patterns are shown: then nothing is computed. `setup`
+    is the `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the
+    projector has now, of at most `white`, or uint8 codes. `questions` may be asked, the largest of
+    so many `pixels`.
     """
 
     page = "index.html"
@@ -49,7 +54,9 @@ class Scene:
             self.pattern, self.pixels = np.ones(T.grid, np.float32), max(T.shape)
             entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
             self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
-        self._pictures: dict[int, tuple[str, np.ndarray, np.ndarray]] = {}  # for the camera, the projector
+        self._pictures: dict[
+            int, tuple[str, np.ndarray, np.ndarray]
+        ] = {}  # for the camera, the projector
         self._given, self._count = len(pictures), 0
         for name, picture in pictures.items():
             self.add(name, as_picture(name, picture))
@@ -60,7 +67,9 @@ class Scene:
         facts: dict[str, Any] = {name: name in self.questions for name in ("scan", "next")}
         facts |= {"title": self.title, "grid": None}
         if (T := self.T) is not None:
-            facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
+            facts |= {
+                name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")
+            }
             facts |= {"device": T.device.name, "square": T.is_square, "compressed": T.is_compressed}
         return facts
 
@@ -68,7 +77,9 @@ class Scene:
         """The answer to a question by name; `callback` is called between the steps of a solve."""
         method = getattr(self, checks.one_of("do", do, self.questions))
         try:
-            bound = inspect.signature(method).bind(**asked, **({"callback": callback} if do in LONG else {}))
+            bound = inspect.signature(method).bind(
+                **asked, **({"callback": callback} if do in LONG else {})
+            )
         except TypeError as error:
             raise InputTypeError(f"{do}: {error}") from None
         return method(*bound.args, **bound.kwargs)
@@ -91,7 +102,9 @@ class Scene:
         if pattern is None:
             light = self.pattern if picture is None else self._picture(picture)[2]
         else:
-            codes = checks.shape("pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3))
+            codes = checks.shape(
+                "pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3)
+            )
             if self.T.channels == 1 and codes.ndim == 3 and (codes == codes[..., :1]).all():
                 codes = codes[..., 0]  # a product in place of three
             light = to_linear(codes, "auto")
@@ -110,24 +123,34 @@ class Scene:
         whole = float(np.sum(image, dtype=np.float64)) or 1.0
         shares = [float(np.sum(part, dtype=np.float64)) / whole for part in light.values()]
         if self._shows_noise:
-            deviations = zip(["direct", *numbered], [result.std.direct, *result.std.bounces], strict=True)
+            deviations = zip(
+                ["direct", *numbered], [result.std.direct, *result.std.bounces], strict=True
+            )
             light |= {f"{name}_std": deviation for name, deviation in deviations}
         return {"shares": shares}, light
 
-    def compensate(self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)) -> Reply:
+    def compensate(
+        self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)
+    ) -> Reply:
         """The pattern under which the scene looks like a picture; the projector shows it from now on."""
         name, desired, shown = self._picture(picture)
         asked, start = {"gain": gain, "bounds": bounds}, time.perf_counter()
         ambient = None if self.setup is None else self.setup.ambient
         c = compensate(self.T, desired, background=ambient, callback=callback, **asked)
-        facts = {key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")}
+        facts = {
+            key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")
+        }
         facts["seconds"], solves = time.perf_counter() - start, report.solution(c.solution)
         solves += [each for each in report.solution(c.limited) if each not in solves]
         facts["method"] = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
         facts["products"] = sum(solve["products"] for solve in solves)
         facts["residuals"] = max((solve["residuals"] for solve in solves), key=len)
         self.pattern, self.white = c.pattern, max(float(bounds[1]), 0.0) or 1.0
-        known = {"title": self.title, "versions": report.versions(), "device": report.device(self.T.device)}
+        known = {
+            "title": self.title,
+            "versions": report.versions(),
+            "device": report.device(self.T.device),
+        }
         known |= {"picture": name, **asked, **facts, "white": self.white, "solves": solves}
         self._compensation = c, known
         plain = self.T @ shown  # the picture itself as a pattern, made as bright as the target
@@ -136,7 +159,9 @@ class Scene:
 
     def pictures(self) -> Reply:
         """Names and numbers of the pictures that there are."""
-        return {"pictures": [{"picture": k, "name": name} for k, (name, *_) in self._pictures.items()]}, {}
+        return {
+            "pictures": [{"picture": k, "name": name} for k, (name, *_) in self._pictures.items()]
+        }, {}
 
     def projector(self) -> Reply:
         """A window that is to show the pattern, or has shown it; the server sends the next one."""
@@ -145,7 +170,9 @@ class Scene:
     def add(self, name: str, picture: np.ndarray) -> int:
         """Keep a picture, on the grids of camera and projector; its number."""
         grids = (self.T.camera_grid, self.T.grid)
-        sizes = [picture if picture.shape[:2] == grid else images.resize(picture, grid) for grid in grids]
+        sizes = [
+            picture if picture.shape[:2] == grid else images.resize(picture, grid) for grid in grids
+        ]
         self._count += 1
         self._pictures[self._count] = name, sizes[0], sizes[1]
         if self._count > self._given + UPLOADS:
@@ -202,7 +229,8 @@ def _unit(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
     if not isinstance(pixel, list) or len(pixel) != 2:
         raise InputError(f"pixel is {checks.shown(pixel)}; it must be [row, column]")
     place = tuple(
-        checks.count("pixel", n, least=0, most=size - 1) for n, size in zip(pixel, grid, strict=True)
+        checks.count("pixel", n, least=0, most=size - 1)
+        for n, size in zip(pixel, grid, strict=True)
     )
     unit = np.zeros(grid, np.float32)
     unit[place] = 1.0

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Bytes of the messages between viewer and page, the same in both directions.
 
-A text frame is a JSON header. A binary frame is the length of its header (uint32, little-endian), the header,
-padded with spaces so that arrays begin at multiples of 4, then the arrays, each padded to a multiple of 4:
+A text frame is a JSON header. A binary frame is the length of its header (uint32, little-endian),
+the header, padded with spaces so that arrays begin at multiples of 4, then the arrays, each padded
+to a multiple of 4:
 
     {"id": 7, "do": "relight", "arrays": [{"name": "pattern", "shape": [h, w, c], "dtype": "u1"}]}
 
-Light goes to the page as float32 ("f4"), codes either way as uint8 ("u1"). A fourth channel, alpha of a
-canvas, is left out.
+Light goes to the page as float32 ("f4"), codes either way as uint8 ("u1"). A fourth channel, alpha
+of a canvas, is left out.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks, report
+from ltcl import checks
 from ltcl.errors import InputError, LtclError
+from ltcl.tasks import report
 
 LARGEST_HEADER = 4096  # bytes of a question
 
@@ -29,7 +31,9 @@ def largest(pixels: int) -> int:
     return 4 * pixels + LARGEST_HEADER
 
 
-def encode(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> str | bytes:
+def encode(
+    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
+) -> str | bytes:
     """A message of pictures (h, w[, 3]): uint8 ones as they are, others as float32."""
     entries, parts = [], []
     for name, array in (arrays or {}).items():
@@ -37,7 +41,9 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = 
         values = checks.finite(name, array.reshape(*array.shape[:2], -1).astype(dtype, copy=False))
         entries.append({"name": name, "shape": values.shape, "dtype": dtype})
         parts += [values.tobytes(), bytes(-values.nbytes % 4)]
-    text = json.dumps(report.plain({**header, "arrays": entries} if entries else header), allow_nan=False)
+    text = json.dumps(
+        report.plain({**header, "arrays": entries} if entries else header), allow_nan=False
+    )
     if not entries:
         return text
     text += " " * (-len(text) % 4)
@@ -58,12 +64,16 @@ def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]
             checks.one_of("dtype", entry["dtype"], ["u1"])
             h, w, c = (checks.count("shape", n, most=1 << 24) for n in entry["shape"])
             codes = np.frombuffer(data, np.uint8, h * w * c, start).reshape(h, w, c)
-            arrays[str(entry["name"])] = codes[..., 0] if c == 1 else codes[..., : 3 if c == 4 else c]
+            arrays[str(entry["name"])] = (
+                codes[..., 0] if c == 1 else codes[..., : 3 if c == 4 else c]
+            )
             start += codes.nbytes + -codes.nbytes % 4
     except LtclError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"message is none: {type(error).__name__}: {error}") from None
     if start != len(data):
-        raise InputError(f"message has {len(data)} bytes; header and arrays must have as many: {start}")
+        raise InputError(
+            f"message has {len(data)} bytes; header and arrays must have as many: {start}"
+        )
     return header, arrays

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Scan`: the folder of an acquisition as it grows, and its transport once that is finished.
 
-What is new is read when a page asks, the newest first, for a while only. A rig that a person works by hand
-has all photographs in the folder. Of others those of the calibration are there until it has ended; then come
-batches of the scan, columns of T or pictures of an adaptive scan, in units of light.
+What is new is read when a page asks, the newest first, for a while only. A rig that a person works
+by hand has all photographs in the folder. Of others those of the calibration are there until it has
+ended; then come batches of the scan, columns of T or pictures of an adaptive scan, in units of
+light.
 """
 
 from __future__ import annotations
@@ -29,7 +30,11 @@ from ltcl.store import ArrayLog, BlockStore, load
 from ltcl.viewer.answers import Reply, Scene
 
 _BUDGET, _PERIOD = 0.5, 0.9  # seconds of reading in a look, and from one to the next
-_SIDE, _BINS, _SHOWN = 160, 32, 24  # pixels of a preview; of a histogram; photographs that a page has
+_SIDE, _BINS, _SHOWN = (
+    160,
+    32,
+    24,
+)  # pixels of a preview; of a histogram; photographs that a page has
 _PACE = 32  # of the newest files: by them the time that is left is estimated
 _FULL, _SATURATED = 0.999, 0.02  # of full scale; part of a photograph
 
@@ -65,7 +70,10 @@ class Scan(Scene):
             self._finish()
         else:
             settings, facts = self.project.outlook()
-            ways = {"aligned": settings.geometry == "aligned", "by_hand": self.project.kind == "folder"}
+            ways = {
+                "aligned": settings.geometry == "aligned",
+                "by_hand": self.project.kind == "folder",
+            }
             self._total = photographs(facts["grid"], facts["channels"], settings.frames, **ways)
             self.pixels = int(np.prod(facts["grid"]))
 
@@ -79,7 +87,10 @@ class Scan(Scene):
                 self._warnings["folder"] = " ".join(str(error).split())
             self._looked = time.monotonic()
         new = [(f, preview) for number, f, preview in self._shown.values() if number > seen]
-        facts = self._facts | {"warnings": [*self._warnings.values()], "photographs": [f for f, _ in new]}
+        facts = self._facts | {
+            "warnings": [*self._warnings.values()],
+            "photographs": [f for f, _ in new],
+        }
         facts |= {"seen": self._count, "finished": self.T is not None}
         return facts, {str(k): preview for k, (_, preview) in enumerate(new)}
 
@@ -94,7 +105,10 @@ class Scan(Scene):
         if store and kind == "folder":
             total, what = int(store.attributes["plan"]["photographs"]), "photographs"
         elif store:
-            batches, total = store.layout.blocks("columns"), int(store.attributes["plan"]["patterns"])
+            batches, total = (
+                store.layout.blocks("columns"),
+                int(store.attributes["plan"]["patterns"]),
+            )
             done, what = round(total * done / batches), "patterns"
         if store and store.final:
             done = total = int(store.attributes["patterns"])
@@ -108,7 +122,10 @@ class Scan(Scene):
             self._facts["coverage"] = float(np.mean(c.resampling.coverage > 0))
             self._facts["saturated"] = 1.0 - float(np.mean(c.white.valid))
         end = time.monotonic() + _BUDGET
-        for file in [*newest[-1:], *newest[:-1]]:  # the first photograph says what the others have to be
+        for file in [
+            *newest[-1:],
+            *newest[:-1],
+        ]:  # the first photograph says what the others have to be
             if self._read.get(file.path) != file.time and time.monotonic() < end:
                 self._read[file.path] = file.time
                 self._open(file, store)
@@ -188,6 +205,11 @@ class Scan(Scene):
 
     def _finish(self) -> None:
         """The transport is there: all that a Scene has, in one assignment, as pages ask meanwhile."""
-        T, setup = load(self.project.store, on_dark="mask", device=self._device), Setup.of(self.project.store)
+        T, setup = (
+            load(self.project.store, on_dark="mask", device=self._device),
+            Setup.of(self.project.store),
+        )
         questions = (*Scene.questions, "scan")
-        self.__dict__ = vars(self) | vars(Scene(T, self.title, {}, setup)) | {"questions": questions}
+        self.__dict__ = (
+            vars(self) | vars(Scene(T, self.title, {}, setup)) | {"questions": questions}
+        )

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The viewer's server: who may ask, and what is sent to whom.
 
-Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another host's
-name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. Each kind of question
-has a thread, so that a product does not wait for a solve; what a page asks again takes the place of what it
-has waiting. A page that does not read its answers is closed, and delays nobody.
+Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another
+host's name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. Each
+kind of question has a thread, so that a product does not wait for a solve; what a page asks again
+takes the place of what it has waiting. A page that does not read its answers is closed, and delays
+nobody.
 """
 
 from __future__ import annotations
@@ -41,7 +42,12 @@ try:
 except ImportError as error:
     raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
 
-TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
+TYPES = {
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".json": "application/json",
+}
 TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
 PAGES, CONNECTIONS = 32, 256
 PATIENCE = 5.0  # seconds for a page to read an answer
@@ -102,7 +108,9 @@ class _Client:
         while True:
             if shown is not (pattern := self.scene.pattern):
                 codes = await self.viewer._run("show", self.scene.codes, pattern, self.scene.white)
-                await self.send(messages.encode({"do": "show", "title": self.scene.title}, {"codes": codes}))
+                await self.send(
+                    messages.encode({"do": "show", "title": self.scene.title}, {"codes": codes})
+                )
                 shown = pattern
             await self.changed.wait()
             self.changed.clear()
@@ -110,7 +118,9 @@ class _Client:
     async def send(self, message: str | bytes) -> None:
         """TimeoutError where the other side does not read."""
         kind = "text" if isinstance(message, str) else "bytes"
-        await asyncio.wait_for(self.socket.send({"type": "websocket.send", kind: message}), PATIENCE)
+        await asyncio.wait_for(
+            self.socket.send({"type": "websocket.send", kind: message}), PATIENCE
+        )
 
     def _compute(self, do: str, number: float, asked: dict[str, Any]) -> str | bytes | None:
         """The message that answers; None where it came too late. In a thread."""
@@ -121,7 +131,13 @@ class _Client:
             if self not in self.viewer._clients or do in self.waiting:
                 raise _Superseded
             if (now := time.monotonic()) > reported + _PERIOD:
-                facts = {"id": number, "step": do, "done": iteration, "total": None, "residual": residual}
+                facts = {
+                    "id": number,
+                    "step": do,
+                    "done": iteration,
+                    "total": None,
+                    "residual": residual,
+                }
                 message = messages.encode({"do": "progress", **facts})
                 asyncio.run_coroutine_threadsafe(self.send(message), self.loop)
                 reported = now
@@ -132,7 +148,9 @@ class _Client:
         except _Superseded:
             return None
         except Exception as error:  # noqa: BLE001 - the next question may go well
-            kind = "" if isinstance(error, LtclError) else f"internal error: {type(error).__name__}: "
+            kind = (
+                "" if isinstance(error, LtclError) else f"internal error: {type(error).__name__}: "
+            )
             line = kind + " ".join(str(error).split())
             return messages.encode({"id": number, "do": do, "error": line})
 
@@ -142,7 +160,9 @@ class _Http(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self.app_state = {"abort": transport.abort}  # of its socket, too: close would wait for a reader
+        self.app_state = {
+            "abort": transport.abort
+        }  # of its socket, too: close would wait for a reader
         self.since = time.monotonic()
         plain = [each for each in self.connections if isinstance(each, _Http)]
         plain = [each for each in plain if not each.transport.is_closing()]
@@ -167,7 +187,9 @@ def _token(port: int) -> str:
 class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
-    def __init__(self, scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True) -> None:
+    def __init__(
+        self, scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True
+    ) -> None:
         try:
             if not host:  # which would be anywhere
                 raise OSError("it is empty")
@@ -176,14 +198,19 @@ class Viewer(contextlib.AbstractContextManager):
             self._token = _token(port) if port else secrets.token_urlsafe(24)
             listening = socket.create_server(place, family=family)
         except OSError as error:
-            raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
+            raise InputError(
+                f"host is {host!r}, port {port}: {error}; they must be free here"
+            ) from None
         own = ipaddress.ip_address(listening.getsockname()[0])
         if not own.is_loopback:  # where it travels unencrypted
             self._token = secrets.token_urlsafe(24)
         # Connections have these, too. Without the first one an answer after another waits 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-        name, self._port = socket.gethostname() if own.is_unspecified else host, listening.getsockname()[1]
+        name, self._port = (
+            socket.gethostname() if own.is_unspecified else host,
+            listening.getsockname()[1],
+        )
         self._names = "127.0.0.1", "localhost", name
         self.url = f"http://{_in_url(name)}:{self._port}/{self._token}/"
         page = (Path(__file__).parent / "page").iterdir()
@@ -192,13 +219,24 @@ class Viewer(contextlib.AbstractContextManager):
         self._threads = defaultdict[str, ThreadPoolExecutor](lambda: ThreadPoolExecutor(1))
         settings: dict[str, Any] = {"interface": "asgi3", "lifespan": "off", "http": _Http}
         settings |= {"ws": "websockets-sansio", "ws_max_size": messages.largest(scene.pixels)}
-        settings |= {"ws_per_message_deflate": False, "timeout_graceful_shutdown": 1, "proxy_headers": False}
-        settings |= {"log_config": None, "log_level": "critical", "access_log": False, "server_header": False}
+        settings |= {
+            "ws_per_message_deflate": False,
+            "timeout_graceful_shutdown": 1,
+            "proxy_headers": False,
+        }
+        settings |= {
+            "log_config": None,
+            "log_level": "critical",
+            "access_log": False,
+            "server_header": False,
+        }
         self._uvicorn = uvicorn.Server(uvicorn.Config(self._application, **settings))
         self._thread = threading.Thread(target=self._uvicorn.run, args=([listening],), daemon=True)
         self._thread.start()
         if not own.is_loopback:
-            _logger.warning("%s is open to the network, unencrypted: whoever has it can compute", self.url)
+            _logger.warning(
+                "%s is open to the network, unencrypted: whoever has it can compute", self.url
+            )
         if open_browser:
             webbrowser.open(self.url)
 
@@ -228,13 +266,18 @@ class Viewer(contextlib.AbstractContextManager):
 
     async def _run(self, kind: str, call: Callable[..., Any], *arguments: Any) -> Any:
         """What a call returns, in the thread for its kind, one after the other."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads[kind], call, *arguments)
+        return await asyncio.get_running_loop().run_in_executor(
+            self._threads[kind], call, *arguments
+        )
 
     async def _application(self, scope: Any, receive: Any, send: Any) -> None:
         """All requests pass here; those that may not get 403 and no word about what there is."""
         headers = HTTPConnection(scope).headers
         host, origins = headers.get("host", ""), headers.getlist("origin")
-        names = (*self._names, scope["server"][0])  # the last was connected to: no other site can have it
+        names = (
+            *self._names,
+            scope["server"][0],
+        )  # the last was connected to: no other site can have it
         token, slash, path = scope["path"].removeprefix("/").partition("/")
         reads = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
         is_allowed = secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode())
@@ -252,11 +295,18 @@ class Viewer(contextlib.AbstractContextManager):
 
     async def _respond(self, request: Request, path: str, reads: bool) -> Response:
         if path == "picture" and request.method == "POST":
-            name, length = request.query_params.get("name", ""), request.headers.get("content-length", "")
+            name, length = (
+                request.query_params.get("name", ""),
+                request.headers.get("content-length", ""),
+            )
             try:
-                checks.count("length", int(length) if length.isdecimal() else None, most=LARGEST_FILE)
+                checks.count(
+                    "length", int(length) if length.isdecimal() else None, most=LARGEST_FILE
+                )
                 content = await request.body()
-                return JSONResponse(await self._run("picture", self._scene.upload, name[:255], content))
+                return JSONResponse(
+                    await self._run("picture", self._scene.upload, name[:255], content)
+                )
             except LtclError as error:
                 return JSONResponse({"error": " ".join(str(error).split())}, 400)
         name = {"": self._scene.page, "projector": "projector.html"}.get(path, path)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rigs that fail, and acquisitions in processes of their own that end at a line of ltcl.
 
-They are forks of a server that has opened no OpenCL device: a child of a process that had opened one lacks
-PoCL's threads, and waits for them for ever.
+They are forks of a server that has opened no OpenCL device: a child of a process that had opened
+one lacks PoCL's threads, and waits for them for ever.
 """
 
 from __future__ import annotations
@@ -41,7 +41,13 @@ class Unplugged(VirtualRig):
     keeps_photographs = False
 
     def __init__(
-        self, T: Any, grid: tuple[int, int], *, left: int = 1 << 30, fault: Any = None, **options: Any
+        self,
+        T: Any,
+        grid: tuple[int, int],
+        *,
+        left: int = 1 << 30,
+        fault: Any = None,
+        **options: Any,
     ) -> None:
         super().__init__(T, grid, **{"bits": 12, "ambient": 0.01, **options})
         self.left, self.counts, self.fault = left, [0], fault
@@ -68,7 +74,9 @@ def set_up(strategy: str, left: int = 1 << 30) -> tuple[Unplugged, dict[str, Any
     return rig, {"strategy": strategy, **common, **settings}
 
 
-def acquire_and_end(store: Path, strategy: str, line: int = 0, end: str = "SIGKILL") -> tuple[int, int, int]:
+def acquire_and_end(
+    store: Path, strategy: str, line: int = 0, end: str = "SIGKILL"
+) -> tuple[int, int, int]:
     """Acquire in a process of its own, and end at a line of ltcl; its status, photographs and lines."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["pytest", __name__])

@@ -27,7 +27,9 @@ SENSOR = Sensor(Response.identity(), NoiseModel(1000.0, 0.003, levels=256), 0.02
 
 def photograph(light: np.ndarray, seconds: float = 1.0, electrons: float = 1000.0) -> np.ndarray:
     """Of `light` a second, by a linear camera of 8 bits."""
-    value = random.poisson(light * seconds * electrons) / electrons + random.normal(0, 0.003, light.shape)
+    value = random.poisson(light * seconds * electrons) / electrons + random.normal(
+        0, 0.003, light.shape
+    )
     return np.rint(np.clip(0.02 + value, 0, 1) * 255) / 255
 
 
@@ -72,7 +74,9 @@ def test_few_photons_deviate_from_nothing() -> None:
 @pytest.mark.parametrize(
     ("gain", "albedo"), [(500.0, 0.6), *product([1000.0, 3000.0], [0.6, (0.8, 0.6, 0.4)])]
 )
-def test_a_clean_calibration_of_a_noisy_camera_agrees(gain: float, albedo: Any, by_hand: bool) -> None:
+def test_a_clean_calibration_of_a_noisy_camera_agrees(
+    gain: float, albedo: Any, by_hand: bool
+) -> None:
     """Its response has to be measured in that noise, which the camera clips at black."""
     T = ltcl.scenes.dihedral(8, albedo=albedo).transport()
     rig = Unplugged(T, T.grid, bits=12, gain=gain, response="srgb", ambient=0.01)
@@ -100,15 +104,34 @@ def test_another_exposure_is_named(wrong: int, gain: float) -> None:
 @pytest.mark.parametrize("gain", [1.0, 2 ** (1 / 3)])
 def test_an_exposure_that_dim_pixels_alone_show(gain: float) -> None:
     """Of two, 64 times apart: what one shows well the other does not, or it is saturated."""
-    light, sensor = random.random((60, 60)) ** 4, Sensor(Response.identity(), NoiseModel(20000.0, 0.001))
-    codes = [x + random.normal(0, 0.001, x.shape) for x in (gain * light, np.minimum(64 * light, 1.0))]
-    assert numbers(deviating(codes, (1.0, 64.0), sensor=sensor)) == ({11, 12} if gain > 1.0 else set())
+    light, sensor = (
+        random.random((60, 60)) ** 4,
+        Sensor(Response.identity(), NoiseModel(20000.0, 0.001)),
+    )
+    codes = [
+        x + random.normal(0, 0.001, x.shape) for x in (gain * light, np.minimum(64 * light, 1.0))
+    ]
+    assert numbers(deviating(codes, (1.0, 64.0), sensor=sensor)) == (
+        {11, 12} if gain > 1.0 else set()
+    )
 
 
 FAULTS: dict[str, tuple[Callable[[list[np.ndarray]], list[np.ndarray]], set[int], str]] = {
-    "exchanged": (lambda images: [*images[:2], images[3], images[2], images[4]], {13, 14}, "exchanged"),
-    "moved": (lambda images: images[:3] + [np.roll(image, 2) for image in images[3:]], {14}, "moved"),
-    "lamp": (lambda images: [images[0], images[1] + 0.1, *images[2:]], {12}, "another light was on"),
+    "exchanged": (
+        lambda images: [*images[:2], images[3], images[2], images[4]],
+        {13, 14},
+        "exchanged",
+    ),
+    "moved": (
+        lambda images: images[:3] + [np.roll(image, 2) for image in images[3:]],
+        {14},
+        "moved",
+    ),
+    "lamp": (
+        lambda images: [images[0], images[1] + 0.1, *images[2:]],
+        {12},
+        "another light was on",
+    ),
     "short": (lambda images: [*images[:4], 0.5 * images[4] + 0.01], {15}, "0.5 times as bright"),
 }
 
@@ -128,7 +151,9 @@ def test_likely_causes(fault: str) -> None:
 @pytest.mark.parametrize("first", [None, 14, 20, 25])
 def test_the_first_that_deviates_is_named(first: int | None) -> None:
     """White and stripes with their inverses, twice; from one photograph on everything has moved."""
-    patterns = [(np.arange(20) // width % 2 * np.ones((20, 1))).astype(np.float32) for width in (1, 2, 4, 8)]
+    patterns = [
+        (np.arange(20) // width % 2 * np.ones((20, 1))).astype(np.float32) for width in (1, 2, 4, 8)
+    ]
     codes = [np.ones((20, 20), np.float32), *(half for p in patterns for half in (p, 1 - p))] * 2
     light = 0.5 * random.random((20, 20))
     images = [photograph(light * pattern) for pattern in codes]

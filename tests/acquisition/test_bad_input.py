@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What goes wrong in front of a camera, and on the disk behind it, through `acquire` as a whole.
 
-It is named in one line, or masked; nothing that was committed is lost; and once it is put right, the
-acquisition goes on to what it would have been.
+It is named in one line, or masked; nothing that was committed is lost; and once it is put right,
+the acquisition goes on to what it would have been.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ import pytest
 import ltcl
 from ltcl.acquisition import Correspondence, Report, acquire
 from ltcl.acquisition.session import calibration_folder, calibration_photographs
-from ltcl.errors import AcquisitionError, DeviceError, FileError, InputError, InputTypeError, LtclError
+from ltcl.errors import (
+    AcquisitionError,
+    DeviceError,
+    FileError,
+    InputError,
+    InputTypeError,
+    LtclError,
+)
 from ltcl.store import BlockStore
 from tests.store.stores import contents
 
@@ -51,7 +58,11 @@ ALIGNED = {"geometry": Correspondence.aligned(GRID)}
 @pytest.mark.parametrize(
     ("rig", "change", "error", "text"),
     [
-        *((rig, change, AcquisitionError, DARK) for rig in (UNLIT, CONSTANT) for change in ({}, MEASURED)),
+        *(
+            (rig, change, AcquisitionError, DARK)
+            for rig in (UNLIT, CONSTANT)
+            for change in ({}, MEASURED)
+        ),
         *((BRIGHT, change, AcquisitionError, SATURATED) for change in ({}, MEASURED)),
         (CONSTANT, {"geometry": "graycode"}, AcquisitionError, "the geometry: photographs"),
         (camera(), {"exposures": [1e-4]}, InputError, "exposures is .*lost in noise at 0.0001 s"),
@@ -88,7 +99,10 @@ def test_bad_arguments(rig: Any, change: dict[str, Any], error: type[LtclError],
 
 
 def test_a_photograph_of_another_kind_is_not_kept(tmp_path: Path) -> None:
-    path, rig = tmp_path / "T.zarr", camera(fault=lambda _, image: image[:4] if rig.count == 30 else image)
+    path, rig = (
+        tmp_path / "T.zarr",
+        camera(fault=lambda _, image: image[:4] if rig.count == 30 else image),
+    )
     with pytest.raises(AcquisitionError, match=r"photograph 30 is uint16 \(4, 8\).*\(8, 8\)"):
         acquire(rig, **FULL, store=path)
     assert calibration_photographs(path) == 29
@@ -118,7 +132,9 @@ def test_hot_pixels_decide_nothing(tmp_path: Path) -> None:
     p = random.random(GRID).astype(np.float32)
     ours = np.asarray(measured @ p, np.float64)[~hot]
     theirs = (scene(GRID) @ p.ravel()).reshape(GRID)[~hot]
-    assert np.linalg.norm((ours @ theirs) / (ours @ ours) * ours - theirs) < 0.02 * np.linalg.norm(theirs)
+    assert np.linalg.norm((ours @ theirs) / (ours @ ours) * ours - theirs) < 0.02 * np.linalg.norm(
+        theirs
+    )
 
 
 def test_whatever_ends_a_calibration_its_photographs_stay(

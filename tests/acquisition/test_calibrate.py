@@ -36,7 +36,9 @@ def test_camera_and_projector() -> None:
     scale = float(np.mean(value / light))
     assert calibration.noise.electrons == pytest.approx(10000.0 / scale, rel=0.2)
     np.testing.assert_allclose(calibration.ambient.value / scale, 0.02, rtol=0.05)
-    np.testing.assert_allclose(calibration.white.value.ravel() / scale, corner().sum(axis=1), rtol=0.03)
+    np.testing.assert_allclose(
+        calibration.white.value.ravel() / scale, corner().sum(axis=1), rtol=0.03
+    )
     assert calibration.light.tolist() == [1.0]
     short, *_, longest = calibration.exposures
     assert 0.3 < short * corner().sum(axis=1).max() < 0.95
@@ -63,7 +65,8 @@ def test_colours_mix_and_have_one_unit(response: str) -> None:
     M = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.1], [0.0, 0.3, 1.0]])
     walls = [corner(8, albedo) for albedo in (0.8, 0.7, 0.1)]
     calibration = measure(
-        Shots(VirtualRig(walls, GRID, mixing=M, response=response, bits=12, ambient=0.01)), geometry="aligned"
+        Shots(VirtualRig(walls, GRID, mixing=M, response=response, bits=12, ambient=0.01)),
+        geometry="aligned",
     )
     assert calibration.mixing is not None
     np.testing.assert_allclose(calibration.mixing, M, atol=0.02)
@@ -79,7 +82,9 @@ def test_a_camera_with_few_exposures() -> None:
 
 @pytest.mark.parametrize("bits", [10, 14])
 def test_fewer_bits_than_a_file_has_are_named(bits: int) -> None:
-    camera = SimpleNamespace(projector_grid=(4, 8), channels=1, photograph=rig(4, bits=bits).photograph)
+    camera = SimpleNamespace(
+        projector_grid=(4, 8), channels=1, photograph=rig(4, bits=bits).photograph
+    )
     with pytest.raises(AcquisitionError, match=f"{(1 << bits) - 1} of 65535.*must be {bits}"):
         measure(Shots(cast(Any, camera)), geometry="aligned")
 
@@ -89,14 +94,19 @@ def test_fewer_bits_than_a_file_has_are_named(bits: int) -> None:
 def test_white_is_bright_but_not_saturated(response: str, bits: int, sensitivity: float) -> None:
     camera = rig(response=response, bits=bits, sensitivity=sensitivity)
     seconds = measure(Shots(camera), geometry="aligned").exposures[0]
-    assert 0.05 < seconds * sensitivity * corner().sum(axis=1).max() < 0.95 or seconds in (1e-4, 30.0)
+    assert 0.05 < seconds * sensitivity * corner().sum(axis=1).max() < 0.95 or seconds in (
+        1e-4,
+        30.0,
+    )
 
 
 def test_a_bracket_determines_a_response_where_powers_of_four_do_not() -> None:
     camera, codes, errors = Camera("srgb", 4096, black=0.02), np.linspace(0.02, 0.9, 200), []
     for seconds in (bracket(0.1, 1.6, 4), (0.1, 0.4, 1.6)):
         random = np.random.default_rng(0)
-        response = calibrate([camera.shoot(scene(), t, random) for t in seconds], seconds, levels=4096)
+        response = calibrate(
+            [camera.shoot(scene(), t, random) for t in seconds], seconds, levels=4096
+        )
         relative = response.linear(camera.codes(codes)) / codes
         errors.append(np.std(relative) / np.mean(relative))
     assert errors[0] < min(0.005, errors[1])

@@ -20,8 +20,12 @@ MIXING = np.array([[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]])
 UNEVEN = np.tile(np.linspace(0.05, 0.15, 8), 4)
 
 
-def scanned(scene: VirtualRig, store: Path, strategy: str = "pixel", **options: Any) -> tuple[Any, Setup]:
-    return acquire(scene, geometry="aligned", strategy=strategy, store=store, **options), Setup.of(store)
+def scanned(
+    scene: VirtualRig, store: Path, strategy: str = "pixel", **options: Any
+) -> tuple[Any, Setup]:
+    return acquire(scene, geometry="aligned", strategy=strategy, store=store, **options), Setup.of(
+        store
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -37,7 +41,10 @@ def test_a_picture_is_transport_of_light_and_ambient(tmp_path: Path, channels: i
     assert (setup.channels, setup.ambient.shape) == (channels, shape)
     p, black = random.random(shape).astype(np.float32), np.zeros(shape, np.float32)
     for light in (p, black, np.ones(shape)):
-        picture, expected = np.asarray(T @ light) + setup.ambient, scene.radiance(setup.codes(light))
+        picture, expected = (
+            np.asarray(T @ light) + setup.ambient,
+            scene.radiance(setup.codes(light)),
+        )
         for ours, theirs in zip(picture.reshape(32, -1).T, expected.reshape(32, -1).T, strict=True):
             scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
             assert np.linalg.norm(scale * ours - theirs) < 0.02 * np.linalg.norm(theirs)
@@ -45,7 +52,9 @@ def test_a_picture_is_transport_of_light_and_ambient(tmp_path: Path, channels: i
 
 
 def test_codes_give_the_light_that_is_asked_for(tmp_path: Path) -> None:
-    _, setup = scanned(rig(4, projector_response="gamma2.2", projector_black=0.02), tmp_path / "T.zarr")
+    _, setup = scanned(
+        rig(4, projector_response="gamma2.2", projector_black=0.02), tmp_path / "T.zarr"
+    )
     p = np.linspace(0, 1, 32).reshape(GRID)
     np.testing.assert_allclose(setup.codes(p) ** 2.2, p, atol=0.01)
     np.testing.assert_allclose(setup.light(setup.codes(p)), p, atol=1e-3)

@@ -110,8 +110,12 @@ def test_any_flipped_bit_is_detected(stores: dict[str, Path], tmp_path: Path, ki
         Calibration.of(path)
 
 
-@pytest.mark.parametrize("state", [{"strategy": "spiral"}, {"strategy": ["pixel"]}, {"settings": 3}])
-def test_a_state_that_makes_no_sense(stores: dict[str, Path], tmp_path: Path, state: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "state", [{"strategy": "spiral"}, {"strategy": ["pixel"]}, {"settings": 3}]
+)
+def test_a_state_that_makes_no_sense(
+    stores: dict[str, Path], tmp_path: Path, state: dict[str, Any]
+) -> None:
     path = Path(shutil.copytree(stores["pixel, half done"], tmp_path / "T.zarr"))
     BlockStore.open(path).update(**state)
     rig, settings = set_up("pixel")

@@ -40,12 +40,20 @@ def test_a_virtual_rig_is_what_its_files_say(folder: Path) -> None:
     ltcl.save(folder / "truth.npz", ltcl.Transport([corner(4)] * 3, GRID, mixing=M))
     wide = scipy.sparse.csr_array(scipy.sparse.kron(scipy.sparse.eye_array(32), np.ones((2, 1))))
     scipy.sparse.save_npz(folder / "camera.npz", wide)
-    sensor: dict[str, Any] = {"response": "film", "gain": None, "read": 0.0, "ambient": 0.1, "seed": 3}
+    sensor: dict[str, Any] = {
+        "response": "film",
+        "gain": None,
+        "read": 0.0,
+        "ambient": 0.1,
+        "seed": 3,
+    }
     text = VIRTUAL + 'response = "film"\ngain = "none"\nread = 0.0\nambient = 0.1\nseed = 3\n'
     text += 'camera_map = "camera.npz"\ncamera_grid = [4, 16]\n[acquire]\nresponse = "srgb"\n'
     project = Project.open(written(folder, text))
     plain = VirtualRig([corner(4)] * 3, GRID, mixing=M, **sensor)
-    warped = VirtualRig([corner(4)] * 3, GRID, mixing=M, camera_map=wide, camera_grid=(4, 16), **sensor)
+    warped = VirtualRig(
+        [corner(4)] * 3, GRID, mixing=M, camera_map=wide, camera_grid=(4, 16), **sensor
+    )
     codes = np.linspace(0, 1, 32).reshape(GRID)
     for aligned, same in ((False, warped), (True, plain)):
         with project.rig(aligned=aligned) as rig:
@@ -69,16 +77,22 @@ def test_a_folder_rig_works_in_the_folder(tmp_path: Path) -> None:
     assert ltcl.images.read_codes(tmp_path / "patterns" / "pattern_000001.png").shape == (60, 100)
 
 
-def test_a_live_rig_is_planned_without_a_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_rig_is_planned_without_a_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     project = Project.open(written(tmp_path, LIVE.format("nothing.avi")))
     assert project.outlook()[1]["channels"] == 3
     with pytest.raises(AcquisitionError), project.rig():
         pass
-    video = cv2.VideoWriter(str(tmp_path / "grey.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (32, 16))
+    video = cv2.VideoWriter(
+        str(tmp_path / "grey.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (32, 16)
+    )
     video.write(np.full((16, 32, 3), 128, np.uint8))
     video.release()
-    text = LIVE.format("grey.avi").replace("[rig.display]", "channels = 1\nseconds = 0.03\n[rig.display]")
+    text = LIVE.format("grey.avi").replace(
+        "[rig.display]", "channels = 1\nseconds = 0.03\n[rig.display]"
+    )
     project = Project.open(written(tmp_path, text.replace('"live"', '"live"\nperiod = "none"')))
     for _ in range(2):  # the second would fail where a display is left open
         with project.rig() as rig:
@@ -87,7 +101,10 @@ def test_a_live_rig_is_planned_without_a_camera(tmp_path: Path, monkeypatch: pyt
 
 
 def test_guesses_follow_the_sensor_and_the_light(folder: Path) -> None:
-    text = VIRTUAL + "bits = 8\ngain = 500.0\nread = 0.01\nambient = 0.3\n[acquire]\nexposures = [8.0, 0.5]\n"
+    text = (
+        VIRTUAL
+        + "bits = 8\ngain = 500.0\nread = 0.01\nambient = 0.3\n[acquire]\nexposures = [8.0, 0.5]\n"
+    )
     outlook = Project.open(written(folder, text)).outlook()[1]
     assert outlook["noise"] == NoiseModel(electrons=500.0, read=0.01, levels=256)
     assert (outlook["light"].ambient, outlook["exposures"]) == (0.3, (0.5, 8.0))
@@ -101,14 +118,30 @@ def test_guesses_follow_the_sensor_and_the_light(folder: Path) -> None:
         ("[rig", FileError, "TOML"),
         ("[rig]\nbits = 8", InputError, r"\[rig\] kind is None; .* virtual, mitsuba, folder, live"),
         ('[rig]\nkind = "virtual"', InputError, r"\[rig\] .*'transport'"),
-        (VIRTUAL + "bit = 8", InputError, r"\[rig\] has 'bit'; .* grid, camera_grid, .*bits, .*transport"),
+        (
+            VIRTUAL + "bit = 8",
+            InputError,
+            r"\[rig\] has 'bit'; .* grid, camera_grid, .*bits, .*transport",
+        ),
         (VIRTUAL + "[scan]", InputError, r"'scan'; .*\[rig\] and \[acquire\]"),
-        (VIRTUAL + "[acquire]\nstore = 'a'", InputError, r"\[acquire\] has 'store'; .* geometry, strategy"),
-        (VIRTUAL + "[acquire]\nresponse = 'agfa'", InputError, "response is 'agfa'; .* linear, srgb"),
+        (
+            VIRTUAL + "[acquire]\nstore = 'a'",
+            InputError,
+            r"\[acquire\] has 'store'; .* geometry, strategy",
+        ),
+        (
+            VIRTUAL + "[acquire]\nresponse = 'agfa'",
+            InputError,
+            "response is 'agfa'; .* linear, srgb",
+        ),
         ('[rig]\nkind = "live"\n[rig.display]\ngrid = [4, 8]', InputError, r"\[rig\] .*'camera'"),
         (LIVE.partition("[rig.d")[0], InputError, r"\[rig\] .*'display'"),
         ('[rig]\nkind = "live"\ncamera = 0\ndisplay = 0', InputError, r"no table \[rig\.camera\]"),
-        (LIVE.replace("opencv", "eye"), InputError, r"\[rig\.camera\] kind is 'eye'; .* opencv, gphoto2"),
+        (
+            LIVE.replace("opencv", "eye"),
+            InputError,
+            r"\[rig\.camera\] kind is 'eye'; .* opencv, gphoto2",
+        ),
         (LIVE.replace("grid", "grit"), InputError, r"\[rig\.display\] has 'grit'; .* grid"),
         (VIRTUAL + "bits = 40", InputError, r"acquisition\.toml: \[rig\] bits is 40"),
         (VIRTUAL + 'response = "agfa"', InputError, r"\[rig\] response is 'agfa'"),

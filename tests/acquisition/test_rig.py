@@ -45,12 +45,16 @@ class Scripted:
         (np.array([[0, 0.2, 1.0]], np.float16), None, None),
     ],
 )
-def test_codes_are_scaled_by_full_scale(image: np.ndarray, bits: int | None, levels: int | None) -> None:
+def test_codes_are_scaled_by_full_scale(
+    image: np.ndarray, bits: int | None, levels: int | None
+) -> None:
     shots = Shots(Scripted(image, bits=bits))
     assert (shots.levels, shots.camera_grid) == (None, None)
     scaled = shots.photograph(CODES, 1.0)
     assert scaled.dtype == np.float32
-    np.testing.assert_allclose(scaled, [[0.0, 0.2, 1.0]], rtol=3e-4 if image.dtype == np.float16 else 1e-6)
+    np.testing.assert_allclose(
+        scaled, [[0.0, 0.2, 1.0]], rtol=3e-4 if image.dtype == np.float16 else 1e-6
+    )
     assert (shots.levels, shots.camera_grid, shots.count) == (levels, (1, 3), 1)
 
 
@@ -71,7 +75,10 @@ def test_the_rig_sees_checked_codes_and_its_own_exposures() -> None:
     [
         *((np.zeros(shape), 1.0, "codes has shape") for shape in ((3, 2), (2, 3, 3))),
         *((CODES * factor, 1.0, "codes") for factor in (np.nan, 2.02, -0.2)),
-        *((CODES, seconds, f"seconds is '?{seconds}") for seconds in (0.0, np.nan, "1", 31.0, 1e-5)),
+        *(
+            (CODES, seconds, f"seconds is '?{seconds}")
+            for seconds in (0.0, np.nan, "1", 31.0, 1e-5)
+        ),
     ],
 )
 def test_bad_requests_never_reach_the_rig(codes: Any, seconds: Any, part: str) -> None:
@@ -92,8 +99,14 @@ SMALL = np.zeros((2, 2), np.uint8)
         ([SMALL, SMALL[:1]], "photograph 2 is uint8 (1, 2); it must be"),
         ([SMALL, SMALL.astype(np.uint16)], "photograph 2 is uint16"),
         ([np.array([[1e39, 1.0]])], "photograph 1 has 1 NaN or infinite"),
-        *(([x], f"photograph 1 has shape {x.shape}") for x in (SMALL[:0], SMALL[0], np.zeros((2, 2, 3)))),
-        *(([x], f"photograph 1 holds {np.asarray(x).dtype}") for x in (SMALL.astype(np.int32), None)),
+        *(
+            ([x], f"photograph 1 has shape {x.shape}")
+            for x in (SMALL[:0], SMALL[0], np.zeros((2, 2, 3)))
+        ),
+        *(
+            ([x], f"photograph 1 holds {np.asarray(x).dtype}")
+            for x in (SMALL.astype(np.int32), None)
+        ),
         ([np.full((1, 1), 4096, np.uint16)], "photograph 1 reaches 4096; by rig.bits"),
         ([SMALL, OSError("it\nis gone")], "photograph 2: the rig failed with OSError: it is gone"),
         ([PhotographMissing("photograph 7 is not there", 7)], "photograph 7 is not there"),
@@ -115,22 +128,33 @@ def test_bad_photographs_are_named(images: list[Any], part: str) -> None:
     [
         ({"channels": 2}, "rig.channels is 2"),
         ({"projector_grid": (0, 3)}, "projector_grid"),
-        *(({"exposures": e}, "rig.exposures") for e in ([], [0.1, 0.1], [1.0, 0.5], [0.0, 1.0], [[1.0]])),
-        *(({"describe": lambda facts=facts: facts}, r"rig\.describe.*JSON") for facts in ({1, 2}, [np.nan])),
+        *(
+            ({"exposures": e}, "rig.exposures")
+            for e in ([], [0.1, 0.1], [1.0, 0.5], [0.0, 1.0], [[1.0]])
+        ),
+        *(
+            ({"describe": lambda facts=facts: facts}, r"rig\.describe.*JSON")
+            for facts in ({1, 2}, [np.nan])
+        ),
     ],
 )
 def test_what_is_no_rig_is_refused(members: dict[str, Any], part: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=part):
         Shots(Scripted(**members))
     nothing: Any = object()
-    with pytest.raises(InputTypeError, match="rig is a object without projector_grid, channels, photograph"):
+    with pytest.raises(
+        InputTypeError, match="rig is a object without projector_grid, channels, photograph"
+    ):
         Shots(nothing)
 
 
 def test_optional_members_are_used_where_they_are() -> None:
     calls = []
     members: dict[str, Any] = {"prepare": calls.extend, "close": lambda: calls.append("closed")}
-    members |= {"describe": lambda: {"kind": "scripted"}, "file_name": lambda number: f"photo_{number}.png"}
+    members |= {
+        "describe": lambda: {"kind": "scripted"},
+        "file_name": lambda number: f"photo_{number}.png",
+    }
     with Shots(Scripted(number=7, **members)) as shots:
         shots.prepare([(CODES, 1)])
         assert shots.describe()["rig"] == {"kind": "scripted"}
@@ -141,7 +165,9 @@ def test_optional_members_are_used_where_they_are() -> None:
     assert (plain.number, plain.name(7)) == (0, "photograph 7")
 
 
-@pytest.mark.parametrize("kind", [np.array, scipy.sparse.csr_array, scipy.sparse.coo_array, aslinearoperator])
+@pytest.mark.parametrize(
+    "kind", [np.array, scipy.sparse.csr_array, scipy.sparse.coo_array, aslinearoperator]
+)
 def test_fingerprints_change_with_any_entry(kind: Any) -> None:
     T = random.random((5, 4))
     changed = T.copy()

@@ -32,12 +32,16 @@ def run(rig: Any, store: Path, **settings: Any) -> None:
     acquire(rig, geometry="aligned", strategy="pixel", store=store, **settings)
 
 
-def test_a_camera_that_is_unplugged_again_and_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_camera_that_is_unplugged_again_and_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Nothing is photographed twice, but for one photograph that was damaged."""
     whole, store, rig = unplugged(), tmp_path / "T.zarr", unplugged()
     run(whole, tmp_path / "whole.zarr")
     for left, count in ((1, 1), (20, 21), (30, 51)):
-        with pytest.raises(AcquisitionError, match=f"photograph {count + 1}: the rig failed with OSErr"):
+        with pytest.raises(
+            AcquisitionError, match=f"photograph {count + 1}: the rig failed with OSErr"
+        ):
             run(unplugged(left), store)
         assert calibration_photographs(store) == count
         assert not store.exists()
@@ -55,11 +59,16 @@ def test_another_rig_and_a_second_process_are_refused(tmp_path: Path) -> None:
     store = tmp_path / "T.zarr"
     with pytest.raises(AcquisitionError):
         run(unplugged(20), store)
-    with pytest.raises(InputError, match=r"rig.bits is 8, but .*T.zarr.calibration was begun with 12"):
+    with pytest.raises(
+        InputError, match=r"rig.bits is 8, but .*T.zarr.calibration was begun with 12"
+    ):
         run(unplugged(bits=8), store)
     with pytest.raises(InputError, match=r"resume is False, but .*calibration exists"):
         run(unplugged(), store, resume=False)
-    with locked(calibration_folder(store)), pytest.raises(FileError, match=r"calibration: another run"):
+    with (
+        locked(calibration_folder(store)),
+        pytest.raises(FileError, match=r"calibration: another run"),
+    ):
         run(unplugged(), store)
     assert calibration_photographs(store) == 20
 
@@ -84,7 +93,10 @@ LIVE: dict[str, Any] = {
     ("change", "text"),
     [
         ({"survey": {"latency": 0.08}, "seed": 3, "mitsuba": "3.9"}, None),
-        ({"camera": LIVE["camera"] | {"source": 2}, "display": {"index": 0, "block": [2, 2]}}, None),
+        (
+            {"camera": LIVE["camera"] | {"source": 2}, "display": {"index": 0, "block": [2, 2]}},
+            None,
+        ),
         ({"period": 1 / 60 + 1e-9, "exposures": [1 / 60 + 1e-9, 1 / 30]}, None),
         ({"kind": "virtual"}, r"rig\.kind is 'virtual'"),
         ({"camera": {"kind": "opencv", "locked": {}}}, r"rig\.camera\.locked\.exposure is"),
@@ -119,7 +131,10 @@ class Terse(Plain):
 @pytest.mark.parametrize(
     ("kind", "others"),
     [
-        (Plain, [(Terse(), "rig.kind is 'terse'"), (Plain(bits=10), "levels"), (Plain(DIM), "white")]),
+        (
+            Plain,
+            [(Terse(), "rig.kind is 'terse'"), (Plain(bits=10), "levels"), (Plain(DIM), "white")],
+        ),
         (Terse, [(Terse(bits=10), r"1024 levels.*4096")]),
     ],
 )

@@ -102,7 +102,11 @@ def test_progress(tmp_path: Path, strategy: str) -> None:
 
 
 def test_other_settings_and_rigs_are_refused(tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel", "store": tmp_path / "T.zarr"}
+    settings: dict[str, Any] = {
+        "geometry": "aligned",
+        "strategy": "pixel",
+        "store": tmp_path / "T.zarr",
+    }
     with pytest.raises(AcquisitionError, match="unplugged"):
         acquire(Unplugged(corner(), GRID, left=300), **settings)
     for other, change, text in (
@@ -145,11 +149,13 @@ def test_a_camera_of_its_own_pixels(
 ) -> None:
     """Decoded by Gray code. It does not see all pixels: these are masked, and the others are right.
 
-    The pattern for the measured transport shows the picture under the true one to 30 dB. By hand, with all
-    defaults, it takes at most 300 photographs.
+    The pattern for the measured transport shows the picture under the true one to 30 dB. By hand,
+    with all defaults, it takes at most 300 photographs.
     """
     C, path = camera_map(askance, (27, 50), GRID), tmp_path / "T.zarr"
-    oblique = Unplugged(corner(), GRID, camera_grid=(27, 50), camera_map=C, response=response, bits=bits)
+    oblique = Unplugged(
+        corner(), GRID, camera_grid=(27, 50), camera_map=C, response=response, bits=bits
+    )
     oblique.keeps_photographs = by_hand
     T = acquire(oblique, strategy=strategy, store=path)
     assert oblique.count <= 300 or not by_hand
@@ -164,7 +170,9 @@ def test_a_camera_of_its_own_pixels(
     assert errors.max() < most, errors
     y, x = np.mgrid[:8, :16] / 16
     desired = 0.25 + 0.1 * np.sin(7 * x + 4 * y)
-    pattern = np.asarray(ltcl.compensate(T, (desired / scale).astype(np.float32), rtol=1e-3).pattern)
+    pattern = np.asarray(
+        ltcl.compensate(T, (desired / scale).astype(np.float32), rtol=1e-3).pattern
+    )
     error = (truth @ pattern.ravel().astype(np.float64) - desired.ravel())[seen]
     assert 10 * np.log10(desired.max() ** 2 / np.mean(error**2)) > 30
 
@@ -181,6 +189,8 @@ def test_pixels_that_every_exposure_saturates(tmp_path: Path) -> None:
         ltcl.load(path, on_dark="raise")
     report = Report.of(path)
     assert (report.saturated, report.masked, report.coverage) == (3 / 32, 3 / 32, 1.0)
-    assert 3 / report.entries <= report.unknown < 0.5  # their own, and those of the sums of their batches
+    assert (
+        3 / report.entries <= report.unknown < 0.5
+    )  # their own, and those of the sums of their batches
     assert report.entries == ltcl.load(path, on_dark="mask").matrices[0].nnz
     assert report.photographs == report.patterns * len(Calibration.of(path).exposures)

@@ -14,7 +14,12 @@ import ltcl
 if TYPE_CHECKING:
     from distributed import Client
 
-WORKERS: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "host": "127.0.0.1", "silence_logs": 50}
+WORKERS: dict[str, Any] = {
+    "n_workers": 2,
+    "threads_per_worker": 1,
+    "host": "127.0.0.1",
+    "silence_logs": 50,
+}
 WORKERS |= {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"}}
 
 
@@ -23,7 +28,9 @@ def cluster(private_cache) -> Iterator[Client]:
     """Of two workers, each with the device that ltcl opens by default, and what tests remember."""
     from distributed import Client, LocalCluster  # imported here it mutes no handler of pytest
 
-    slowly = dask.config.set({"distributed.deploy.lost-worker-timeout": "120s"})  # on a busy machine
+    slowly = dask.config.set(
+        {"distributed.deploy.lost-worker-timeout": "120s"}
+    )  # on a busy machine
     environment = {"LTCL_CACHE": str(private_cache)}
     with slowly, LocalCluster(**WORKERS, env=environment) as cluster, Client(cluster) as client:
         yield client

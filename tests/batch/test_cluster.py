@@ -24,8 +24,8 @@ from distributed import Client, LocalCluster
 import ltcl
 from ltcl import images
 from ltcl.batch import compensate_frames
+from ltcl.batch.cluster import connect, stream
 from ltcl.cli.main import main
-from ltcl.cluster import connect, stream
 from ltcl.errors import ClusterError, FileError, InputError, InputTypeError
 from tests.problems import lambertian
 
@@ -73,7 +73,9 @@ def test_items_that_are_done_leave_memory(client):
             sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert sizes[-1] - sizes[9] < 5 << 20, sizes  # here and on the scheduler, which is in this process
+    assert sizes[-1] - sizes[9] < 5 << 20, (
+        sizes
+    )  # here and on the scheduler, which is in this process
 
 
 def test_a_function_is_sent_once_to_each_worker(client, monkeypatch):
@@ -116,7 +118,9 @@ def test_what_was_killed_is_done_by_others_and_joins_again(client):
     assert len({pid for _, pid in results}) >= 3  # of two
 
 
-@pytest.mark.parametrize(("select", "text"), [("abacus", "device is 'abacus'"), ("", "no OpenCL device")])
+@pytest.mark.parametrize(
+    ("select", "text"), [("abacus", "device is 'abacus'"), ("", "no OpenCL device")]
+)
 def test_a_worker_without_device_is_named_and_takes_no_work(client, caplog, select, text):
     first, second = client.nthreads()
 
@@ -149,7 +153,7 @@ def test_a_worker_without_device_is_named_and_takes_no_work(client, caplog, sele
 
 def test_one_worker_for_each_gpu_unless_asked_for_more(client, caplog):
     def claim(gpu: bool) -> None:
-        module: Any = importlib.import_module("ltcl.cluster")
+        module: Any = importlib.import_module("ltcl.batch.cluster")
         module.original = getattr(module, "original", module.describe)
         module.describe = (lambda: ("A GPU", "host, bus 1")) if gpu else module.original
 
@@ -220,7 +224,9 @@ def test_frames_have_the_bytes_of_a_serial_run(client, film, device, tmp_path, s
     calls = []
     common: dict[str, Any] = {"batch": 4, "appearance": True, "client": client, "resume": True}
     compensate_frames(T, film / "in", tmp_path, frames=8, **common)
-    done = compensate_frames(T, film / "in", tmp_path, progress=lambda *now: calls.append(now), **common)
+    done = compensate_frames(
+        T, film / "in", tmp_path, progress=lambda *now: calls.append(now), **common
+    )
     assert everything(tmp_path) == everything(film / "serial")
     assert done.solved == FRAMES - 8
     assert [(step, total) for step, _, total in calls] == [("frames", FRAMES)] * len(calls)
@@ -269,11 +275,19 @@ sys.exit(main(sys.argv[2:]))
 
 
 def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path):
-    words = ["compensate", *map(str, (film / "T.npz", film / "in")), "--rtol", "0.01", "--appearance"]
+    words = [
+        "compensate",
+        *map(str, (film / "T.npz", film / "in")),
+        "--rtol",
+        "0.01",
+        "--appearance",
+    ]
     words += ["--batch", "4", "--out", str(tmp_path / "out"), "--quiet"]
     file, dask = str(tmp_path / "scheduler.json"), [sys.executable, "-m", "dask"]
     commands = ["scheduler --host 127.0.0.1 --port 0", "worker --nthreads 1 --no-nanny"]
-    started = [[*dask, *each.split(), "--no-dashboard", "--scheduler-file", file] for each in commands]
+    started = [
+        [*dask, *each.split(), "--no-dashboard", "--scheduler-file", file] for each in commands
+    ]
     processes = [subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in started]
     try:
         with Client(scheduler_file=file) as client:
@@ -288,7 +302,9 @@ def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path)
     assert (run.returncode, run.stderr.count("\n")) == (1, 1), run.stderr
     assert "was lost; 8 frame(s) are done" in run.stderr
     assert main([*words, "--resume"]) == 0
-    patterns = {name: data for name, data in everything(film / "serial").items() if "json" not in name}
+    patterns = {
+        name: data for name, data in everything(film / "serial").items() if "json" not in name
+    }
     assert everything(tmp_path / "out").items() >= patterns.items()
 
 
@@ -324,7 +340,9 @@ def test_a_lost_scheduler_is_one_line_and_the_next_run_goes_on(film, device, tmp
                 cluster.close()
 
         common: dict[str, Any] = {"batch": 4, "appearance": True}
-        with pytest.raises(ClusterError, match=r"scheduler at .* lost.*8 frame.*resume=True") as error:
+        with pytest.raises(
+            ClusterError, match=r"scheduler at .* lost.*8 frame.*resume=True"
+        ) as error:
             compensate_frames(T, film / "in", tmp_path, client=other, progress=progress, **common)
         assert "\n" not in str(error.value)
     compensate_frames(T, film / "in", tmp_path, resume=True, **common)
@@ -338,10 +356,20 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
         shutil.copy(film / "T.npz", tmp_path / f"{name}.npz")
     (tmp_path / "c.npz").write_bytes(b"no transport")
     address, out = client.scheduler.address, tmp_path / "out"
-    scenes = ["compensate", "--transports", str(tmp_path / "*.npz"), str(desired), "--out", str(out)]
+    scenes = [
+        "compensate",
+        "--transports",
+        str(tmp_path / "*.npz"),
+        str(desired),
+        "--out",
+        str(out),
+    ]
     assert main([*scenes, "--cluster", address]) == 1
     assert "1 of 3 scenes failed" in capsys.readouterr().err
-    assert main(["compensate", str(tmp_path / "a.npz"), str(desired), "--out", str(tmp_path / "one")]) == 0
+    assert (
+        main(["compensate", str(tmp_path / "a.npz"), str(desired), "--out", str(tmp_path / "one")])
+        == 0
+    )
     for name in ("a", "b"):
         for picture in tmp_path.glob("one/*.exr"):
             assert (out / name / picture.name).read_bytes() == picture.read_bytes()
@@ -349,7 +377,9 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
     frames += ["--appearance", "--out", str(tmp_path / "frames")]
     assert main([*frames, "--cluster", "local", "--workers", "1", "--frames", "4"]) == 0
     assert main([*frames, "--cluster", address, "--resume"]) == 0
-    patterns = {name: data for name, data in everything(film / "serial").items() if "json" not in name}
+    patterns = {
+        name: data for name, data in everything(film / "serial").items() if "json" not in name
+    }
     assert everything(tmp_path / "frames").items() >= patterns.items()
 
 
@@ -367,7 +397,10 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
 def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, options, text):
     out = str(tmp_path / "out")
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        assert main(["compensate", *map(str, (film / "T.npz", film / "in")), "--out", out, *options]) == 1
+        assert (
+            main(["compensate", *map(str, (film / "T.npz", film / "in")), "--out", out, *options])
+            == 1
+        )
     error = capsys.readouterr().err
     assert (text in error, error.count("\n")) == (True, 1), error
     assert not (tmp_path / "out").exists()

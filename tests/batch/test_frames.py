@@ -56,20 +56,30 @@ def fill(folder: Path, pictures: np.ndarray | list[np.ndarray]) -> Path:
 
 
 def everything(folder: Path) -> dict[Path, bytes]:
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
 
 
 def patterns(done: CompensatedFrames) -> list[np.ndarray]:
-    return [images.read(next(done.folder.glob(f"pattern_{each.number:06}.*"))) for each in done.records]
+    return [
+        images.read(next(done.folder.glob(f"pattern_{each.number:06}.*"))) for each in done.records
+    ]
 
 
 @pytest.mark.parametrize("batch", [1, 4, 20])
 def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batch):
     calls = []
-    common: dict[str, Any] = {"format": "exr", "rtol": 1e-4, "progress": lambda *now: calls.append(now)}
+    common: dict[str, Any] = {
+        "format": "exr",
+        "rtol": 1e-4,
+        "progress": lambda *now: calls.append(now),
+    }
     done = compensate_frames(T, source, tmp_path, batch=batch, **common)
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT, rtol=5e-4)
-    assert [(r.number, r.name) for r in done.records] == [(n + 1, f"f{n}.exr") for n in range(COUNT)]
+    assert [(r.number, r.name) for r in done.records] == [
+        (n + 1, f"f{n}.exr") for n in range(COUNT)
+    ]
     assert calls == [("frames", n, COUNT) for n in [*range(0, COUNT, batch), COUNT]]
     assert (done.solved, done.worst.error < 1e-4, done.most_clipped.clipped) == (COUNT, True, 0)
 
@@ -82,7 +92,10 @@ def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, 
         np.testing.assert_allclose(coarse, exact / 2.0, atol=1e-4)
     for frame in list(open_frames(source))[:5]:
         name = f"appearance/appearance_{frame.number:06}"
-        shown, light = images.read(tmp_path / f"png/{name}.png"), images.read(tmp_path / f"exr/{name}.exr")
+        shown, light = (
+            images.read(tmp_path / f"png/{name}.png"),
+            images.read(tmp_path / f"exr/{name}.exr"),
+        )
         np.testing.assert_allclose(shown, frame.picture(), rtol=0.02, atol=1e-3)
         np.testing.assert_allclose(light, 0.5 * frame.picture(), rtol=0.02)
 
@@ -90,10 +103,14 @@ def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, 
 def test_grey_coloured_black_and_bright_frames_are_what_each_is_alone(T, tmp_path):
     grey, colour = seen(LIGHT[:4]), np.stack(list(seen(LIGHT[4:7])), axis=-1)
     pictures = [grey[0], colour, 4.0 * grey[2], np.zeros(GRID), 0.5 * grey[3]]
-    done = compensate_frames(T, fill(tmp_path / "in", pictures), tmp_path / "out", format="exr", rtol=1e-4)
+    done = compensate_frames(
+        T, fill(tmp_path / "in", pictures), tmp_path / "out", format="exr", rtol=1e-4
+    )
     for record, picture, pattern in zip(done.records, pictures, patterns(done), strict=True):
         alone = ltcl.compensate(T, picture, rtol=1e-4)
-        shown = pattern[..., 0] if picture.ndim == 2 else pattern  # a batch with one in colour is in colour
+        shown = (
+            pattern[..., 0] if picture.ndim == 2 else pattern
+        )  # a batch with one in colour is in colour
         np.testing.assert_allclose(shown, alone.pattern, atol=2e-3)
         assert record.error == pytest.approx(alone.error, abs=1e-3)
         assert record.clipped == pytest.approx(alone.clipped, abs=0.05)
@@ -115,7 +132,9 @@ def test_one_gain_for_all_frames_from_a_sample_of_all(T, tmp_path):
     assert (listed["gain"], listed["settings"]["gain"]) == (done.gain, "auto")
 
 
-def test_background_and_weights_serve_all_frames_and_sizes_are_scaled_when_asked(T, source, tmp_path):
+def test_background_and_weights_serve_all_frames_and_sizes_are_scaled_when_asked(
+    T, source, tmp_path
+):
     options: dict[str, Any] = {"background": 0.1 * seen(LIGHT[:1])[0], "weights": np.ones(GRID)}
     done = compensate_frames(T, source, tmp_path / "out", format="exr", rtol=1e-4, **options)
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT - 0.1 * LIGHT[0], rtol=2e-3)
@@ -130,7 +149,9 @@ def test_videos_in_and_out_also_where_sound_outlasts_the_picture(T, tmp_path, ca
     film, out = tmp_path / "film.mkv", tmp_path / "out.avi"
     write_video(film, seen(LIGHT), fps=30.0)
     data = film.read_bytes()
-    place = data.index(b"\x44\x89\x88") + 3  # its duration, of which the number of frames is estimated
+    place = (
+        data.index(b"\x44\x89\x88") + 3
+    )  # its duration, of which the number of frames is estimated
     (duration,) = struct.unpack_from(">d", data, place)
     film.write_bytes(data[:place] + struct.pack(">d", 1.2 * duration) + data[place + 8 :])
     common: dict[str, Any] = {"out": tmp_path / "patterns", "video": out, "rtol": 1e-4, "batch": 4}
@@ -139,7 +160,9 @@ def test_videos_in_and_out_also_where_sound_outlasts_the_picture(T, tmp_path, ca
     assert (shown.count, shown.fps) == (COUNT, pytest.approx(30.0))
     assert [record.name for record in done.records][:2] == ["film.mkv:1", "film.mkv:2"]
     for frame, source, pattern in zip(shown, open_frames(film), patterns(done), strict=True):
-        np.testing.assert_allclose(images.to_srgb(frame.picture()), images.to_srgb(pattern), atol=0.6 / 255)
+        np.testing.assert_allclose(
+            images.to_srgb(frame.picture()), images.to_srgb(pattern), atol=0.6 / 255
+        )
         desired = source.picture()
         assert np.linalg.norm(seen(pattern[None])[0] - desired) < 1e-2 * np.linalg.norm(desired)
     again = compensate_frames(T, film, fps=10, resume=True, **common)
@@ -161,7 +184,9 @@ def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, 
         common["T"] = ltcl.load(tmp_path / "T.npz", first_bounce=SCENE.F)
     (out / "pattern_000006.png").unlink()
     assert compensate_frames(**common, resume=True).solved == 1
-    np.testing.assert_allclose(patterns(done), patterns(whole), atol=1e-3)  # 5 to 8 were not one batch
+    np.testing.assert_allclose(
+        patterns(done), patterns(whole), atol=1e-3
+    )  # 5 to 8 were not one batch
 
 
 class Projector:
@@ -189,7 +214,10 @@ class Projector:
     ],
 )
 def test_another_run_is_refused_by_what_differs(T, source, tmp_path, changed, text):
-    out, common = tmp_path / "out", {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "T": T}
+    out, common = (
+        tmp_path / "out",
+        {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "T": T},
+    )
     if "exact" in changed:
         common["exact"] = ltcl.Transport(SCENE.T, GRID)
     if "source" in changed:  # one of its files is another

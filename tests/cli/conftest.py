@@ -77,7 +77,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def transport(folder: Path, device: Device) -> Path:
     """A corner of two walls, grey, grid 5 x 10."""
     scene = scenes.dihedral(5, albedo=0.6)
-    ltcl.save(folder / "corner.npz", scene.transport(first_bounce=scene.first_bounce, device=device))
+    ltcl.save(
+        folder / "corner.npz", scene.transport(first_bounce=scene.first_bounce, device=device)
+    )
     return folder / "corner.npz"
 
 
@@ -98,7 +100,9 @@ def compressed(folder: Path, transport: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def inverse(folder: Path, transport: Path) -> Path:
-    ltcl.save_inverse(folder / "inverse.npz", ltcl.invert(ltcl.load(transport), 1e-3, basis="pixels"))
+    ltcl.save_inverse(
+        folder / "inverse.npz", ltcl.invert(ltcl.load(transport), 1e-3, basis="pixels")
+    )
     return folder / "inverse.npz"
 
 
@@ -120,14 +124,20 @@ def large_picture(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def results(program: Program, transport: Path, picture: Path, large_picture: Path, folder: Path) -> Any:
+def results(
+    program: Program, transport: Path, picture: Path, large_picture: Path, folder: Path
+) -> Any:
     """The folder and the JSON of compensate, separate and relight on two pictures, all in one folder."""
     out, report = folder.with_name("results"), {}
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     common = f"--on-dark mask --encoding linear --grid 5x10 --resize --json --out {out}".split()
     solving = ["--first-bounce", "exact", "--rtol", "1e-4", "--method", "chebyshev"]
-    for command, more in (("compensate", solving), ("separate", [*solving, "--bounces", 2]), ("relight", [])):
+    for command, more in (
+        ("compensate", solving),
+        ("separate", [*solving, "--bounces", 2]),
+        ("relight", []),
+    ):
         report[command] = program(command, transport, picture, large_picture, *common, *more).json
     return out, report
 
@@ -137,7 +147,10 @@ def simulated(program: Program, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """A corner of two walls, 4 x 8, in a room that is not dark; nothing is photographed here."""
     out = tmp_path_factory.mktemp("simulated") / "scan"
     options = ["--size", 4, "--strategy", "pixel", "--response", "film", "--ambient", 0.05]
-    assert program("simulate", "dihedral", "--out", out, *options, "--projector-response", "film").code == 0
+    assert (
+        program("simulate", "dihedral", "--out", out, *options, "--projector-response", "film").code
+        == 0
+    )
     return out
 
 

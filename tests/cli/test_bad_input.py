@@ -56,13 +56,28 @@ OTHERS = [
     ("compensate {store} {picture} --resize --high 2 --out {out}", ["--high is 2", "0 to 1"]),
     ("compensate --transports {nan} {film} --out {out}", ["--transports", "film.avi holds frames"]),
     ("compensate --transports {nan} {empty} --out {out}", ["--transports", "empty holds frames"]),
-    ("compensate --transports {store} {picture} --out {store}", ["--out is", "where transports are"]),
-    ("compensate --transports {nan} {store} {picture} --out {out}", ["zarr: is a transport", "--transports"]),
-    ("compensate --transports {nan} {transport} {picture} --out {out}", ["corner.npz: is a transport"]),
-    ("compensate --transports {nan}.x {picture} --out {out}", ["nan.npy.x, and there is no such file"]),
+    (
+        "compensate --transports {store} {picture} --out {store}",
+        ["--out is", "where transports are"],
+    ),
+    (
+        "compensate --transports {nan} {store} {picture} --out {out}",
+        ["zarr: is a transport", "--transports"],
+    ),
+    (
+        "compensate --transports {nan} {transport} {picture} --out {out}",
+        ["corner.npz: is a transport"],
+    ),
+    (
+        "compensate --transports {nan}.x {picture} --out {out}",
+        ["nan.npy.x, and there is no such file"],
+    ),
     ("compensate {store} {picture} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
     ("compensate {store} {film} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
-    ("separate {store} {picture} --out {store}/new", ["--out is", "new, which is TRANSPORT itself or in it"]),
+    (
+        "separate {store} {picture} --out {store}/new",
+        ["--out is", "new, which is TRANSPORT itself or in it"],
+    ),
     ("acquire run {simulated} --take {empty}", ["--take", "virtual"]),
     ("show {empty} --every 2 --arrival", ["--every is 2", "--arrival"]),
     ("show {empty} --every 0", ["is 0"]),
@@ -76,10 +91,14 @@ def names(request: pytest.FixtureRequest, folder: Path) -> dict[str, Any]:
     files = {name: request.getfixturevalue(name) for name in fixtures.split()}
     T = ltcl.load(files["transport"]).matrices[0]
     ltcl.save(folder / "other.npz", ltcl.Transport(1.5 * T - 0.5 * np.diag(np.diag(T)), (5, 10)))
-    np.savez(folder / "dark.npz", T=np.diag([1.0, 1, 0, 1, 0, 1]) + 0.01 * (1 - np.eye(6)), grid=(2, 3))
+    np.savez(
+        folder / "dark.npz", T=np.diag([1.0, 1, 0, 1, 0, 1]) + 0.01 * (1 - np.eye(6)), grid=(2, 3)
+    )
     np.save(folder / "tall.npy", np.ones((50, 10)))
     np.save(folder / "nan.npy", np.full((4, 4), np.nan))
-    write_video(folder / "film.avi", np.random.default_rng(6).uniform(0.2, 0.3, (3, 4, 12)), fps=12.0)
+    write_video(
+        folder / "film.avi", np.random.default_rng(6).uniform(0.2, 0.3, (3, 4, 12)), fps=12.0
+    )
     (folder / "empty").mkdir()
     files["store"] = files["acquired"] / "transport.zarr"
     return {path.stem: path for path in folder.iterdir()} | files
@@ -90,12 +109,17 @@ def test_wrong_usage_is_code_2(program, line, parts):
     words = [word.format(nothing=" ") for word in line.split()]
     program(*words).refused(*parts, code=2)
     failed = program(*words, "--json")
-    assert (failed.code, failed.document["type"], failed.document["exit_code"]) == (2, "UsageError", 2)
+    assert (failed.code, failed.document["type"], failed.document["exit_code"]) == (
+        2,
+        "UsageError",
+        2,
+    )
     assert all(part in failed.document["error"] for part in parts)
 
 
 @pytest.mark.parametrize(
-    ("line", "parts"), [*((f"compensate {line} --out {{out}}", parts) for line, parts in COMPENSATE), *OTHERS]
+    ("line", "parts"),
+    [*((f"compensate {line} --out {{out}}", parts) for line, parts in COMPENSATE), *OTHERS],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(program, names, tmp_path, line, parts):
     before = {path: path.stat().st_mtime_ns for path in names["transport"].parent.iterdir()}
@@ -116,7 +140,9 @@ PLACES = [
     ("invert nowhere.npz --out", "file/a.npz"),
     ("convert nowhere.npz", "file/a.npz"),
     ("analyze nowhere.npz --plot", "file/a.png"),
-    *([("compress nowhere.npz --out", "/proc/a.npz")] if sys.platform == "linux" else []),  # for nobody
+    *(
+        [("compress nowhere.npz --out", "/proc/a.npz")] if sys.platform == "linux" else []
+    ),  # for nobody
 ]
 
 

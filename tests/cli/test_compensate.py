@@ -23,13 +23,23 @@ from .conftest import write
 WEIGHTS = np.where(np.arange(50).reshape(5, 10) == 23, 0.0, 1.0)
 SAMPLING = {"method": "monte_carlo", "samples": 300, "seed": 2**64 - 1}
 EXACT, INVERSE = {"exact": "transport", "rtol": 1e-5}, {"inverse": "inverse"}
-CALLS: list[tuple[str, dict[str, Any], str]] = [  # options, the same of the library, and what is printed
+CALLS: list[
+    tuple[str, dict[str, Any], str]
+] = [  # options, the same of the library, and what is printed
     ("compensate {transport}", {}, ""),
     ("compensate {transport} --gain auto --loss 0.05", {"gain": "auto", "loss": 0.05}, ""),
     ("compensate {transport} --weights {weights} --gain 4", {"weights": WEIGHTS, "gain": 4}, ""),
     ("compensate {transport} --background {weights}", {"background": WEIGHTS}, ""),
-    ("compensate {transport} --low 0.2 --high 0.4 --clamp", {"bounds": (0.2, 0.4), "clamp": True}, ""),
-    (f"compensate {{transport}} --method monte_carlo --samples 300 --seed {2**64 - 1}", SAMPLING, ""),
+    (
+        "compensate {transport} --low 0.2 --high 0.4 --clamp",
+        {"bounds": (0.2, 0.4), "clamp": True},
+        "",
+    ),
+    (
+        f"compensate {{transport}} --method monte_carlo --samples 300 --seed {2**64 - 1}",
+        SAMPLING,
+        "",
+    ),
     ("compensate {transport} --inverse {inverse}", INVERSE, ""),
     ("compensate {compressed}", {}, "compressed transport"),
     ("compensate {compressed} --exact {transport} --rtol 1e-5", EXACT, "corner.npz"),
@@ -47,7 +57,10 @@ def written_by(command: str, result: Any) -> dict[str, np.ndarray]:
     if command == "relight":
         return {"sky_relit": result}
     if command == "compensate":
-        return {f"sky_{name}": getattr(result, name) for name in ("pattern", "appearance", "out_of_reach")}
+        return {
+            f"sky_{name}": getattr(result, name)
+            for name in ("pattern", "appearance", "out_of_reach")
+        }
     parts = {name: getattr(result, name) for name in ("direct", "indirect", "rest")}
     return parts | {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
 
@@ -56,7 +69,9 @@ def deviations_of(command: str, std: Any) -> dict[str, np.ndarray]:
     """What is in files of standard deviations, by their names."""
     if command == "compensate":
         return {"sky_pattern": std.pattern, "sky_appearance": std.appearance}
-    return {"direct": std.direct} | {f"bounce_{k}": bounce for k, bounce in enumerate(std.bounces, 1)}
+    return {"direct": std.direct} | {
+        f"bounce_{k}": bounce for k, bounce in enumerate(std.bounces, 1)
+    }
 
 
 @pytest.mark.parametrize(("line", "arguments", "printed"), CALLS)
@@ -80,20 +95,34 @@ def test_a_command_does_what_the_library_does(
             np.testing.assert_allclose(seen, deviation, rtol=1e-3, atol=1e-3 * deviation.max())
     for name in ("gain", "error", "clipped", "gap", "transport_error"):
         if hasattr(result, name):
-            assert report["pictures"][0][name] == pytest.approx(getattr(result, name), rel=1e-5, abs=1e-7)
+            assert report["pictures"][0][name] == pytest.approx(
+                getattr(result, name), rel=1e-5, abs=1e-7
+            )
     if command != "relight":
         default = max(T.error, 1e-2 if command == "compensate" else 1e-3)
         assert report["options"]["rtol"] == arguments.get("rtol", default)
-    assert (report["transport"]["compressed"], report["transport"]["error"]) == (T.is_compressed, T.error)
+    assert (report["transport"]["compressed"], report["transport"]["error"]) == (
+        T.is_compressed,
+        T.error,
+    )
     if command == "compensate":  # pixel for pixel, white at the upper bound
-        white, codes = arguments.get("bounds", (0, 1))[1], images.read_codes(out / "sky_pattern.png")
-        np.testing.assert_allclose(codes / 255, images.to_srgb(result.pattern / white), atol=0.6 / 255)
+        white, codes = (
+            arguments.get("bounds", (0, 1))[1],
+            images.read_codes(out / "sky_pattern.png"),
+        )
+        np.testing.assert_allclose(
+            codes / 255, images.to_srgb(result.pattern / white), atol=0.6 / 255
+        )
 
 
 def test_reports_have_every_option_as_it_was_resolved(results):
     shared = {"on_dark": "mask", "encoding": "linear", "grid": [5, 10], "resize": True}
     solving = shared | {"first_bounce": "exact", "rtol": 1e-4, "method": "chebyshev"}
-    asked = {"compensate": solving | {"low": 0, "high": 1, "gain": 1}, "separate": solving, "relight": shared}
+    asked = {
+        "compensate": solving | {"low": 0, "high": 1, "gain": 1},
+        "separate": solving,
+        "relight": shared,
+    }
     for command, options in asked.items():
         report = results[1][command]
         assert options.items() <= report["options"].items()
@@ -166,7 +195,9 @@ def test_what_is_for_the_eye_is_the_linear_picture_at_the_exposure_of_the_run(re
     ("value", "low", "colour", "advice"),
     [(5.0, 0, [1.0, 0.55, 0.0], "too_dark"), (0.0, 0.5, [0.1, 0.45, 1.0], "too_bright")],
 )
-def test_what_is_out_of_reach_is_named_and_seen(program, transport, tmp_path, value, low, colour, advice):
+def test_what_is_out_of_reach_is_named_and_seen(
+    program, transport, tmp_path, value, low, colour, advice
+):
     """Orange where it stays too dark, blue where too bright, and the picture in grey elsewhere."""
     desired = np.full((5, 10), 0.6)
     desired[2, 3] = value
@@ -194,7 +225,9 @@ def test_commands_share_a_folder_and_list_their_files(results):
 
 def test_many_transports_get_a_folder_each(program, transport, picture, tmp_path):
     pattern = str(transport.with_name("corne[r].npz"))
-    report = program("compensate", "--transports", pattern, picture, "--out", tmp_path, "--json").json
+    report = program(
+        "compensate", "--transports", pattern, picture, "--out", tmp_path, "--json"
+    ).json
     (scene,) = report["scenes"]
     assert scene["folder"] == str(tmp_path / "corner")
     assert {*scene["files"]} == files_in(tmp_path / "corner")
@@ -226,11 +259,17 @@ def test_patterns_of_a_folder_are_listed_and_kept_after_ctrl_c(
     with monkeypatch.context() as patch:
         patch.setattr(frames, "compensate", end_at_the_third)
         program(*common).refused("6 frame(s)", str(tmp_path), "--resume", code=130)
-    assert len(json.loads(listed.read_text())["frames"]) == len([*tmp_path.glob("pattern_*.png")]) == 6
+    assert (
+        len(json.loads(listed.read_text())["frames"]) == len([*tmp_path.glob("pattern_*.png")]) == 6
+    )
     program(*common).refused(f"{tmp_path}: ", "6 frame(s)", "resume=True")
     program(*common, "--resume", "--rtol", "1e-3").refused("rtol=0.01", "0.001")
     report = program(*common, "--resume", "--json").json
-    assert (report["source"], report["solved"], report["options"]["rtol"]) == (str(film), COUNT - 6, 1e-2)
+    assert (report["source"], report["solved"], report["options"]["rtol"]) == (
+        str(film),
+        COUNT - 6,
+        1e-2,
+    )
     assert [frame["name"] for frame in report["frames"]] == [
         f"f{number}.png" for number in range(1, COUNT + 1)
     ]

@@ -58,21 +58,30 @@ def error_of(codes: np.ndarray, rig: Any) -> float:
     return float(np.linalg.norm(scale * seen - DESIRED) / np.linalg.norm(DESIRED))
 
 
-def test_what_is_projected_looks_like_the_picture(program, store, waves, compensated, tmp_path, rig):
+def test_what_is_projected_looks_like_the_picture(
+    program, store, waves, compensated, tmp_path, rig
+):
     """In the room with its light; a pattern in sRGB, or without the ambient light, would not."""
     out, printed = compensated
     report = json.loads((out / "compensate.json").read_text())
     (entry,) = report["pictures"]
     assert (report["options"]["gain"], report["options"]["background"]) == ("auto", "measured")
     assert all(text in printed for text in ("codes of the measured projector", "background"))
-    pattern, codes = images.read(out / entry["pattern"]["exr"]), codes_in(out / entry["pattern"]["png"])
-    assert (entry["clipped"], pattern.max()) == (0, pytest.approx(1.0, abs=1e-3))  # as bright as can be
+    pattern, codes = (
+        images.read(out / entry["pattern"]["exr"]),
+        codes_in(out / entry["pattern"]["png"]),
+    )
+    assert (entry["clipped"], pattern.max()) == (
+        0,
+        pytest.approx(1.0, abs=1e-3),
+    )  # as bright as can be
     assert error_of(codes, rig) < 0.015
     assert error_of(images.to_srgb(pattern), rig) > 0.05
     np.testing.assert_allclose(codes, Setup.of(store).codes(pattern), atol=0.6 / 255)
     none = write(tmp_path / "none.exr", np.zeros((4, 8)))
     assert (
-        "background" not in program("compensate", store, waves, "--out", tmp_path, "--background", none).out
+        "background"
+        not in program("compensate", store, waves, "--out", tmp_path, "--background", none).out
     )
     assert error_of(codes_in(tmp_path / "waves_pattern.png"), rig) > 0.02
 
@@ -90,7 +99,14 @@ def test_codes_of_a_pattern_are_relit_as_its_light(program, store, compensated, 
 
 def test_frames_and_videos_hold_codes(program, store, tmp_path, rig):
     write(tmp_path / "frames" / "0.exr", DESIRED)
-    arguments = [store, tmp_path / "frames", "--out", tmp_path / "out", "--video", tmp_path / "out.mkv"]
+    arguments = [
+        store,
+        tmp_path / "frames",
+        "--out",
+        tmp_path / "out",
+        "--video",
+        tmp_path / "out.mkv",
+    ]
     assert program("compensate", *arguments).code == 0
     codes = codes_in(tmp_path / "out" / "pattern_000001.png")
     assert error_of(codes, rig) < 0.015
@@ -99,7 +115,10 @@ def test_frames_and_videos_hold_codes(program, store, tmp_path, rig):
 
 
 def test_a_copy_is_told_where_its_calibration_is(program, store, waves, transport, tmp_path, rig):
-    for name, command in {"compress": ["compress", store, "--out"], "convert": ["convert", store]}.items():
+    for name, command in {
+        "compress": ["compress", store, "--out"],
+        "convert": ["convert", store],
+    }.items():
         copy = tmp_path / f"{name}.npz"
         assert f"--calibration {store}" in program(*command, copy, "--json").err
         out = ["--calibration", store, "--rtol", "0.02", "--out", tmp_path / "out"]
@@ -107,7 +126,9 @@ def test_a_copy_is_told_where_its_calibration_is(program, store, waves, transpor
         assert error_of(codes_in(tmp_path / "out" / "waves_pattern.png"), rig) < 0.04
     arguments = [waves, "--out", tmp_path / "no", "--calibration"]
     program("compensate", transport, *arguments, store).refused("(4, 8)", "(5, 10)")
-    program("compensate", tmp_path / "convert.npz", *arguments, tmp_path / "none.zarr").refused("none.zarr: ")
+    program("compensate", tmp_path / "convert.npz", *arguments, tmp_path / "none.zarr").refused(
+        "none.zarr: "
+    )
 
 
 def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):

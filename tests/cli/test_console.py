@@ -44,7 +44,13 @@ def test_version_and_help(program):
     assert program("--version").out == f"ltcl {ltcl.__version__}\n"
     outcome = program("--help")
     assert all(name.partition(" ")[0] in outcome.out for name in COMMANDS)
-    for code in (command.FAILED, command.USAGE, command.WAITING, command.INTERNAL, command.INTERRUPTED):
+    for code in (
+        command.FAILED,
+        command.USAGE,
+        command.WAITING,
+        command.INTERNAL,
+        command.INTERRUPTED,
+    ):
         assert f" {code} " in outcome.out
         assert f"| {code} |" in EXIT_CODES
     listed = program("acquire", "--help").out
@@ -87,7 +93,9 @@ def test_quiet_and_verbose_and_warnings_of_the_library(program, transport, tmp_p
     arguments = ["convert", transport, tmp_path / "T.npy"]
     assert "--grid 5x10" in program(*arguments).err
     assert program(*arguments, "--quiet").err == ""
-    assert re.search(r"^ltcl: reading .*corner\.npz$", program(*arguments, "--verbose").err, re.MULTILINE)
+    assert re.search(
+        r"^ltcl: reading .*corner\.npz$", program(*arguments, "--verbose").err, re.MULTILINE
+    )
 
     warn = partial(logging.getLogger("ltcl.store").warning, "grid 16 x 64:\n is it right?")
     monkeypatch.setattr(doctor.discovery, "list_devices", lambda: warn() or [])
@@ -105,7 +113,9 @@ def test_progress_is_a_bar_with_elapsed_time_and_time_left(capsys, monkeypatch):
             progress.refresh()
         out, err = capsys.readouterr()
         assert (out, progress.tasks[0].completed) == ("", 16)
-        assert all((part in err) == (terminal and not quiet) for part in ("frames", "0:00:0", "left"))
+        assert all(
+            (part in err) == (terminal and not quiet) for part in ("frames", "0:00:0", "left")
+        )
 
 
 def failed(program: Program, *arguments: str) -> list[dict[str, Any]]:
@@ -125,8 +135,19 @@ def test_all_is_well_here_and_every_solver_and_product_is_tried(program, device,
     monkeypatch.setattr(Device, "kernel", record)
     report = program("doctor", "--json").json
     assert report["passed"] is True
-    assert {f"solve, {method}" for method in METHODS} <= {check["check"] for check in report["checks"]}
-    assert {"csr", "dense", "tile", "wavelet", "form_factor", "southwell", "walk", "vector"} <= files
+    assert {f"solve, {method}" for method in METHODS} <= {
+        check["check"] for check in report["checks"]
+    }
+    assert {
+        "csr",
+        "dense",
+        "tile",
+        "wavelet",
+        "form_factor",
+        "southwell",
+        "walk",
+        "vector",
+    } <= files
 
 
 def test_a_compiler_prints_nothing(device, capfd):
@@ -142,7 +163,9 @@ def test_what_fails_has_a_fix(program, monkeypatch, tmp_path):
         patch.setitem(doctor.LIMITS, "product", 0.0)
         cache, *products = failed(program)
         assert (cache["check"], "LTCL_CACHE" in cache["fix"]) == ("cache folder", True)
-        assert {(each["check"][:8], "NumPy" in each["found"]) for each in products} == {("product,", True)}
+        assert {(each["check"][:8], "NumPy" in each["found"]) for each in products} == {
+            ("product,", True)
+        }
     printed = program("doctor", "--device", "nonsense").out
     assert all(word in printed for word in ("FAILED", "nonsense", "fix: ", "ltcl devices", "1 of "))
     monkeypatch.setattr(discovery, "list_devices", list)
@@ -157,7 +180,12 @@ def test_a_driver_that_crashes_or_hangs_is_named(program, monkeypatch, tmp_path)
     monkeypatch.setattr(doctor, "TRIAL", trial)
     monkeypatch.setattr(doctor, "SECONDS", 2)
     monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
-    actions = {"crash": "os.abort()", "hang": "time.sleep(60)", "good": "", "odd": "raise RuntimeError"}
+    actions = {
+        "crash": "os.abort()",
+        "hang": "time.sleep(60)",
+        "good": "",
+        "odd": "raise RuntimeError",
+    }
     for name, action in actions.items():
         (tmp_path / f"{name}.icd").write_text(action)
     (check,) = failed(program)
@@ -171,7 +199,9 @@ def test_devices_mark_the_one_that_would_be_chosen(program, device, monkeypatch)
     entries = program("devices", "--json").json
     (chosen,) = [entry for entry in entries if entry["chosen"]]
     assert (chosen["name"], chosen["index"]) == (device.name, device.description.index)
-    assert ["->", chosen["index"]] in [line.split()[:2] for line in program("devices").out.splitlines()]
+    assert ["->", chosen["index"]] in [
+        line.split()[:2] for line in program("devices").out.splitlines()
+    ]
     monkeypatch.setenv("LTCL_DEVICE", "nonsense")
     outcome = program("devices")
     assert (outcome.code, outcome.err) == (0, "ltcl: LTCL_DEVICE=nonsense matches none of these\n")

@@ -24,7 +24,11 @@ def test_info(program, transport, colour_transport, compressed, inverse, tmp_pat
     assert (corner["shape"], corner["grid"], corner["channels"]) == ([50, 50], [5, 10], 1)
     assert corner["first_bounce"] == pytest.approx([0.6, 0.6], rel=1e-6)
     assert (room["shape"], room["channels"], room["stored"]) == ([48, 48], 3, "dense")
-    assert (small["stored"], small["grid"], corner["solution_error"]) == ("compressed", [5, 10], 0.0)
+    assert (small["stored"], small["grid"], corner["solution_error"]) == (
+        "compressed",
+        [5, 10],
+        0.0,
+    )
     assert small["dtype"].endswith(f"; error {checks.upwards(small['solution_error'])}")
     assert 0 < small["entries"] < 2500
     assert (inverted["stored"], inverted["shape"]) == ("inverse", [50, 50])
@@ -32,10 +36,22 @@ def test_info(program, transport, colour_transport, compressed, inverse, tmp_pat
     assert (sparse["stored"], sparse["entries"], sparse["grid"]) == ("sparse", 3, None)
     assert (sparse["dark_pixels"], sparse["first_bounce"]) == (1, [0.0, 3.0])
     assert (rectangular["first_bounce"], rectangular["dark_pixels"]) == (None, None)
-    reasons = (corner, "fewer than 64"), (small, "compressed: .*analyze"), (inverted, "inverse: .*analyze")
-    reasons += (sparse, "grid: .*analyze .* --grid"), (rectangular, "grid: .*convert .* --camera-grid")
-    assert all(re.search(f"^Unknown: .*{words}", entry["verdict"]["text"]) for entry, words in reasons)
-    printed, words = program("info", *files).out, ("50 x 50", "5 x 10", "the same", "unknown", "inverse")
+    reasons = (
+        (corner, "fewer than 64"),
+        (small, "compressed: .*analyze"),
+        (inverted, "inverse: .*analyze"),
+    )
+    reasons += (
+        (sparse, "grid: .*analyze .* --grid"),
+        (rectangular, "grid: .*convert .* --camera-grid"),
+    )
+    assert all(
+        re.search(f"^Unknown: .*{words}", entry["verdict"]["text"]) for entry, words in reasons
+    )
+    printed, words = (
+        program("info", *files).out,
+        ("50 x 50", "5 x 10", "the same", "unknown", "inverse"),
+    )
     assert all(word in printed for word in words)
 
 
@@ -69,27 +85,46 @@ def test_analysis_is_that_of_the_library_and_shows_what_diverges(program, transp
     for first_bounce in ("diagonal", "exact", "estimate"):
         (entry,) = program("analyze", transport, "--first-bounce", first_bounce, "--json").json
         (expected,) = ltcl.analyze(ltcl.load(transport, first_bounce=first_bounce)).channels
-        for name in ("spectral_radius", "spectral_radius_bounds", "reciprocity_defect", "first_bounce"):
+        for name in (
+            "spectral_radius",
+            "spectral_radius_bounds",
+            "reciprocity_defect",
+            "first_bounce",
+        ):
             assert entry["channels"][0][name] == pytest.approx(getattr(expected, name), rel=1e-5)
         assert entry["channels"][0]["products"]["jacobi"] == expected.products["jacobi"]
     ltcl.save(tmp_path / "closed.npz", scenes.box(3, albedo=0.8).transport())
-    printed = program("analyze", transport, tmp_path / "closed.npz", "--plot", tmp_path / "a.png").out
+    printed = program(
+        "analyze", transport, tmp_path / "closed.npz", "--plot", tmp_path / "a.png"
+    ).out
     assert (tmp_path / "a.png").stat().st_size > 10_000
     assert printed.count(" diverges") == 2  # jacobi and neumann
 
 
 def test_a_compressed_file_is_smaller_and_solves(program, colour_transport, tmp_path):
-    out, arguments = tmp_path / "C.npz", ["--rtol", "0.05", "--basis", "haar", "--basis", "pixels", "--out"]
-    report = program("compress", colour_transport, *arguments, out, "--budget", "1.5GiB", "--json").json
+    out, arguments = (
+        tmp_path / "C.npz",
+        ["--rtol", "0.05", "--basis", "haar", "--basis", "pixels", "--out"],
+    )
+    report = program(
+        "compress", colour_transport, *arguments, out, "--budget", "1.5GiB", "--json"
+    ).json
     assert (report["bytes_on_disk"], report["options"]["budget"]) == (out.stat().st_size, 3 << 29)
-    assert [trial["basis"] for trial in report["compression"]["channels"][0]["trials"]] == ["haar", "pixels"]
+    assert [trial["basis"] for trial in report["compression"]["channels"][0]["trials"]] == [
+        "haar",
+        "pixels",
+    ]
     T, C, pattern = ltcl.load(colour_transport), ltcl.load(out), random.random((4, 12, 3))
     assert 0.05 >= C.error == pytest.approx(report["solution_error"])
     assert np.linalg.norm(C @ pattern - T @ pattern) <= 0.1 * np.linalg.norm(T @ pattern)
     assert C.error < C.error_bound == pytest.approx(report["error_bound"])
-    printed = program("compress", colour_transport, *arguments, tmp_path / "C.zarr", "--norm", "worst").out
+    printed = program(
+        "compress", colour_transport, *arguments, tmp_path / "C.zarr", "--norm", "worst"
+    ).out
     within = checks.upwards(ltcl.load(tmp_path / "C.zarr").error)  # enough to ask for
-    assert all(word in printed for word in ("red", "green", "blue", "haar", f"solutions within {within}, "))
+    assert all(
+        word in printed for word in ("red", "green", "blue", "haar", f"solutions within {within}, ")
+    )
     noise = program(
         "compress", colour_transport, "--rtol", "noise", "--out", tmp_path / "N.npz", "--json"
     ).json
@@ -104,7 +139,9 @@ def test_a_transport_with_less_noise(program, colour_transport, tmp_path):
     report = program("denoise", noisy, "--out", out, "--json").json
     noise = report["noise"]
     assert all(a < b for a, b in zip(noise["after"], noise["before"], strict=True))
-    assert np.linalg.norm(ltcl.load(out).to_numpy() - T.to_numpy()) < np.linalg.norm(entries - T.to_numpy())
+    assert np.linalg.norm(ltcl.load(out).to_numpy() - T.to_numpy()) < np.linalg.norm(
+        entries - T.to_numpy()
+    )
 
 
 def test_an_inverse_is_made_and_kept(program, transport, tmp_path):
@@ -119,6 +156,7 @@ def test_an_inverse_is_made_and_kept(program, transport, tmp_path):
 def test_dark_of_0_keeps_every_pixel_lit(program, tmp_path):
     np.savez(tmp_path / "T.npz", T=np.diag([1.0, 1e-9, 1.0, 1.0]), grid=(2, 2))
     reports = [
-        program("analyze", tmp_path / "T.npz", "--json", *dark).json[0] for dark in ([], ["--dark", "0"])
+        program("analyze", tmp_path / "T.npz", "--json", *dark).json[0]
+        for dark in ([], ["--dark", "0"])
     ]
     assert [report["masked"] for report in reports] == [1, 0]

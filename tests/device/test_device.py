@@ -21,7 +21,9 @@ from ltcl.device.discovery import Description
 from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
 
 
-def test_arrays_and_matrices_beyond_the_memory_are_refused_with_both_sizes(device, small_device, monkeypatch):
+def test_arrays_and_matrices_beyond_the_memory_are_refused_with_both_sizes(
+    device, small_device, monkeypatch
+):
     """On a CPU also where the host has filled up since."""
     most = (small_device.max_allocation - SPARE_BYTES) // 4
     small_device.empty(most)
@@ -159,7 +161,13 @@ def test_selection(select, device):
 
 @pytest.mark.parametrize(
     ("select", "kind"),
-    [("9:0", " index "), ("tpu", " name "), ("cpu", " CPU "), ("accelerator", " accelerator "), (None, "")],
+    [
+        ("9:0", " index "),
+        ("tpu", " name "),
+        ("cpu", " CPU "),
+        ("accelerator", " accelerator "),
+        (None, ""),
+    ],
 )
 def test_selection_of_nothing_lists_what_there_is(select, kind):
     """A simulator is never taken unasked."""
@@ -177,7 +185,9 @@ def test_selection_of_nothing_lists_what_there_is(select, kind):
         ("win32", "AMD64", "conda-forge pyopencl pocl-cpu"),
     ],
 )
-def test_no_device_at_all_names_a_command_and_what_may_hide_drivers(monkeypatch, system, machine, fix):
+def test_no_device_at_all_names_a_command_and_what_may_hide_drivers(
+    monkeypatch, system, machine, fix
+):
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine=machine), raising=False)
     monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")

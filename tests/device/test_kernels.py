@@ -35,7 +35,9 @@ def test_every_kernel_has_a_twin_and_every_line_its_mark(name):
     assert len(set(seen)) == len(seen)  # each include comes once
     for kernel in re.findall(r"\bkernel\s+void\s+(\w+)", text):
         assert kernel.startswith(f"{name}_")
-        assert re.search(rf"^def {re.sub('_(group|sum)$', '', kernel)}", TWINS, re.MULTILINE), kernel
+        assert re.search(rf"^def {re.sub('_(group|sum)$', '', kernel)}", TWINS, re.MULTILINE), (
+            kernel
+        )
 
 
 @pytest.fixture
@@ -49,8 +51,12 @@ def own_kernels(tmp_path, monkeypatch):
 
 def test_messages_name_file_line_and_defines(device, own_kernels):
     (own_kernels / "part.h").write_text("// fine\nint broken(void) { return nonsense; }\n")
-    (own_kernels / "own.cl").write_text('// first\n#include "part.h"\nkernel void own_a(int n) { }\n')
-    with pytest.raises(DeviceError, match=r"^kernels/own\.cl.*-DK=3 -DLANES=8(?s:.*)nonsense") as error:
+    (own_kernels / "own.cl").write_text(
+        '// first\n#include "part.h"\nkernel void own_a(int n) { }\n'
+    )
+    with pytest.raises(
+        DeviceError, match=r"^kernels/own\.cl.*-DK=3 -DLANES=8(?s:.*)nonsense"
+    ) as error:
         device.kernel("own", "own_a", K=3, LANES=8)
     assert device.driver in str(error.value)
     if device.kind != "simulator":  # Oclgrind blots the #line marks out
@@ -97,7 +103,9 @@ def test_numbers_take_the_types_of_the_source(device, own_kernels):
     kernel = device.kernel("own", "own_a")
     for number in (1, True, np.int64(1), np.uint8(1)):
         for real in (number, 1.0, np.float64(1)):
-            kernel(1, 1, number, number, int(number) << 32, real, vectors.fill(out, 0), device.local(1))
+            kernel(
+                1, 1, number, number, int(number) << 32, real, vectors.fill(out, 0), device.local(1)
+            )
             assert out.get().tolist() == [1, 1, 1, 1]
     kernel(1, 1, -1, 2**31, 2**63, -1e300, out, device.local(1))
     assert out.get().tolist() == [-1, 2**31, 2**31, -math.inf]
@@ -172,7 +180,9 @@ def test_arguments_that_the_driver_refuses_are_errors_of_ltcl(device):
 )
 def test_status_codes_say_what_to_do(device, monkeypatch, name, kind, advice):
     def fail(*_, **__):
-        raise cl.RuntimeError(_cl._ErrorRecord(msg="", code=getattr(cl.status_code, name), routine="clDo"))
+        raise cl.RuntimeError(
+            _cl._ErrorRecord(msg="", code=getattr(cl.status_code, name), routine="clDo")
+        )
 
     x = device.empty(3)
     monkeypatch.setattr(cl, "enqueue_copy", fail)

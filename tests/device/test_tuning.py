@@ -78,7 +78,9 @@ def test_without_tuning_the_first_variant_and_constants_are_taken(device, monkey
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("answer", ["gone", 7, None, ["b"], {}, 0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    "answer", ["gone", 7, None, ["b"], {}, 0.0, -1.0, float("nan"), float("inf")]
+)
 def test_a_damaged_answer_is_measured_over(device, monkeypatch, folder, answer):
     race = Race(monkeypatch, a=2.0, b=1.0)
     tuning.choose(device, "csr", "k=1", race.variants)

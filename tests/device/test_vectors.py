@@ -28,7 +28,12 @@ def operands(device, shape, count=2) -> tuple[Any, ...]:
 def test_values_come_back_as_they_went(device, shape, dtype):
     values = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
     array = device.upload(values, dtype)
-    assert (array.shape, array.dtype, array.size, array.nbytes) == (shape, dtype, values.size, values.nbytes)
+    assert (array.shape, array.dtype, array.size, array.nbytes) == (
+        shape,
+        dtype,
+        values.size,
+        values.nbytes,
+    )
     assert array.columns == (1 if len(shape) == 1 else shape[1])
     for same in (array, array.copy(), array.like().copy_from(array), array.like().set(values)):
         assert same.get().dtype == dtype
@@ -37,7 +42,12 @@ def test_values_come_back_as_they_went(device, shape, dtype):
 
 def test_strided_arrays_and_other_types_are_converted(device):
     values = gallery.signed(6, 8).astype(np.float64)
-    for view in (values[::2, ::-1], values.T, values[:, 3], np.array([np.inf, np.nan, 1e-45, 3.4e38])):
+    for view in (
+        values[::2, ::-1],
+        values.T,
+        values[:, 3],
+        np.array([np.inf, np.nan, 1e-45, 3.4e38]),
+    ):
         np.testing.assert_array_equal(device.upload(view).get(), view.astype(np.float32))
 
 
@@ -94,7 +104,9 @@ def test_dot_and_norm_stay_accurate_as_vectors_grow(shaped, rows, k):
 def test_sums_lose_no_tail_and_hide_no_nan(shaped):
     """In sequence, 2^24 + 1 = 2^24 in float32: sums of ones would stop growing there."""
     ones = vectors.fill(shaped.empty(1 << 20), 5.0)
-    assert vectors.dot(ones, ones).tolist() == [25.0 * (1 << 20)]  # partial sums are small integers times 25
+    assert vectors.dot(ones, ones).tolist() == [
+        25.0 * (1 << 20)
+    ]  # partial sums are small integers times 25
     norms = vectors.norm(shaped.upload([[1.0, 1.0], [np.nan, np.inf]]))
     assert np.isnan(norms[0])
     assert np.isinf(norms[1])
@@ -151,4 +163,6 @@ def test_refusals(device):
         ("TiB", device.upload, np.broadcast_to(np.int8(0), huge)),
         ("TiB", dataclasses.replace(device.empty(1), shape=huge).get),
     )
-    refused(InputTypeError, ("1 masked", device.upload, np.ma.masked_array([1.0, 2.0], [False, True])))
+    refused(
+        InputTypeError, ("1 masked", device.upload, np.ma.masked_array([1.0, 2.0], [False, True]))
+    )

@@ -18,14 +18,26 @@ from ltcl import images
 from ltcl.errors import FileError, MemoryLimitError
 
 random = np.random.default_rng(0)
-KINDS = [(".png", 8), (".png", 16), (".jpg", 8), (".bmp", 8), (".tif", 8), (".tif", 16), (".tif", 32)]
+KINDS = [
+    (".png", 8),
+    (".png", 16),
+    (".jpg", 8),
+    (".bmp", 8),
+    (".tif", 8),
+    (".tif", 16),
+    (".tif", 32),
+]
 KINDS += [(".exr", 16), (".exr", 32)]
 SUFFIXES = [".png", ".jpg", ".tif", ".bmp", ".exr"]
 MUTANTS = 60
 
 
-def good(folder: Path, suffix: str, bits: int | None = None, shape: tuple[int, ...] = (20, 30, 3)) -> bytes:
-    images.write(folder / f"good{suffix}", np.linspace(0, 1, int(np.prod(shape))).reshape(shape), bits=bits)
+def good(
+    folder: Path, suffix: str, bits: int | None = None, shape: tuple[int, ...] = (20, 30, 3)
+) -> bytes:
+    images.write(
+        folder / f"good{suffix}", np.linspace(0, 1, int(np.prod(shape))).reshape(shape), bits=bits
+    )
     return (folder / f"good{suffix}").read_bytes()
 
 
@@ -54,7 +66,9 @@ def mutant(data: bytes) -> bytes:
     if kind < 0.35:
         return data + random.bytes(int(random.integers(1, 100)))
     for _ in range(random.integers(1, 4)):
-        changed[random.integers(min(len(data), 400 if kind < 0.7 else len(data)))] = random.integers(256)
+        changed[random.integers(min(len(data), 400 if kind < 0.7 else len(data)))] = (
+            random.integers(256)
+        )
     return bytes(changed)
 
 
@@ -66,7 +80,9 @@ def test_a_mutant_gives_a_picture_or_one_line_that_names_it(tmp_path, capfd, suf
     assert sum(refused) > MUTANTS / 10
     out, err = capfd.readouterr()
     assert out == ""
-    assert suffix == ".exr" or err == ""  # OpenEXR itself writes of damaged pixels, and cannot be told not to
+    assert (
+        suffix == ".exr" or err == ""
+    )  # OpenEXR itself writes of damaged pixels, and cannot be told not to
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -93,10 +109,13 @@ def test_absurd_sizes_are_refused_before_decoding(tmp_path, capfd, suffix, size)
     data, (h, w) = good(tmp_path, suffix), size
     if suffix == ".tif":
         for tag, before, now in ((256, 30, w), (257, 20, h)):
-            data = data.replace(struct.pack("<HHII", tag, 3, 1, before), struct.pack("<HHII", tag, 4, 1, now))
+            data = data.replace(
+                struct.pack("<HHII", tag, 3, 1, before), struct.pack("<HHII", tag, 4, 1, now)
+            )
     window = struct.pack("<4i", 0, 0, 29, 19), struct.pack("<4i", 0, 0, w - 1, h - 1)
     assert refusal(
-        tmp_path / f"bad{suffix}", png(b"", size=size) if suffix == ".png" else data.replace(*window)
+        tmp_path / f"bad{suffix}",
+        png(b"", size=size) if suffix == ".png" else data.replace(*window),
     )
     out, err = capfd.readouterr()
     assert out == ""

@@ -33,7 +33,9 @@ def test_frames_of_a_folder_are_what_pictures_are(tmp_path):
     images.write(tmp_path / "2.png", np.full((4, 5, 3), 128 / 255), encoding="linear")
     first, second = open_frames(tmp_path)
     np.testing.assert_array_equal(first.picture(), light)
-    np.testing.assert_allclose(second.picture(), images.from_srgb(np.full((4, 5, 3), 128 / 255)), rtol=1e-6)
+    np.testing.assert_allclose(
+        second.picture(), images.from_srgb(np.full((4, 5, 3), 128 / 255)), rtol=1e-6
+    )
     _, second = open_frames(tmp_path, encoding="linear")
     np.testing.assert_allclose(second.picture(), 128 / 255, rtol=1e-6)
     assert second.digest() == hashlib.sha256((tmp_path / "2.png").read_bytes()).hexdigest()
@@ -68,7 +70,10 @@ def film(count: int, size: tuple[int, int] = (32, 48)) -> np.ndarray:
 def test_lossless_videos_give_every_code_back(tmp_path, suffix, size):
     codes, path = film(5, size), tmp_path / f"a{suffix}"
     codes[1], codes[2] = codes[0], codes[2, ..., :1]  # the latter is grey, and comes back as that
-    pictures = [*images.from_srgb(codes[:4] / 255), 2 * images.from_srgb(codes[4] / 255) - 0.5]  # is clipped
+    pictures = [
+        *images.from_srgb(codes[:4] / 255),
+        2 * images.from_srgb(codes[4] / 255) - 0.5,
+    ]  # is clipped
     codes[4] = np.rint(255 * images.to_srgb(np.clip(pictures[4], 0, 1)))
     assert write_video(path, iter(pictures), fps=12.5) == 5
     np.testing.assert_array_equal(cv2.VideoCapture(str(path)).read()[1][..., ::-1], codes[0])  # BGR
@@ -86,10 +91,14 @@ def test_lossless_videos_give_every_code_back(tmp_path, suffix, size):
 def test_a_video_is_upright_as_a_player_shows_it(tmp_path):
     write_video(tmp_path / "a.mp4", film(3) / 255)
     data = (tmp_path / "a.mp4").read_bytes()
-    place = data.index(struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30), data.index(b"tkhd"))
+    place = data.index(
+        struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30), data.index(b"tkhd")
+    )
     turned = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
     (tmp_path / "b.mp4").write_bytes(data[:place] + turned + data[place + 36 :])
-    for codes, turned in zip(*(open_frames(tmp_path / name) for name in ("a.mp4", "b.mp4")), strict=True):
+    for codes, turned in zip(
+        *(open_frames(tmp_path / name) for name in ("a.mp4", "b.mp4")), strict=True
+    ):
         np.testing.assert_allclose(turned.picture(), np.rot90(codes.picture(), -1), atol=0.02)
 
 

@@ -44,9 +44,14 @@ def test_float_formats_are_exact_and_never_clip(tmp_path, suffix, bits, shape):
 
 @pytest.mark.parametrize(
     ("suffix", "dtype", "bgr"),
-    [*((name, np.uint8, [0, 255, 0]) for name in (".png", ".jpg", ".bmp")), (".tif", np.float32, [0, 2, -1])],
+    [
+        *((name, np.uint8, [0, 255, 0]) for name in (".png", ".jpg", ".bmp")),
+        (".tif", np.float32, [0, 2, -1]),
+    ],
 )
-def test_defaults_clipping_and_order_of_channels_as_other_programs_see_them(tmp_path, suffix, dtype, bgr):
+def test_defaults_clipping_and_order_of_channels_as_other_programs_see_them(
+    tmp_path, suffix, dtype, bgr
+):
     images.write(tmp_path / f"a{suffix}", np.tile([-1.0, 2.0, 0.0], (8, 8, 1)))
     stored = cv2.imread(str(tmp_path / f"a{suffix}"), cv2.IMREAD_UNCHANGED)
     assert stored is not None
@@ -57,7 +62,9 @@ def test_defaults_clipping_and_order_of_channels_as_other_programs_see_them(tmp_
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize("channels", [(), (3,)])
-def test_a_picture_is_read_upright_and_a_photograph_keeps_its_pixels(tmp_path, suffix, orientation, channels):
+def test_a_picture_is_read_upright_and_a_photograph_keeps_its_pixels(
+    tmp_path, suffix, orientation, channels
+):
     path = tmp_path / f"a{suffix}"
     codes = random.integers(0, 256, (2, 3, *channels)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
     picture = Image.fromarray(codes)
@@ -71,14 +78,19 @@ def test_a_picture_is_read_upright_and_a_photograph_keeps_its_pixels(tmp_path, s
 
 
 def test_palettes_are_looked_up_and_bits_are_black_and_white(tmp_path):
-    palette, bits = Image.fromarray(np.array([[1, 0]], np.uint8), "P"), Image.fromarray(np.eye(2) > 0)
+    palette, bits = (
+        Image.fromarray(np.array([[1, 0]], np.uint8), "P"),
+        Image.fromarray(np.eye(2) > 0),
+    )
     palette.putpalette([10, 20, 30, 40, 50, 60])
     for picture, codes in ((palette, [[[40, 50, 60], [10, 20, 30]]]), (bits, 255 * np.eye(2))):
         picture.save(tmp_path / "a.png")
         np.testing.assert_array_equal(images.read_codes(tmp_path / "a.png"), codes)
 
 
-@pytest.mark.parametrize(("suffix", "dtype"), [(".png", "uint8"), (".png", "uint16"), (".tif", "float32")])
+@pytest.mark.parametrize(
+    ("suffix", "dtype"), [(".png", "uint8"), (".png", "uint16"), (".tif", "float32")]
+)
 def test_alpha_is_dropped_only_where_it_is_opaque(tmp_path, suffix, dtype):
     path, white = tmp_path / f"a{suffix}", 1 if dtype == "float32" else np.iinfo(dtype).max
     codes = np.full((3, 3, 4), white, dtype)
@@ -139,7 +151,9 @@ BLACK = np.zeros((2, 2))
         ("a.gif", BLACK, {}, r"\.gif .*\.png.*\.exr"),
     ],
 )
-def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(tmp_path, name, image, options, text):
+def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(
+    tmp_path, name, image, options, text
+):
     path: Path = tmp_path / name
     path.write_bytes(b"earlier")
     with pytest.raises((InputError, InputTypeError), match=text):
@@ -151,12 +165,18 @@ def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(tmp_path, 
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-7), (np.float32, 1e-6)])
 def test_the_srgb_curve_is_the_closed_form_and_undone_also_outside_0_to_1(dtype, rtol):
     for code in np.linspace(0, 1, 257):
-        exact = code / 12.92 if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4  # IEC 61966-2-1
+        exact = (
+            code / 12.92 if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4
+        )  # IEC 61966-2-1
         assert images.from_srgb(np.float64(code)) == pytest.approx(exact, rel=1e-14)
     values = np.concatenate([[0, 0.04045], np.linspace(-2, 3, 501)]).astype(dtype)
     assert images.from_srgb(values).dtype == dtype
-    np.testing.assert_allclose(images.to_srgb(images.from_srgb(values)), values, rtol=rtol, atol=1e-7)
-    np.testing.assert_allclose(images.from_srgb(images.to_srgb(values)), values, rtol=3 * rtol, atol=1e-7)
+    np.testing.assert_allclose(
+        images.to_srgb(images.from_srgb(values)), values, rtol=rtol, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        images.from_srgb(images.to_srgb(values)), values, rtol=3 * rtol, atol=1e-7
+    )
     with pytest.raises(InputTypeError, match="encoded holds"):
         images.from_srgb(np.array([1j]))
 

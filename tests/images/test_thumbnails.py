@@ -19,8 +19,12 @@ from ltcl.images.pictures import thumbnails
 
 
 def decoded(html: str) -> list[np.ndarray]:
-    data = [base64.b64decode(part) for part in re.findall(r'src="data:image/png;base64,([^"]+)"', html)]
-    return [np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)) for png in data]
+    data = [
+        base64.b64decode(part) for part in re.findall(r'src="data:image/png;base64,([^"]+)"', html)
+    ]
+    return [
+        np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)) for png in data
+    ]
 
 
 @pytest.fixture(scope="module")

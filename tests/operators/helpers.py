@@ -44,7 +44,8 @@ LAUNCHES = {"item": Variant("", 16, shared=False)} | {
 def meets_twin(A: Operator, matrix: np.ndarray, *, transpose: bool = False) -> None:
     """Assert that products of A, or of A^T, are those of `matrix` to rounding.
 
-    For every number of right-hand sides and every epilogue, into an array of NaN where nothing is added.
+    For every number of right-hand sides and every epilogue, into an array of NaN where nothing is
+    added.
     """
     matrix = matrix.T if transpose else matrix
     rows, columns = matrix.shape
@@ -55,7 +56,11 @@ def meets_twin(A: Operator, matrix: np.ndarray, *, transpose: bool = False) -> N
             add, out = operands(A, y, kind)
             y_term = add_scale * y.astype(np.float64) if kind else 0.0 * y
             x_term = shift * x.astype(np.float64) if rows == columns else 0.0 * y
-            numbers = {"scale": scale, "add_scale": add_scale, "shift": shift if rows == columns else 0.0}
+            numbers = {
+                "scale": scale,
+                "add_scale": add_scale,
+                "shift": shift if rows == columns else 0.0,
+            }
             assert apply(A.device.upload(x), out, add=add, **numbers) is out
             error = reference.product_error(matrix, x, scale, np.abs(y_term) + np.abs(x_term))
             close(out.get(), reference.dense_matvec(matrix, x, scale, y_term + x_term), error)
@@ -95,8 +100,8 @@ def same_bits(a: np.ndarray, b: np.ndarray) -> None:
 def same_rows(device: Device, a: np.ndarray, b: np.ndarray, error: np.ndarray) -> None:
     """Assert that rows do not depend on the slab they are in: to the bit, where the driver allows that.
 
-    Intel's compiler works on several rows at once, and contracts a * b + c to another rounding in those
-    that are left over at the end of a slab.
+    Intel's compiler works on several rows at once, and contracts a * b + c to another rounding in
+    those that are left over at the end of a slab.
     """
     if "Intel" in device.driver:
         close(a, b, 2 * error)
@@ -124,7 +129,10 @@ def steps_match(S: Operator, matrix: np.ndarray, columns: tuple[int | None, ...]
     """Assert that steps of S are those of `matrix` in float64 to rounding, norms of residuals included."""
     n = len(matrix)
     for k in columns:
-        x, r = gallery.vectors(n, k, 7).astype(np.float64), gallery.vectors(n, k, 8).astype(np.float64)
+        x, r = (
+            gallery.vectors(n, k, 7).astype(np.float64),
+            gallery.vectors(n, k, 8).astype(np.float64),
+        )
         on_device = S.device.upload(x), S.device.upload(r)
         stepper = S.stepper(*on_device)
         stepper.start(0.5)
@@ -136,7 +144,9 @@ def steps_match(S: Operator, matrix: np.ndarray, columns: tuple[int | None, ...]
             norms.append(np.atleast_1d(np.linalg.norm(r, axis=0)))
         assert stepper.waiting == 3
         scale = (
-            1e-5 * (1.0 + np.abs(matrix).sum(axis=1).max()) ** 3 * (1.0 + np.abs(gallery.vectors(n, k)).max())
+            1e-5
+            * (1.0 + np.abs(matrix).sum(axis=1).max()) ** 3
+            * (1.0 + np.abs(gallery.vectors(n, k)).max())
         )
         for array, expected in zip((*on_device, stepper.d), (x, r, d), strict=True):
             np.testing.assert_allclose(array.get(), expected, atol=scale)

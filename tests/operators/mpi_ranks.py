@@ -58,7 +58,9 @@ def bits_of_rows() -> None:
     """A row gives the same bits on a rank as where all rows are on one device."""
     matrix: Any = gallery.SPARSE["129x129"]
     x, device = gallery.vectors(129, None), ltcl.open_device()
-    one, many = (helpers.product(A, x) for A in (CSR(device, matrix), Distributed(comm, share(matrix))))
+    one, many = (
+        helpers.product(A, x) for A in (CSR(device, matrix), Distributed(comm, share(matrix)))
+    )
     helpers.same_rows(device, one, many, np.full(129, 1e-5))
 
 
@@ -100,13 +102,20 @@ def transports() -> None:
         ltcl.save(files[1], ltcl.Transport(scipy.sparse.csr_array(T.to_numpy()), grid))
     comm.barrier()
     for file in files:
-        one, many = (ltcl.load(file, grid=grid, device=device) for device in (None, rank_device(comm)))
+        one, many = (
+            ltcl.load(file, grid=grid, device=device) for device in (None, rank_device(comm))
+        )
         assert many.nbytes < 0.6 * one.nbytes
         exact, within = (
-            [ltcl.compensate(t, desired, method="chebyshev", rtol=1e-6, bounds=bounds) for t in (one, many)]
+            [
+                ltcl.compensate(t, desired, method="chebyshev", rtol=1e-6, bounds=bounds)
+                for t in (one, many)
+            ]
             for bounds in ((-10.0, 10.0), (0.0, 1.0))
         )
-        assert np.linalg.norm(exact[0].pattern - exact[1].pattern) <= 1e-6 * np.linalg.norm(exact[0].pattern)
+        assert np.linalg.norm(exact[0].pattern - exact[1].pattern) <= 1e-6 * np.linalg.norm(
+            exact[0].pattern
+        )
         assert within[1].clipped == pytest.approx(within[0].clipped, abs=0.01) != 0.0
         assert within[1].error == pytest.approx(within[0].error, abs=1e-5)
         for array in (exact[1].pattern, within[1].pattern, within[1].std.pattern):

@@ -47,7 +47,11 @@ def operators(device):
     square, tall, sparse = Dense(device, SQUARE), Dense(device, TALL), scipy.sparse.csr_array
     I, d, lit = np.eye(53), gallery.vectors(53, None, 9), np.arange(53) % 5 > 0
     grid, core, order = (5, 6), gallery.sparse(44, 44), np.random.default_rng(4).permutation(30)
-    db2, sums, permutation = Wavelet(device, grid), Pyramid(device, grid), SubsetBasis(device, grid, order)
+    db2, sums, permutation = (
+        Wavelet(device, grid),
+        Pyramid(device, grid),
+        SubsetBasis(device, grid, order),
+    )
     some = SubsetBasis(device, grid, order[:9], of=db2)
     W, P = reference.wavelet_split(grid, 3, wavelets.filters("db2")), np.eye(30)[order]
     Q, V = reference.pyramid_gather(np.eye(30).reshape(5, 6, 30)), W[order[:9]]
@@ -122,7 +126,9 @@ def test_adjoint(pair):
     A, matrix = pair
     x, y = gallery.vectors(A.shape[1], None, 3), gallery.vectors(A.shape[0], None, 4)
     left, right = np.vdot(np.asarray(A @ x, np.float64), y), np.vdot(x, np.float64(A.T @ y))
-    terms = reference.product_error(matrix, x) @ np.abs(y) + reference.product_error(matrix.T, y) @ np.abs(x)
+    terms = reference.product_error(matrix, x) @ np.abs(y) + reference.product_error(
+        matrix.T, y
+    ) @ np.abs(x)
     assert abs(left - right) <= terms
 
 
@@ -152,7 +158,9 @@ def test_facts(pair):
     helpers.close(A.row_sums(), matrix @ ones, reference.product_error(matrix, ones))
     assert A.row_sums() is A.row_sums()
     # A column is one value times 1, plus what the identity brings: a few roundings.
-    np.testing.assert_allclose(A.to_dense(), matrix, rtol=0, atol=8 * reference.UNIT * np.abs(matrix).max())
+    np.testing.assert_allclose(
+        A.to_dense(), matrix, rtol=0, atol=8 * reference.UNIT * np.abs(matrix).max()
+    )
     if not isinstance(A, Host | Basis | Coupled):  # which do not know it
         np.testing.assert_allclose(A.diagonal(), matrix.diagonal(), atol=4 * reference.UNIT)
 
@@ -173,7 +181,9 @@ def test_what_no_operator_takes_is_refused(pair, monkeypatch):
         ("another device", A.apply, Device(device.description).empty(columns)),
     )
     helpers.refused(
-        InputTypeError, ("real numbers", A.matvec, np.full(columns, 1j)), ("Transport", pickle.dumps, A)
+        InputTypeError,
+        ("real numbers", A.matvec, np.full(columns, 1j)),
+        ("Transport", pickle.dumps, A),
     )
     helpers.refused(MemoryLimitError, ("but the host has 64 B", A.to_dense))
 
@@ -206,7 +216,10 @@ def test_scipy_solvers_take_operators(device):
     signed, b = gallery.signed(53, 53, 6), gallery.vectors(53, None).astype(np.float64)
     R = signed / np.float32(2 * np.linalg.norm(signed, 2))
     S = IdentityPlus(Dense(device, R))
-    gmres, lsqr = scipy.sparse.linalg.gmres(S, b, rtol=1e-5), scipy.sparse.linalg.lsqr(S, b, 0.0, 1e-6, 1e-6)
+    gmres, lsqr = (
+        scipy.sparse.linalg.gmres(S, b, rtol=1e-5),
+        scipy.sparse.linalg.lsqr(S, b, 0.0, 1e-6, 1e-6),
+    )
     for x in (gmres[0], lsqr[0]):
         assert np.linalg.norm(b - x - R @ x) <= 1e-4 * np.linalg.norm(b)
 

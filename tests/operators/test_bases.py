@@ -35,7 +35,9 @@ def some(n: int, share: int = 3) -> np.ndarray:
     return np.random.default_rng(4).permutation(n)[: max(1, n // share)]
 
 
-@pytest.mark.parametrize("small", [0, 12, 4096], ids=["a launch each", "small ones together", "all in one"])
+@pytest.mark.parametrize(
+    "small", [0, 12, 4096], ids=["a launch each", "small ones together", "all in one"]
+)
 @pytest.mark.parametrize("name", ["haar", "db4", "pyramid"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
@@ -57,7 +59,9 @@ def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
 
 
 @pytest.mark.parametrize("share", [1, 3])
-@pytest.mark.parametrize("grid", [(1, 1), (9, 8), (20000, 1)])  # the last has more pixels than items
+@pytest.mark.parametrize(
+    "grid", [(1, 1), (9, 8), (20000, 1)]
+)  # the last has more pixels than items
 def test_subsets_meet_their_twin(shaped, grid, share):
     n = grid[0] * grid[1]
     places = some(n, share)
@@ -73,7 +77,9 @@ def test_subsets_meet_their_twin(shaped, grid, share):
 
 @pytest.mark.parametrize("name", [*NAMES, "db38", "sym20"])
 @pytest.mark.parametrize("grid", [(8, 8), (16, 2), (12, 20), (128, 256)])
-@pytest.mark.filterwarnings("ignore:Level value of")  # sides shorter than the filter are wanted here
+@pytest.mark.filterwarnings(
+    "ignore:Level value of"
+)  # sides shorter than the filter are wanted here
 def test_coefficients_are_those_of_pywavelets_where_sides_halve_evenly(device, grid, name):
     levels = min(side & -side for side in grid).bit_length() - 1
     x = gallery.vectors(grid[0] * grid[1], None)
@@ -137,7 +143,11 @@ assert abs(Tiles(device, scipy.sparse.csr_array(A)) @ x - A @ x).max() < 0.01
 
 
 def test_small_work_groups_will_do_in_the_shape_of_a_gpu():
-    environment = {**os.environ, "POCL_MAX_WORK_GROUP_SIZE": "8", "PYOPENCL_BUILD_OPTIONS": "-cl-opt-disable"}
+    environment = {
+        **os.environ,
+        "POCL_MAX_WORK_GROUP_SIZE": "8",
+        "PYOPENCL_BUILD_OPTIONS": "-cl-opt-disable",
+    }
     subprocess.run([sys.executable, "-c", SMALL_GROUPS], env=environment, check=True, timeout=120)
 
 

@@ -36,7 +36,9 @@ FORMS = [np.asarray, scipy.sparse.csr_array, scipy.sparse.linalg.aslinearoperato
 def test_identity_and_operand_may_be_what_is_added(device, sign):
     matrix, x = gallery.signed(33, 33), gallery.vectors(33, 2)
     on_device = device.upload(x)
-    product = IdentityPlus(Dense(device, matrix), sign).apply(on_device, scale=0.5, add=on_device).get()
+    product = (
+        IdentityPlus(Dense(device, matrix), sign).apply(on_device, scale=0.5, add=on_device).get()
+    )
     np.testing.assert_allclose(product, 0.5 * (x + sign * matrix @ x) + x, atol=1e-5)
     np.testing.assert_array_equal(on_device.get(), x)
 
@@ -68,7 +70,11 @@ def test_host_operators_may_lack_a_transpose_and_have_a_diagonal(device, monkeyp
 
 
 def test_unusable_numbers_and_masks_of_host_operators_are_refused(device):
-    for bad, part in ((np.nan, "the product of Plain"), (np.inf, "the product of Plain"), (1e39, "float32")):
+    for bad, part in (
+        (np.nan, "the product of Plain"),
+        (np.inf, "the product of Plain"),
+        (1e39, "float32"),
+    ):
         with pytest.raises(InputError, match=part):
             Host(device, helpers.Plain(np.diag([bad, 1.0]))).matvec(np.ones(2))
     known: dict[str, Any] = {"shape": (2, 2), "matvec": lambda x: x, "dtype": float}
@@ -93,7 +99,9 @@ def test_a_diagonal_of_many_pixels_has_to_be_told(device, monkeypatch):
         R.diagonal()
     told = Compressed(R.core, R.out, R.into, diagonal=np.arange(N))
     assert told.diagonal().tolist() == list(range(N))
-    assert len(Compressed(Dense(device, np.eye(N)), None, None).diagonal()) == N  # of pixels, at hand
+    assert (
+        len(Compressed(Dense(device, np.eye(N)), None, None).diagonal()) == N
+    )  # of pixels, at hand
 
 
 def test_sides_and_bytes_of_compressed_operators(device):
@@ -132,7 +140,9 @@ def test_interreflections_of_all_forms_agree(device, form, diagonal):
     for S, T, f in zip(systems, matrices, first_bounce, strict=True):
         R, x = expected(T, f), gallery.vectors(N, None)
         helpers.meets_twin(S.R, R)
-        helpers.close(S.matvec(x), x + R @ x, reference.product_error(np.eye(N) + np.abs(R), np.abs(x)))
+        helpers.close(
+            S.matvec(x), x + R @ x, reference.product_error(np.eye(N) + np.abs(R), np.abs(x))
+        )
         if isinstance(S.R, CSR):
             assert S.R.pattern is getattr(systems[0].R, "pattern", None)
             assert diagonal != "first bounce" or S.R.nnz == np.count_nonzero(T) - N

@@ -23,7 +23,9 @@ CASES = "products", "bits_of_rows", "solves", "times_that_differ", "transports",
 
 def mpiexec(*command, cwd):
     """Two ranks of one thread each; the test fails where they do not end."""
-    launcher = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    launcher = shutil.which(
+        "mpiexec", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    )
     assert launcher is not None, "mpiexec is missing: pip install mpich"
     env = os.environ | {"PYTHONPATH": str(ROOT), "POCL_MAX_PTHREAD_COUNT": "1"}
     ranks = [launcher, "-n", "2", sys.executable, "-m", *map(str, command)]
@@ -51,7 +53,9 @@ def test_a_rank_that_ends_alone_ends_the_other(tmp_path, case):
 def test_the_page_and_the_command_line(tmp_path, monkeypatch):
     page = (ROOT / "docs/guide/mpi.md").read_text(encoding="utf-8")
     (script,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    command = re.search(r"mpiexec -n 2 ltcl (compensate T.zarr picture.png --mpi --out patterns)", page)
+    command = re.search(
+        r"mpiexec -n 2 ltcl (compensate T.zarr picture.png --mpi --out patterns)", page
+    )
     assert command is not None
     monkeypatch.chdir(tmp_path)
     T = ltcl.scenes.dihedral(12).transport()
@@ -67,7 +71,9 @@ def test_the_page_and_the_command_line(tmp_path, monkeypatch):
     assert run.returncode == 0, run.stderr
     assert run.stdout.count("look at patterns") == 1
     assert main([*words[:-1], "one", "--quiet"]) == 0  # on one rank, in this process
-    assert {path.name for path in Path("one").iterdir()} == {path.name for path in Path("patterns").iterdir()}
+    assert {path.name for path in Path("one").iterdir()} == {
+        path.name for path in Path("patterns").iterdir()
+    }
     one, two = (ltcl.images.read(f"{folder}/picture_pattern.exr") for folder in ("one", "patterns"))
     assert np.linalg.norm(one - two) <= 1e-2 * np.linalg.norm(one)
 
@@ -80,7 +86,9 @@ def test_what_all_ranks_refuse_is_said_once(tmp_path):
     (tmp_path / "start.py").write_text(code, encoding="utf-8")
     run = mpiexec("start", *asked, cwd=tmp_path)
     assert run.returncode == 1
-    assert [line[:27] for line in run.stderr.splitlines()] == ["ltcl: error: --mpi is given"] * 3, run.stderr
+    assert [line[:27] for line in run.stderr.splitlines()] == ["ltcl: error: --mpi is given"] * 3, (
+        run.stderr
+    )
     assert not (tmp_path / "patterns").exists()
 
 

@@ -21,7 +21,16 @@ import ltcl
 from ltcl.cli.main import main
 from ltcl.device import Device, discovery, tuning
 from ltcl.errors import FileError, InputError, MemoryLimitError
-from ltcl.operators import CSR, Dense, MultiDevice, Parts, ScaledColumns, Streamed, as_operator, parts
+from ltcl.operators import (
+    CSR,
+    Dense,
+    MultiDevice,
+    Parts,
+    ScaledColumns,
+    Streamed,
+    as_operator,
+    parts,
+)
 from tests import gallery
 from tests.operators import helpers
 
@@ -71,7 +80,10 @@ def two(monkeypatch: pytest.MonkeyPatch, device: Device) -> list[discovery.Descr
         handles = device.handle.create_sub_devices(half)[:2]
     found = [
         dataclasses.replace(
-            device.description, index=f"7:{d}", handle=handle, compute_units=handle.max_compute_units
+            device.description,
+            index=f"7:{d}",
+            handle=handle,
+            compute_units=handle.max_compute_units,
         )
         for d, handle in enumerate(handles)
     ]
@@ -93,7 +105,9 @@ def no_room(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
 FORMS: dict[str, Callable[[Path, Device, Any], Parts]] = {
     "mapped": lambda folder, device, A: Streamed(device, mapped(folder, A)),
     "stored": lambda folder, device, A: Streamed(device, Stored(A)),
-    "dense rows": lambda folder, device, A: MultiDevice(device, [Dense(device, A[:7]), Dense(device, A[7:])]),
+    "dense rows": lambda folder, device, A: MultiDevice(
+        device, [Dense(device, A[:7]), Dense(device, A[7:])]
+    ),
     "sparse rows": lambda folder, device, A: MultiDevice(
         device, [CSR(device, scipy.sparse.csr_array(rows)) for rows in np.split(A, [3, 30])]
     ),
@@ -126,9 +140,9 @@ def test_rows_that_are_larger_than_a_buffer_are_cut(tmp_path, small_device):
 @pytest.mark.parametrize("mode", ["r", "c"])
 def test_every_array_that_looks_at_a_file_is_read(tmp_path, device, monkeypatch, dtype, mode):
     monkeypatch.setattr(parts, "_READ", 1000)
-    whole = np.stack([gallery.signed(30, 40)] * 3).astype(dtype) * np.arange(1, 4)[:, None, None].astype(
-        dtype
-    )
+    whole = np.stack([gallery.signed(30, 40)] * 3).astype(dtype) * np.arange(1, 4)[
+        :, None, None
+    ].astype(dtype)
     np.save(tmp_path / "T.npy", whole)
     array: Any = np.load(tmp_path / "T.npy", mmap_mode=mode)
     if mode == "c":
@@ -158,14 +172,20 @@ def test_a_file_that_is_cut_before_its_first_use_is_refused(tmp_path, no_room):
     np.save(tmp_path / "T.npy", light())
     T = ltcl.load(tmp_path / "T.npy", grid=GRID)
     os.truncate(tmp_path / "T.npy", 5000)
-    for use in (lambda: T @ np.ones(GRID), lambda: T.systems, lambda: ltcl.save(tmp_path / "copy.npy", T)):
+    for use in (
+        lambda: T @ np.ones(GRID),
+        lambda: T.systems,
+        lambda: ltcl.save(tmp_path / "copy.npy", T),
+    ):
         with pytest.raises(FileError, match=r"T\.npy: has become shorter"):
             use()
 
 
 @pytest.mark.parametrize("extension", [".npy", ".zarr"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_file_without_room_is_solved_from_the_disk(tmp_path, monkeypatch, request, extension, dtype):
+def test_a_file_without_room_is_solved_from_the_disk(
+    tmp_path, monkeypatch, request, extension, dtype
+):
     path, T = tmp_path / f"T{extension}", ltcl.Transport(light(dtype=dtype), GRID)
     ltcl.save(path, T)
     picture = T @ np.linspace(0.2, 0.8, T.shape[1]).reshape(GRID).astype(np.float32)
@@ -180,7 +200,9 @@ def test_a_file_without_room_is_solved_from_the_disk(tmp_path, monkeypatch, requ
         ours, theirs = (solve(each, picture, method="chebyshev") for each in (stored, T))
         for name in ("pattern", "direct", "bounces"):
             if hasattr(ours, name):
-                np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=0, atol=1e-6)
+                np.testing.assert_allclose(
+                    getattr(ours, name), getattr(theirs, name), rtol=0, atol=1e-6
+                )
 
 
 def test_files_with_room_are_solved_in_memory(tmp_path):
@@ -211,7 +233,9 @@ def test_one_reading_serves_all_right_hand_sides(no_room, device):
 def test_rows_on_a_disk_correct_what_others_solve(tmp_path, no_room, rtol):
     matrix = light(dtype=np.float64)
     F = matrix.diagonal()
-    rough = scipy.sparse.csr_array(np.where(matrix > 0.7 / len(F), matrix, 0.0))  # some far light is missing
+    rough = scipy.sparse.csr_array(
+        np.where(matrix > 0.7 / len(F), matrix, 0.0)
+    )  # some far light is missing
     T = ltcl.Transport(mapped(tmp_path, matrix), GRID)
     assert isinstance(T.systems[0].R, ScaledColumns)
     b = np.random.default_rng(0).uniform(size=(len(F), 3))
@@ -254,15 +278,21 @@ def test_all_devices_give_the_answer_of_one(two, monkeypatch, kind, colour):
     assert shares == [[576, 192]] * len(matrices)  # three times as fast, three times as many
     picture = one @ np.full((*GRID, 3) if colour else GRID, 0.5, np.float32)
     for solve, name in ((ltcl.compensate, "pattern"), (ltcl.separate, "bounces")):
-        ours, theirs = (getattr(solve(T, picture, method="chebyshev"), name) for T in (several, one))
+        ours, theirs = (
+            getattr(solve(T, picture, method="chebyshev"), name) for T in (several, one)
+        )
         assert np.linalg.norm(ours - theirs) <= 1e-6 * np.linalg.norm(theirs)
-    fine = ltcl.solve(several.systems[0], np.ones(several.shape[0]), rtol=1e-12)  # in float64, on the host
+    fine = ltcl.solve(
+        several.systems[0], np.ones(several.shape[0]), rtol=1e-12
+    )  # in float64, on the host
     assert fine.residual <= 1e-12
 
 
 def test_a_rectangular_T_is_on_all_devices(two):
     matrix = gallery.vectors(12, 20) + 2.0
-    one, several = (ltcl.Transport(matrix, (4, 5), camera_grid=(3, 4), device=d) for d in (None, "all"))
+    one, several = (
+        ltcl.Transport(matrix, (4, 5), camera_grid=(3, 4), device=d) for d in (None, "all")
+    )
     assert isinstance(several.operators[0], MultiDevice)
     np.testing.assert_allclose(several @ np.ones((4, 5)), one @ np.ones((4, 5)), rtol=1e-6)
 
@@ -294,13 +324,17 @@ def test_the_command_line_takes_all_devices(two, tmp_path, capsys):
 
 def test_the_page_on_scale_runs(two, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "scale.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "scale.md").read_text(
+        encoding="utf-8"
+    )
     names: dict[str, Any] = {}
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(code, names)  # noqa: S102
     assert isinstance(names["T"].systems[0].R, MultiDevice)
     assert names["patterns"].shape == (8, 24, 48)
-    assert abs(names["separated"].direct - 0.5 * names["T"].first_bounce.reshape(24, 48)).max() < 1e-3
+    assert (
+        abs(names["separated"].direct - 0.5 * names["T"].first_bounce.reshape(24, 48)).max() < 1e-3
+    )
 
 
 CAPPED = """
@@ -346,7 +380,10 @@ def test_a_file_beyond_the_memory_of_the_process(tmp_path):
     picture = T @ np.random.default_rng(0).uniform(0.3, 0.7, (3, side, side)).astype(np.float32)
     np.save(tmp_path / "picture.npy", picture)
     run = subprocess.run(
-        [sys.executable, "-c", CAPPED, str(tmp_path), str(side)], capture_output=True, text=True, check=False
+        [sys.executable, "-c", CAPPED, str(tmp_path), str(side)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert run.returncode == 0, run.stderr
     separation = ltcl.separate(T, picture[0], 2)

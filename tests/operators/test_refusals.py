@@ -45,7 +45,9 @@ def test_what_is_no_operator_is_refused(device, small_device):
     assert Compressed(dropped, skew, skew, 0.3).error == 0.3
     a, b = (Dense(device, gallery.signed(3, columns)) for columns in (3, 2))
     host = Host(device, helpers.Plain(EYE))
-    wide = CSR(device, scipy.sparse.csr_array((np.ones(1), ([0], [1 << 22])), shape=(1, (1 << 22) + 1)))
+    wide = CSR(
+        device, scipy.sparse.csr_array((np.ones(1), ([0], [1 << 22])), shape=(1, (1 << 22) + 1))
+    )
     beyond = gallery.sparse(9, 9)
     beyond.indices[0] = 9
     helpers.refused(
@@ -82,7 +84,13 @@ def test_what_is_no_operator_is_refused(device, small_device):
         ("into .*device", Compressed, core, W, Given(small_device, np.eye(N))),
         ("error is -1.0", Compressed, core, W, W, -1.0),
         ("error is nan", Compressed, core, W, W, np.nan),
-        ("error is None", Compressed, dropped, skew, skew),  # that of coefficients is none of pixels
+        (
+            "error is None",
+            Compressed,
+            dropped,
+            skew,
+            skew,
+        ),  # that of coefficients is none of pixels
         (r"diagonal .*\(2,\)", partial(Compressed, core, W, W, diagonal=np.ones(2))),
         (f"diagonal has {N} NaN", partial(Compressed, core, W, W, diagonal=np.full(N, np.nan))),
         ("blocks", Coupled, [[a] * 3] * 2),
@@ -99,7 +107,10 @@ def test_what_is_no_operator_is_refused(device, small_device):
         ("R.*row 1.*float32", tables, Dense(device, [[1.0, 1.0], [3e38, -3e38]])),
         *((f"wavelet .*{name}.*haar", Wavelet, device, (8, 8), name) for name in NO_WAVELETS),
         *(("grid is", Wavelet, device, grid, "haar") for grid in ((0, 4), (2.5, 2), 9, (1, 2, 3))),
-        *((f"levels is {levels!r}", Wavelet, device, (8, 5), "haar", levels) for levels in (4, -1, 1.5, "3")),
+        *(
+            (f"levels is {levels!r}", Wavelet, device, (8, 5), "haar", levels)
+            for levels in (4, -1, 1.5, "3")
+        ),
         *((f"{name}.*haar", basis, device, (4, 6), name) for name in ("hilbert", None, "bior2.2")),
         (r"grid is \(0, 3\)", Pyramid, device, (0, 3)),
         (r"grid is \(0, 3\)", multiresolution_order, (0, 3), 1),

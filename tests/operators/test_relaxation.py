@@ -21,7 +21,9 @@ MATRICES = {
     "53": gallery.signed(53, 53, 3) / 20,
     "53 in slabs": gallery.signed(53, 53, 4) / 20,
     "sparse 97": gallery.sparse(97, 97, 0.3).toarray() / 20,
-    "empty rows": np.where(np.arange(40)[:, None] % 3 == 1, gallery.signed(40, 40) / 20, np.float32(0)),
+    "empty rows": np.where(
+        np.arange(40)[:, None] % 3 == 1, gallery.signed(40, 40) / 20, np.float32(0)
+    ),
     "runs": np.tril(np.triu(gallery.signed(150, 150, 5), -70), 70) / 40,
     "below only": np.tril(gallery.signed(33, 33, 6), -1) / 9,
     "above only": np.triu(gallery.signed(33, 33, 7), 1) / 9,
@@ -51,7 +53,9 @@ def sweeps_of(relax: Relaxation, k: int | None) -> tuple[Sweeps, np.ndarray, np.
     """Sweeps that start with NaN wherever nothing is read."""
     n, device = relax.rows.M.shape[0], relax.rows.M.device
     x, b = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
-    sweeps = Sweeps(relax, device.upload(x), device.upload(b), device.upload(np.full_like(x, np.nan)))
+    sweeps = Sweeps(
+        relax, device.upload(x), device.upload(b), device.upload(np.full_like(x, np.nan))
+    )
     for array in (sweeps.before, sweeps.s, sweeps.carry):
         array.set(np.full_like(x, np.nan))
     return sweeps, x, b

@@ -23,7 +23,9 @@ def in_blocks(device, matrix):
     """Three blocks of rows, the last one of what is left."""
     size = -(-matrix.shape[0] // 3)
     starts = range(0, matrix.shape[0], size)
-    return RowBlocks(device, matrix.shape, lambda: ((k, matrix[k : k + size]) for k in starts), matrix.nnz)
+    return RowBlocks(
+        device, matrix.shape, lambda: ((k, matrix[k : k + size]) for k in starts), matrix.nnz
+    )
 
 
 formats = pytest.mark.parametrize(
@@ -36,7 +38,9 @@ kernels = pytest.mark.parametrize("make", helpers.FORMATS.values(), ids=list(hel
 @kernels
 @pytest.mark.parametrize("launch", helpers.LAUNCHES)
 def test_products_of_every_launch_meet_their_twin(device, monkeypatch, name, make, launch):
-    monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 5, 10))  # launches of every width, alone and not
+    monkeypatch.setattr(
+        helpers, "COLUMNS", (None, 3, 5, 10)
+    )  # launches of every width, alone and not
     A = make(device, gallery.SPARSE[name])
     helpers.force(monkeypatch, A, launch)
     helpers.meets_twin(A, A.to_dense())
@@ -160,7 +164,8 @@ def test_dense_transposes_meet_their_twin(device, monkeypatch, name, strip):
 
 
 def test_unsorted_and_repeated_entries_are_put_in_order(device):
-    # Row 0: 24 columns backwards, each twice. The fast path for neighbours relies on ascending columns.
+    # Row 0: 24 columns backwards, each twice. The fast path for neighbours relies on ascending
+    # columns.
     columns, values = np.repeat(np.arange(24)[::-1], 2), np.arange(48, dtype=np.float32)
     matrix = scipy.sparse.csr_array((values, columns, [0, 48]), shape=(1, 24))
     before = matrix.indices.copy()
@@ -184,6 +189,8 @@ def test_channels_with_one_pattern_store_it_once(device, small_device):
 def test_any_sparse_format_and_real_numbers_of_any_type_are_taken(device, dtype):
     matrix = np.array([[1, 0], [1, 1]], dtype)
     sparse = scipy.sparse.csr_array(matrix.astype(float))
-    forms = [CSR(device, sparse.asformat(form)) for form in ("csc", "coo", "lil", "dok", "bsr", "dia")]
+    forms = [
+        CSR(device, sparse.asformat(form)) for form in ("csc", "coo", "lil", "dok", "bsr", "dia")
+    ]
     for A in (Dense(device, matrix), *forms):
         np.testing.assert_array_equal(A @ np.array([2, 3]), [2, 5])

@@ -61,7 +61,12 @@ def test_the_same_bits_come_back(device, name, core):
     arrays = stored.to_arrays([a])
     assert all(array.dtype.kind in "fiuU" for array in arrays.values())
     (b,) = stored.from_arrays(device, arrays)
-    assert (a.shape, a.sign, a.error, a.solution_error) == (b.shape, b.sign, b.error, b.solution_error)
+    assert (a.shape, a.sign, a.error, a.solution_error) == (
+        b.shape,
+        b.sign,
+        b.error,
+        b.solution_error,
+    )
     assert a.nbytes == b.nbytes
     np.testing.assert_array_equal(a.weights, b.weights)
     for x in (gallery.vectors(N, None), gallery.vectors(N, 3)):
@@ -74,7 +79,11 @@ def test_the_same_bits_come_back(device, name, core):
         for old, new in ((a.R.out, b.R.out), (a.R.into, b.R.into)):
             if old is not None and new is not None:
                 assert type(old) is type(new)
-                assert (old.name, old.grid, old.orthonormal) == (new.name, new.grid, new.orthonormal)
+                assert (old.name, old.grid, old.orthonormal) == (
+                    new.name,
+                    new.grid,
+                    new.orthonormal,
+                )
 
 
 def test_what_channels_share_is_kept_and_made_once(device):
@@ -85,7 +94,12 @@ def test_what_channels_share_is_kept_and_made_once(device):
     assert sum(name.startswith("basis_") and name.endswith(".name") for name in arrays) == 1
     found = [S.R for S in stored.from_arrays(device, arrays)]
     assert len({R.into for R in found if isinstance(R, Compressed)}) == 1
-    assert len({R.core.pattern for R in found if isinstance(R, Compressed) and isinstance(R.core, CSR)}) == 1
+    assert (
+        len(
+            {R.core.pattern for R in found if isinstance(R, Compressed) and isinstance(R.core, CSR)}
+        )
+        == 1
+    )
 
 
 def test_other_operators_cannot_be_kept(device):
@@ -98,20 +112,38 @@ def test_other_operators_cannot_be_kept(device):
 BAD = {
     "no kind": ({"system_0.R.kind": None}, "lack 'kind'"),
     "no core": ({"system_0.R.core.kind": None}, "lack 'kind'"),
-    "another kind": ({"system_0.R.core.kind": np.array("pickle")}, "kind .* is 'pickle'; .* compress again"),
+    "another kind": (
+        {"system_0.R.core.kind": np.array("pickle")},
+        "kind .* is 'pickle'; .* compress again",
+    ),
     "no values": ({"system_0.R.core.data": None}, "lack 'data'"),
-    "column beyond": ({"system_0.R.core.indices": np.full(NNZ, 35, np.int32)}, "holds 35; column indices"),
-    "column before": ({"system_0.R.core.indices": np.full(NNZ, -1, np.int32)}, "holds -1; column indices"),
+    "column beyond": (
+        {"system_0.R.core.indices": np.full(NNZ, 35, np.int32)},
+        "holds 35; column indices",
+    ),
+    "column before": (
+        {"system_0.R.core.indices": np.full(NNZ, -1, np.int32)},
+        "holds -1; column indices",
+    ),
     "columns of reals": ({"system_0.R.core.indices": np.full(NNZ, 1.0)}, "vector of integers"),
-    "falling pointers": ({"system_0.R.core.indptr": np.r_[0, 5, 3, np.full(33, NNZ)]}, "must never fall"),
+    "falling pointers": (
+        {"system_0.R.core.indptr": np.r_[0, 5, 3, np.full(33, NNZ)]},
+        "must never fall",
+    ),
     "short pointers": ({"system_0.R.core.indptr": np.array([0])}, "indptr has 1 entries"),
     "no pointers": ({"system_0.R.core.indptr": np.array([], np.int64)}, "indptr has 0 entries"),
     "another length": ({"system_0.R.core.data": np.ones(3, np.float32)}, "the three must agree"),
-    "another shape": ({"system_0.R.core.shape": np.array([35, 1 << 62])}, "into has 35 coefficients"),
+    "another shape": (
+        {"system_0.R.core.shape": np.array([35, 1 << 62])},
+        "into has 35 coefficients",
+    ),
     "a shape of one": ({"system_0.R.core.shape": np.array([35])}, "do not fit"),
     "NaN": ({"system_0.R.core.data": np.full(NNZ, np.nan, np.float32)}, "NaN"),
     "words for values": ({"system_0.R.core.data": np.full(NNZ, "a")}, "must hold real numbers"),
-    "basis that is not there": ({"system_0.R.out": np.array(7)}, "lack grid and name; compress again"),
+    "basis that is not there": (
+        {"system_0.R.out": np.array(7)},
+        "lack grid and name; compress again",
+    ),
     "half a basis": ({"system_0.R.out": np.array([0, 0])}, "do not fit"),
     "basis of another grid": ({"basis_0.grid": np.array([6, 6])}, "36 coefficients, but the core"),
     "basis of no side": ({"basis_0.grid": np.array([2])}, "grid is"),

@@ -32,7 +32,9 @@ def decoded(A: Tiles) -> np.ndarray:
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", gallery.SPARSE)
-def test_every_kind_and_its_transpose_is_what_it_stands_for(device, monkeypatch, name, width, precision):
+def test_every_kind_and_its_transpose_is_what_it_stands_for(
+    device, monkeypatch, name, width, precision
+):
     monkeypatch.setattr(helpers, "COLUMNS", (3,))  # others are in test_rows.py
     A = Tiles(device, gallery.SPARSE[name], width, precision)
     assert A.matrix().dtype == np.float64
@@ -54,7 +56,9 @@ def test_values_are_rounded_to_nearest(name, width):
     np.testing.assert_array_equal(np.abs(half - exact) <= step / 2, True)
     np.testing.assert_array_equal(np.mod(half, step), 0)
     packed = pack(gallery.SPARSE[name], width, "int8")
-    step = np.abs(exact).max(axis=1, keepdims=True) / 127 * 1.125  # of 3 bits of fraction, rounded up
+    step = (
+        np.abs(exact).max(axis=1, keepdims=True) / 127 * 1.125
+    )  # of 3 bits of fraction, rounded up
     assert np.all(np.abs(packed.decoded() - exact) <= step / 2)
     assert np.abs(packed.codes).max(initial=0) <= 127
 
@@ -78,7 +82,9 @@ def test_what_is_lost_is_known(device, name, precision):
     lost = given.toarray() - A.to_dense()
     assert A.quantisation == pytest.approx(np.linalg.norm(lost), rel=1e-12)
     spectral = np.linalg.norm(lost, 2)
-    bound = min(np.linalg.norm(lost), np.sqrt(np.linalg.norm(lost, 1) * np.linalg.norm(lost, np.inf)))
+    bound = min(
+        np.linalg.norm(lost), np.sqrt(np.linalg.norm(lost, 1) * np.linalg.norm(lost, np.inf))
+    )
     assert spectral * (1 - 1e-12) <= A.error == pytest.approx(bound, rel=1e-12)
     assert A.T.error == A.error
 
@@ -102,7 +108,9 @@ def _fewest(places: list[int], width: int) -> int:
     if not places:
         return 0
     firsts = range(places[0] - width + 1, places[0] + 1)
-    return 1 + min(_fewest([p for p in places if p >= first + width], width) for first in firsts[-2:])
+    return 1 + min(
+        _fewest([p for p in places if p >= first + width], width) for first in firsts[-2:]
+    )
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -152,7 +160,9 @@ def test_stored_arrays_that_do_not_fit_are_refused(device, name, spoil):
 
 def test_the_smallest_that_is_good_enough_is_named(device):
     runs = gallery.SPARSE["stretches"]
-    scattered = scipy.sparse.csr_array(np.where(np.arange(53 * 530).reshape(53, -1) % 31 == 0, 0.3, 0.0))
+    scattered = scipy.sparse.csr_array(
+        np.where(np.arange(53 * 530).reshape(53, -1) % 31 == 0, 0.3, 0.0)
+    )
     for matrix, tolerance in itertools.product((runs, scattered), (0.1, 0.003, 3e-4, 0)):
         norm = scipy.sparse.linalg.norm(matrix.astype(np.float64))
         kinds = itertools.product(WIDTHS, PRECISIONS)

@@ -44,7 +44,9 @@ HARD = np.array(
     np.float32,
 )
 DENSE = gallery.DENSE | {"hard": HARD}
-EMPTY_ROWS = np.where(np.isin(np.arange(53), [0, 7, 52])[:, None], 0, gallery.sparse(53, 53).toarray() / 12)
+EMPTY_ROWS = np.where(
+    np.isin(np.arange(53), [0, 7, 52])[:, None], 0, gallery.sparse(53, 53).toarray() / 12
+)
 # R of one channel, or of three with signs, places and empty rows of their own.
 SCENES = {
     "1x1": [np.array([[-0.5]], np.float32)],
@@ -56,14 +58,18 @@ SCENES = {
     "three without entries": [np.zeros((3, 3), np.float32)] * 3,
     "apart": [EMPTY_ROWS, *(gallery.sparse(53, 53, 0.3 - c / 10, c).toarray() / 9 for c in (1, 2))],
     "alike": [gallery.bounces(29, rho) for rho in (0.6, 0.3, 0.5)],
-    "far apart": [gallery.signed(9, 9, seed) * scale for seed, scale in enumerate((1e-20, 0.1, 0.1))],
+    "far apart": [
+        gallery.signed(9, 9, seed) * scale for seed, scale in enumerate((1e-20, 0.1, 0.1))
+    ],
 }
 COLOURS = [name for name, channels in SCENES.items() if len(channels) == 3]
 SIGNS = (1.0, 1.0, -1.0)
 
 
 def tables_of(device, name: str) -> Tables:
-    Rs = [helpers.FORMATS["dense" if c == 1 else "csr"](device, R) for c, R in enumerate(SCENES[name])]
+    Rs = [
+        helpers.FORMATS["dense" if c == 1 else "csr"](device, R) for c, R in enumerate(SCENES[name])
+    ]
     return linked(Rs, SIGNS) if len(Rs) == 3 else tables(*Rs)
 
 
@@ -71,7 +77,10 @@ def drawn(made: Tables, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Column with sign, and chance, of what an alias table draws."""
     start, _, count, _ = made.records.get()[row].tolist()
     entries = made.entries.get()[start : start + count].tolist()
-    own, threshold = [e >> 23 & 0x7FFFFF for e in entries], np.array([e >> 46 for e in entries]) / 2**18
+    own, threshold = (
+        [e >> 23 & 0x7FFFFF for e in entries],
+        np.array([e >> 46 for e in entries]) / 2**18,
+    )
     targets = np.array([*own, *(e & 0x7FFFFF for e in entries)], np.int64)
     return targets, np.concatenate([threshold, 1 - threshold]) / max(count, 1)
 
@@ -150,7 +159,9 @@ def test_tables_beyond_the_device_are_refused(small_device):
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_R_is_what_S_has_beside_the_identity(device, form):
     R = gallery.sparse(53, 53, 0.4).toarray()
-    M, S = (helpers.FORMATS[form](device, matrix) for matrix in (R, np.eye(53, dtype=np.float32) + R))
+    M, S = (
+        helpers.FORMATS[form](device, matrix) for matrix in (R, np.eye(53, dtype=np.float32) + R)
+    )
     for sign in (1.0, -1.0):
         assert rows_of_R(IdentityPlus(M, sign), "monte_carlo") == (M, sign)
     made, sign = rows_of_R(S, "monte_carlo")
@@ -196,7 +207,10 @@ def test_no_bit_depends_on_how_it_is_launched(device, shaped, monkeypatch, name,
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_walks_from_b_are_those_of_the_twin(shaped, monkeypatch, form, samples, records):
     monkeypatch.setattr("ltcl.operators.walks._RECORDS", max(records, samples // 10))
-    b, made = gallery.vectors(53, None), tables_of_columns(helpers.FORMATS[form](shaped, EMPTY_ROWS))
+    b, made = (
+        gallery.vectors(53, None),
+        tables_of_columns(helpers.FORMATS[form](shaped, EMPTY_ROWS)),
+    )
     lengths = Lengths.geometric(0.6, -1.0, from_b=True)
     made.append(shaped.upload(b))
     found = Walker(made, lengths, SEED).columns(samples)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Form factors known otherwise: closed forms at right angles, random pairs of points, rooms that are closed.
 
-Sources: Ehlert and Smith, "View factors for perpendicular and parallel rectangular plates", J. Thermophysics
-and Heat Transfer 7(1), 1993; C-13 and C-15 in Howell, "A catalog of radiation heat transfer configuration
-factors".
+Sources: Ehlert and Smith, "View factors for perpendicular and parallel rectangular plates", J.
+Thermophysics and Heat Transfer 7(1), 1993; C-13 and C-15 in Howell, "A catalog of radiation heat
+transfer configuration factors".
 """
 
 from __future__ import annotations
@@ -52,13 +52,17 @@ def closed_room(*edges: Vector) -> list[Wall]:
     return walls
 
 
-def sampled(first: Wall, second: Wall, samples: int, block: Block | None = None) -> tuple[float, float]:
+def sampled(
+    first: Wall, second: Wall, samples: int, block: Block | None = None
+) -> tuple[float, float]:
     """a_i F_ij between whole walls by random pairs of points, and its standard error."""
     rng = np.random.default_rng(0)
     x, y = (wall.points(*rng.random((2, samples))) for wall in (first, second))
     ray = y - x
     r2 = np.einsum("ki,ki->k", ray, ray)
-    kernel = np.maximum(ray @ first.normal, 0) * np.maximum(-ray @ second.normal, 0) / (np.pi * r2**2)
+    kernel = (
+        np.maximum(ray @ first.normal, 0) * np.maximum(-ray @ second.normal, 0) / (np.pi * r2**2)
+    )
     kernel *= first.area * second.area
     if block is not None:
         box = np.concatenate([block.low + block.high, block.high - block.low]) / 2

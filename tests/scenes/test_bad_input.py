@@ -27,7 +27,11 @@ ONE = np.array([[0.0, 1.0 + 5e-7], [1.0 + 5e-7, 0.0]])  # as far above 1 as a sc
 
 
 def shine(**changes: Any) -> Any:
-    place: dict[str, Any] = {"projector": (1.5, 0.9, 0.8), "camera": (0.8, 1.6, 0.4), "directions": 16}
+    place: dict[str, Any] = {
+        "projector": (1.5, 0.9, 0.8),
+        "camera": (0.8, 1.6, 0.4),
+        "directions": 16,
+    }
     return glossy(**{"room": dihedral(2), "n": 2, **place, **changes})
 
 
@@ -42,7 +46,10 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: box(2, occluder=Block((0, 0, 0), (1, 1, 1))), "occluder fills the room"),
     (lambda: box(2, occluder=(0.1, 0.1)), "occluder is .*ltcl.scenes.Block"),  # pyright: ignore[reportArgumentType]
     (lambda: transport(ONE, np.full(2, 1 - 1e-9), np.ones(2)), "gain of 1 or more"),
-    (lambda: replace(CORNER, grid=(4, 15)), r"form_factors has shape \(75, 75\); it must be \(60, 60\)"),
+    (
+        lambda: replace(CORNER, grid=(4, 15)),
+        r"form_factors has shape \(75, 75\); it must be \(60, 60\)",
+    ),
     (lambda: replace(CORNER, albedo=np.full((1, 75), np.nan)), "albedo has 75 NaN"),
     (lambda: replace(CORNER, form_factors=UNEVEN), "breaks reciprocity by"),
     (lambda: CORNER.sample(np.full((2, 2), np.nan)), "image has 4 NaN"),

@@ -45,7 +45,9 @@ TEN_TIMES = [X, (0, 0.1, 0), (0.1, 0, 1)]  # patches ten times as long as wide
 NARROW = [X, (float(np.cos(np.radians(8))), float(np.sin(np.radians(8))), 0.0), Z]
 
 
-@pytest.mark.parametrize("edges", [[X, (0.5, 0.8, 0), (0.3, 0.2, 0.9)], NARROW, TEN_TIMES, [X, Y, Z]])
+@pytest.mark.parametrize(
+    "edges", [[X, (0.5, 0.8, 0), (0.3, 0.2, 0.9)], NARROW, TEN_TIMES, [X, Y, Z]]
+)
 @pytest.mark.parametrize("n", [1, 4, 9])
 def test_closed_rooms_lose_no_light(edges: list[Vector], n: int) -> None:
     walls = closed_room(*edges)
@@ -72,8 +74,12 @@ def test_walls_at_any_angle_agree_with_sampling(walls: tuple[Wall, Wall]) -> Non
 
 def test_a_long_wedge_takes_what_its_opening_lets_go() -> None:
     """Strips of infinite length that share an edge: F = 1 - sin(angle / 2); the ends take 1 / length."""
-    floors = [Wall("floor", FLOOR.corner, (0.0, length, 0.0), FLOOR.down) for length in (200.0, 400.0)]
+    floors = [
+        Wall("floor", FLOOR.corner, (0.0, length, 0.0), FLOOR.down) for length in (200.0, 400.0)
+    ]
     for angle in (20, 60, 90, 150):
-        short, long = (of_walls(slope(angle, width=f.right[1]), f, 1).item() / f.right[1] for f in floors)
+        short, long = (
+            of_walls(slope(angle, width=f.right[1]), f, 1).item() / f.right[1] for f in floors
+        )
         edge = 2 * long - short
         assert edge == pytest.approx(1 - np.sin(np.radians(angle / 2)), abs=2e-4)

@@ -33,7 +33,9 @@ def tiles(count: int) -> Patches:
 
 # A patch on the floor, and one 20 sizes away that stands half below its plane: both see but a part.
 ASTRIDE = Patches(
-    np.eye(3)[[0, 0]] * [[0], [20]] + [[0, 0, 0], [0, 0, 0.1]], np.eye(3)[:2], np.eye(3)[[1, 2]] * [[-1], [1]]
+    np.eye(3)[[0, 0]] * [[0], [20]] + [[0, 0, 0], [0, 0, 0.1]],
+    np.eye(3)[:2],
+    np.eye(3)[[1, 2]] * [[-1], [1]],
 )
 SCENES = {
     "astride a plane": (ASTRIDE, None),
@@ -54,7 +56,8 @@ def test_products_meet_their_twin(shaped, name):
     )
     kernel, near = albedo[:, None] * G * A._area.get().astype(np.float64), A._near.to_dense()
     matrix, dense = kernel + near, A.to_dense()
-    # An entry is some 30 roundings; corrections cancel kernel values, which then count with their size.
+    # An entry is some 30 roundings; corrections cancel kernel values, which then count with their
+    # size.
     size = np.abs(kernel) + np.abs(near) + np.abs(matrix)
     off = np.abs(dense - matrix) > 1e-4 * size
     if blocks is not None:  # a ray that grazes a block counts either way
@@ -94,7 +97,9 @@ def test_products_are_those_of_the_exact_matrix(device, walls, n):
     "block",
     [
         Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), albedo=0.5),  # on the floor, faces cut patches
-        Block((0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=(0.5, 0.3, 0.2)),  # faces between patches
+        Block(
+            (0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=(0.5, 0.3, 0.2)
+        ),  # faces between patches
         Block((0, 0.4, 0), (0.3, 0.6, 0.7), albedo=0.5),  # in a corner
         None,
     ],
@@ -105,7 +110,9 @@ def test_a_scene_gives_its_operators(device, block):
     l_d = np.random.default_rng(2).random(len(room.area))
     matrices = room.A if room.channels == 3 else (room.A,)
     for A, dense in zip(FormFactor.of(room, device), matrices, strict=True):
-        assert np.linalg.norm(A.to_dense() - dense) < (0.015 if block else 1e-4) * np.linalg.norm(dense)
+        assert np.linalg.norm(A.to_dense() - dense) < (0.015 if block else 1e-4) * np.linalg.norm(
+            dense
+        )
         assert A.row_sums().max() < 0.51
         light = ltcl.solve(IdentityPlus(A, sign=-1), l_d, rtol=1e-4).x
         expected = np.linalg.solve(np.eye(len(l_d)) - dense, l_d)
@@ -118,11 +125,15 @@ def test_launches_in_slabs_give_the_same(device, monkeypatch):
     whole, seen = A.apply(x).get(), visibility(patches, BLOCK, device)
     monkeypatch.setattr("ltcl.scenes.form_factor._LAUNCH", 7 * 56)
     monkeypatch.setattr(sys.modules[Rays.__module__], "_LAUNCH", 54 * 16 * 7)
-    helpers.same_rows(device, whole, A.apply(x).get(), reference.product_error(A.to_dense(), x.get()))
+    helpers.same_rows(
+        device, whole, A.apply(x).get(), reference.product_error(A.to_dense(), x.get())
+    )
     np.testing.assert_array_equal(visibility(patches, BLOCK, device), seen)
 
 
-@pytest.mark.parametrize(("count", "boxes", "samples"), [(1, 1, 1), (8, 2, 3), (9, 1, 4), (53, 5, 4)])
+@pytest.mark.parametrize(
+    ("count", "boxes", "samples"), [(1, 1, 1), (8, 2, 3), (9, 1, 4), (53, 5, 4)]
+)
 def test_rays_meet_their_twin(shaped, count, boxes, samples):
     rng = np.random.default_rng(count)
     patches = Patches(*rng.uniform(-1, 1, (3, count, 3)) * np.array([3, 0.3, 0.3])[:, None, None])
@@ -130,8 +141,13 @@ def test_rays_meet_their_twin(shaped, count, boxes, samples):
     blocks = np.stack([low, low + rng.uniform(0.2, 2, (boxes, 3))], axis=1)
     seen = visibility(patches, blocks, shaped, samples=samples)
     rays = Rays(patches, blocks, shaped, samples)
-    starts, ends = (p.get().reshape(samples**2, 3, -1)[..., :count] for p in (rays._starts, rays._ends))
-    expected = reference.form_factor_visible(starts, ends, rays._normals.get()[:, :count], rays._blocks.get())
-    # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at most.
+    starts, ends = (
+        p.get().reshape(samples**2, 3, -1)[..., :count] for p in (rays._starts, rays._ends)
+    )
+    expected = reference.form_factor_visible(
+        starts, ends, rays._normals.get()[:, :count], rays._blocks.get()
+    )
+    # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at
+    # most.
     assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 0.01 * count**2
     np.testing.assert_array_equal(seen, seen.T)

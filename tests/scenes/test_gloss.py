@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from ltcl.diagnostics import reciprocity_defect
 from ltcl.scenes import Block, GlossyScene, box, cut, dihedral, glossy
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.gloss import brdf
 from ltcl.scenes.gloss.beams import exchange
 from ltcl.scenes.walls import Wall
+from ltcl.transport.diagnostics import reciprocity_defect
 
 PROJECTOR, CAMERA = (1.5, 0.9, 0.8), (0.8, 1.6, 0.4)
 
@@ -29,13 +29,20 @@ def test_bins_hold_equal_projected_solid_angles(k: int) -> None:
     """Directions of a cosine law, made by rejection from a square: each bin gets its share."""
     points = np.random.default_rng(1).uniform(-1, 1, (200_000, 2))
     points = points[(points**2).sum(axis=1) < 1]
-    counts = np.bincount(brdf.bins(np.column_stack([points, np.sqrt(1 - (points**2).sum(axis=1))]), k))
-    assert counts == pytest.approx(np.full(k * k, len(points) / k**2), abs=5 * (len(points) / k**2) ** 0.5)
+    counts = np.bincount(
+        brdf.bins(np.column_stack([points, np.sqrt(1 - (points**2).sum(axis=1))]), k)
+    )
+    assert counts == pytest.approx(
+        np.full(k * k, len(points) / k**2), abs=5 * (len(points) / k**2) ** 0.5
+    )
 
 
 @pytest.mark.parametrize(("k", "exponent"), [(2, 1), (4, 20), (8, 0.5), (8, 512)])
 def test_lobes_return_all_light_and_are_reciprocal(k: int, exponent: float) -> None:
-    shine, vectors = brdf.lobe(exponent, k), brdf.from_square(np.random.default_rng(0).random((40, 2)))
+    shine, vectors = (
+        brdf.lobe(exponent, k),
+        brdf.from_square(np.random.default_rng(0).random((40, 2))),
+    )
     for means in (shine.between.mean(axis=1), shine.towards(vectors).mean(axis=1)):
         assert means == pytest.approx(1, rel=1e-12)
     assert ((shine.between == shine.between.T) & (shine.between > 0)).all()
@@ -43,7 +50,10 @@ def test_lobes_return_all_light_and_are_reciprocal(k: int, exponent: float) -> N
     assert there == pytest.approx(back, rel=1e-12)
 
 
-UNEQUAL = (Wall("a", (1, 0, 2), (-1, 0, 0), (0, 0, -2)), Wall("b", (0, 0, 1), (0, 3, 0.5), (0, 0, -1)))
+UNEQUAL = (
+    Wall("a", (1, 0, 2), (-1, 0, 0), (0, 0, -2)),
+    Wall("b", (0, 0, 1), (0, 3, 0.5), (0, 0, -1)),
+)
 
 
 @pytest.mark.parametrize("walls", [WALLS, UNEQUAL])
@@ -53,7 +63,9 @@ def test_beams_exchange_the_same_light_both_ways(walls: tuple[Wall, ...]) -> Non
     np.testing.assert_allclose(E, E.T, atol=1e-6 * E.max())
     assert G.sum(axis=1).max() <= 1 + 1e-12
     assert len(walls) < 6 or G.sum(axis=1).min() >= 1 - 1e-12  # a closed room keeps all light
-    same = [(exchange(walls, 3, 16, 64, seed=seed).toarray() == G.toarray()).all() for seed in (0, 4)]
+    same = [
+        (exchange(walls, 3, 16, 64, seed=seed).toarray() == G.toarray()).all() for seed in (0, 4)
+    ]
     assert same == [True, False]
     curtain = exchange((WALLS[0], WALLS[4]), 2, 16, 16, blocks=[[(-1, 0.4, -1), (2, 0.5, 2)]])
     assert curtain.sum() == 0
@@ -99,14 +111,23 @@ def first_bounce_by_integration(gloss: float, exponent: float) -> float:
     shine = brdf.lobe(exponent, 16)
     u, v, a, b = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(12).T + 2.0**-13
     radius, angle = np.sqrt(a), 2 * np.pi * b
-    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - a)  # z along +x, off the right wall
+    x, y, z = (
+        radius * np.cos(angle),
+        radius * np.sin(angle),
+        np.sqrt(1 - a),
+    )  # z along +x, off the right wall
     distance = np.where(x < 0, -u / x, np.inf)  # to y = 0; x here is along +y of the room
     reached = distance * z, v + distance * y
     room = np.column_stack([z, x, y])[(reached[0] < 1) & (reached[1] > 0) & (reached[1] < 1)]
 
-    def reflect(normal: tuple[int, int, int], place: Any, centre: Any, other: np.ndarray) -> np.ndarray:
+    def reflect(
+        normal: tuple[int, int, int], place: Any, centre: Any, other: np.ndarray
+    ) -> np.ndarray:
         # Any frame does for an isotropic lobe.
-        axes, away = np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1), place - centre
+        axes, away = (
+            np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1),
+            place - centre,
+        )
         towards = np.broadcast_to(away / np.linalg.norm(away), room.shape)
         return 1 - gloss + gloss * shine.direct(towards @ axes, other @ axes)
 
@@ -127,12 +148,20 @@ def test_first_bounce_approaches_an_integral_without_bins() -> None:
 def test_a_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
     cube = box(1, sides=3, occluder=Block(corner=(0.3, 0.3, 0.0), size=(0.3, 0.3, 0.4), albedo=0.5))
     gloss = [0.8 if wall.name.startswith("block") else 0.0 for wall in cube.walls]
-    options: dict[str, Any] = {"projector": (0.9, 0.2, 1.4), "camera": (0.15, 0.75, 1.4), "rays": 16}
+    options: dict[str, Any] = {
+        "projector": (0.9, 0.2, 1.4),
+        "camera": (0.15, 0.75, 1.4),
+        "rays": 16,
+    }
     room = glossy(cube, 5, 0.5, gloss, 100, **options, directions=36)
     direct = room.picture(room.first_bounce).reshape(5, len(cube.walls), 5)
     names = [wall.name for wall in cube.walls]
     floor, top, side = (direct[:, names.index(name)] for name in ("floor", "block top", "block -x"))
-    assert (floor[2, 2], floor[4, 4], side.max()) == (0, pytest.approx(0.5), 0)  # the first is below it
+    assert (floor[2, 2], floor[4, 4], side.max()) == (
+        0,
+        pytest.approx(0.5),
+        0,
+    )  # the first is below it
     assert top.max() > 20 * 0.5 * (1 - 0.8)  # of the matte part
     # Halfway between projector and camera, which are as high above it.
     assert np.unravel_index(np.argmax(top), top.shape) == (3, 2)

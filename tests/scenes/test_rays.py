@@ -26,11 +26,15 @@ def test_blocks_stop_rays_as_the_twin_says() -> None:
     middle_and_half = np.concatenate([boxes.mean(axis=1), np.array([block.size]) / 2], axis=1)
     twin = reference.blocked(start, end, middle_and_half)
     np.testing.assert_array_equal(clear((), start, end, boxes), ~twin)
-    # Its own faces are in front of it; a ray from the face outwards, along it or over the top passes.
+    # Its own faces are in front of it; a ray from the face outwards, along it or over the top
+    # passes.
     hits = cast(block.faces(), start[twin], (end - start)[twin], boxes)
     outside = ((start < block.low) | (start > block.high)).any(axis=1)[twin]
     assert (hits.wall[outside] >= 0).all()
-    places, aims = [(0.6, 0.4, 0.3)] * 2 + [(0, 0, 0.6)], [(1, 0.9, 0.9), (0.6, 0.9, 0.3), (1, 1, 0.6)]
+    places, aims = (
+        [(0.6, 0.4, 0.3)] * 2 + [(0, 0, 0.6)],
+        [(1, 0.9, 0.9), (0.6, 0.9, 0.3), (1, 1, 0.6)],
+    )
     assert clear((), np.array(places, float), np.array(aims), boxes).all()
     assert not clear((), np.array([[0.6, 0.4, 0.3]]), np.array([0.0, 0.4, 0.3]), boxes).any()
 
@@ -42,10 +46,14 @@ def test_sight_is_in_the_frame_of_each_patch_and_keeps_to_shadows() -> None:
     away = place - patches.centre
     back = np.einsum("nij,ni->nj", patches.frames, seen.towards)
     assert back == pytest.approx(away / np.linalg.norm(away, axis=1)[:, None])
-    # A lamp at height 2 over x = 0, a plate at height 1 to x = 0.25: shadow to x = 0.5, half the patches.
+    # A lamp at height 2 over x = 0, a plate at height 1 to x = 0.25: shadow to x = 0.5, half the
+    # patches.
     plate = [[(-1, -1, 1), (0.25, 2, 1.001)]]
     for n, expected in ((4, [0] * 8 + [1] * 8), (1, [0.5])):
-        assert sight("projector", (0, 0.5, 2), [FLOOR], cut([FLOOR], n), plate).share.tolist() == expected
+        assert (
+            sight("projector", (0, 0.5, 2), [FLOOR], cut([FLOOR], n), plate).share.tolist()
+            == expected
+        )
 
 
 def test_a_pinhole_shows_a_screen_as_it_is() -> None:
@@ -58,7 +66,9 @@ def test_a_pinhole_shows_a_screen_as_it_is() -> None:
     assert not np.concatenate([image[:3].ravel(), image[:, -3:].ravel()]).any()
     fine = np.tile(np.array([[0, 1], [1, 0]], np.float32), (200, 200))
     assert draw(EYE, [SCREEN], fine, 53, supersample=8)[4:-4, 4:-4] == pytest.approx(0.5, abs=0.02)
-    wide = np.broadcast_to(np.linspace(-1, 1, 300, dtype=np.float32), (100, 300))  # read: its sides are lost
+    wide = np.broadcast_to(
+        np.linspace(-1, 1, 300, dtype=np.float32), (100, 300)
+    )  # read: its sides are lost
     inside = np.array([-0.75, -0.25, 0.25, 0.75]) / 3 / 1.06
     assert read(EYE, [SCREEN], wide, grid=(4, 4))[0] == pytest.approx(inside, abs=0.005)
     assert read(EYE, [SCREEN], wide.T, grid=(4, 4))[:, 0] == pytest.approx(inside, abs=0.005)
@@ -69,12 +79,16 @@ def test_reading_undoes_drawing_of_smooth_pictures(size: int) -> None:
     """Also seen at an angle and for any rounding of the image's height; negative values pass."""
     oblique, (y, x) = Viewer(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5)), np.mgrid[:16, :16] / 16
     picture = np.stack([np.sin(3 * x) - 0.5, x * y, 1 - y], axis=-1).astype(np.float32)
-    seen = read(oblique, [SCREEN], draw(oblique, [SCREEN], picture, size, supersample=4), grid=(16, 16))
+    seen = read(
+        oblique, [SCREEN], draw(oblique, [SCREEN], picture, size, supersample=4), grid=(16, 16)
+    )
     assert seen[1:-1, 1:-1] == pytest.approx(picture[1:-1, 1:-1], abs=0.02)
 
 
 def test_a_block_hides_what_is_behind_it_and_seams_show_no_cracks(device) -> None:
-    scene = box(10, sides=3, occluder=Block((0.3, 0.35, 0), (0.35, 0.3, 0.5), albedo=0.6), device=device)
+    scene = box(
+        10, sides=3, occluder=Block((0.3, 0.35, 0), (0.35, 0.3, 0.5), albedo=0.6), device=device
+    )
     picture = scene.sample(np.ones((300, 300)))
     floor, top, left = picture[:, 20:30], picture[:, -10:], picture[:, 40:50]
     assert not floor[4:6, 4:6].any()  # under the block

@@ -14,12 +14,12 @@ from scipy.sparse.linalg import aslinearoperator
 import ltcl
 from ltcl import checks, scenes
 from ltcl.device import Device
-from ltcl.diagnostics import other_grid
 from ltcl.errors import MemoryLimitError
 from ltcl.scenes import Block, Scene, box, cut, dihedral, landscape, trihedral
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.scene import transport
 from ltcl.scenes.walls import spread_albedo
+from ltcl.transport.diagnostics import other_grid
 from tests.scenes.closed_forms import sampled
 
 random = np.random.default_rng(0)
@@ -95,9 +95,13 @@ def test_patches_lie_in_the_order_of_the_picture() -> None:
     for r, w, c in [(0, 0, 0), (2, 1, 0), (1, 5, 2)]:
         wall, number = WALLS[w], r * len(WALLS) * n + w * n + c
         right, down = np.array([wall.right, wall.down]) / n
-        np.testing.assert_allclose(patches.centre[number], wall.corner + (c + 0.5) * right + (r + 0.5) * down)
+        np.testing.assert_allclose(
+            patches.centre[number], wall.corner + (c + 0.5) * right + (r + 0.5) * down
+        )
         np.testing.assert_allclose(patches.normal[number], wall.normal)
-        np.testing.assert_allclose(patches.frames[number] @ patches.frames[number].T, np.eye(3), atol=1e-15)
+        np.testing.assert_allclose(
+            patches.frames[number] @ patches.frames[number].T, np.eye(3), atol=1e-15
+        )
 
 
 def test_faces_of_a_block_look_outwards_and_close_it() -> None:
@@ -124,8 +128,13 @@ def test_faces_of_a_block_look_outwards_and_close_it() -> None:
     ],
 )
 def test_albedo_is_spread_over_walls_and_colours(albedo: Any, expected: Any) -> None:
-    pictures = spread_albedo(albedo, walls=2, n=3).reshape(-1, 3, 2, 3)  # (channels, row, wall, column)
-    assert pictures.tolist() == np.broadcast_to(np.array(expected)[:, None, :, None], pictures.shape).tolist()
+    pictures = spread_albedo(albedo, walls=2, n=3).reshape(
+        -1, 3, 2, 3
+    )  # (channels, row, wall, column)
+    assert (
+        pictures.tolist()
+        == np.broadcast_to(np.array(expected)[:, None, :, None], pictures.shape).tolist()
+    )
 
 
 def test_picture_has_saturated_blue_and_orange_white_and_black() -> None:
@@ -164,8 +173,12 @@ def test_closed_box_of_uniform_albedo_reaches_the_bound_of_equation_14(albedo: f
     assert max(abs(spectrum(scene))) == pytest.approx(albedo, rel=1e-9)
     (T,) = scene.matrices()
     R = T / albedo - np.eye(len(T))
-    assert max(abs(np.linalg.eigvalsh((R + R.T) / 2))) == pytest.approx(albedo / (1 - albedo), rel=1e-9)
-    assert T.sum(axis=1) == pytest.approx(albedo / (1 - albedo), rel=1e-9)  # uniform light glows uniformly
+    assert max(abs(np.linalg.eigvalsh((R + R.T) / 2))) == pytest.approx(
+        albedo / (1 - albedo), rel=1e-9
+    )
+    assert T.sum(axis=1) == pytest.approx(
+        albedo / (1 - albedo), rel=1e-9
+    )  # uniform light glows uniformly
 
 
 def test_bounces_of_a_dihedral_alternate() -> None:
@@ -193,7 +206,9 @@ def test_the_narrower_the_more_light_stays(make: Any, angles: tuple[float, ...])
         assert -turn == pytest.approx(np.cos(np.radians(angle)), abs=1e-12)
 
 
-def test_too_large_scenes_are_refused_before_anything_is_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_scenes_are_refused_before_anything_is_allocated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with pytest.raises(MemoryLimitError, match=r"dihedral.* needs .* TiB"):
         dihedral(10**5)
     monkeypatch.setattr(checks, "host_memory", lambda: 4 * 8 * 96**2 - 1)
@@ -224,7 +239,12 @@ def test_exchange_past_a_block_agrees_with_sampling(device: Device, block: Block
         assert F[:, i, :, :, j].sum() * walls[i].area / N**2 == expected
 
 
-SCENES = [scenes.box(12, sides=3, albedo=0.7), scenes.box(8), scenes.dihedral(15), scenes.trihedral(12)]
+SCENES = [
+    scenes.box(12, sides=3, albedo=0.7),
+    scenes.box(8),
+    scenes.dihedral(15),
+    scenes.trihedral(12),
+]
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=["corner", "closed", "dihedral", "trihedral"])

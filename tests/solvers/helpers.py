@@ -25,7 +25,12 @@ from tests.problems import Scene, enclosure
 SAMPLED = ("monte_carlo", "hybrid")
 METHODS = tuple(method for method in ALL if method not in SAMPLED)  # those that keep a tolerance
 ITERATIVE = tuple(method for method in METHODS if method not in ("direct", "auto"))
-READS_ROWS = ("gauss_seidel", "sor", "block_gauss_seidel", "southwell")  # refuse entries that cannot be read
+READS_ROWS = (
+    "gauss_seidel",
+    "sor",
+    "block_gauss_seidel",
+    "southwell",
+)  # refuse entries that cannot be read
 N, SOME = 43, 19  # pixels of compressed systems, and coefficients where not all are there
 CLOSED = enclosure(N, 0.4)  # self-adjoint in the plain inner product, and so on coefficients
 
@@ -43,7 +48,9 @@ def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
 
 def force_groups(monkeypatch: Any, device: Device, group: int) -> None:
     """Let all kernels run with work-groups of one size, as far as the device allows it."""
-    monkeypatch.setattr(device, "reductions", {})  # what was planned for other groups does not fit these
+    monkeypatch.setattr(
+        device, "reductions", {}
+    )  # what was planned for other groups does not fit these
     real = Kernel.group
 
     def forced(kernel: Kernel, wanted: Any) -> Any:
@@ -53,7 +60,9 @@ def force_groups(monkeypatch: Any, device: Device, group: int) -> None:
     monkeypatch.setattr(Kernel, "group", forced)
 
 
-def refused(says: str, S: Any, b: Any, method: str = "auto", kind: Any = InputError, **options: Any) -> str:
+def refused(
+    says: str, S: Any, b: Any, method: str = "auto", kind: Any = InputError, **options: Any
+) -> str:
     """The message, of one line, with which `solve` refuses this."""
     with pytest.raises(kind, match=says) as caught:
         ltcl.solve(S, b, method, **options)
@@ -83,7 +92,9 @@ def compressed(
 
 def subset(device: Device, sign: float = 1.0) -> tuple[IdentityPlus, np.ndarray]:
     """S = I + sign V^T C V with 19 of 43 coefficients, and its float64 matrix."""
-    V = Given(device, rotation(N, 6)[:SOME])  # row sums are near the spectrum, as free bounds suppose
+    V = Given(
+        device, rotation(N, 6)[:SOME]
+    )  # row sums are near the spectrum, as free bounds suppose
     scene = enclosure(SOME, 0.4)
     R = Compressed(CSR(device, scipy.sparse.csr_array(scene.R if sign > 0 else scene.A)), V, V)
     return IdentityPlus(R, sign), np.eye(N) + sign * stands_for(R)

@@ -53,16 +53,36 @@ CANCEL = np.outer((-1.0) ** np.arange(N), (-1.0) ** np.arange(N)) / N  # row sum
 CHOICES = {
     "small": (np.eye(20) + 0.01, 1e-2, "direct", "20"),
     "precise": (np.eye(N) + ring(0.01), 1e-9, "jacobi", "float64, since rtol=1e-09"),
-    "weak": (np.eye(N) + ring(0.01), 1e-2, "jacobi", r"jacobi: 1 product, chebyshev: 4 .*R .* 0.01$"),
-    "strong": (np.eye(N) + ring(0.5), 1e-2, "chebyshev", r"first: chebyshev: .*cg: .*by 3 products$"),
+    "weak": (
+        np.eye(N) + ring(0.01),
+        1e-2,
+        "jacobi",
+        r"jacobi: 1 product, chebyshev: 4 .*R .* 0.01$",
+    ),
+    "strong": (
+        np.eye(N) + ring(0.5),
+        1e-2,
+        "chebyshev",
+        r"first: chebyshev: .*cg: .*by 3 products$",
+    ),
     "lopsided": (np.eye(N) + ring(0.5, 0.3), 1e-2, "chebyshev", r"first: chebyshev: .*gmres: "),
     "three eigenvalues": (
         *(normal(np.where(np.arange(N) < 2, [3.0, 6.0] * (N // 2), 1.0)), 1e-2, "cg gmres"),
         r"gmres: 3 .*chebyshev: \d+ .* 1 and 6 by 3 products$|cg: 4 ",
     ),
     "indefinite": (normal(np.linspace(-1, 3, N)), 0.2, "gmres", r"gmres: \d+ products.* between -"),
-    "one-way": (np.eye(N) + ring(0.7, 1.0), 1e-2, "gmres", r"0.5\d of R .* imaginary parts up to 0.\d+ by 3"),
-    "rows that cancel": (np.eye(N) + 3 * CANCEL, 1e-2, "cg gmres", "^jacobi: .*; jacobi ended diverged; "),
+    "one-way": (
+        np.eye(N) + ring(0.7, 1.0),
+        1e-2,
+        "gmres",
+        r"0.5\d of R .* imaginary parts up to 0.\d+ by 3",
+    ),
+    "rows that cancel": (
+        np.eye(N) + 3 * CANCEL,
+        1e-2,
+        "cg gmres",
+        "^jacobi: .*; jacobi ended diverged; ",
+    ),
 }
 
 
@@ -85,7 +105,9 @@ def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device)
     first, second, third = (ltcl.solve(S, pictures()) for _ in range(3))
     assert (first.method, first.products) == ("gmres", ltcl.solve(S, pictures(), "gmres").products)
     assert "eigenvalues" not in first.reason
-    assert "eigenvalues" in ltcl.solve(system(device, ring(0.5)), pictures(20)).reason  # worth it at once
+    assert (
+        "eigenvalues" in ltcl.solve(system(device, ring(0.5)), pictures(20)).reason
+    )  # worth it at once
     assert second.products == third.products + auto.STEPS
     np.testing.assert_array_equal(second.x, third.x)
     ltcl.solve(S, pictures(), "direct")
@@ -106,7 +128,9 @@ def test_many_right_hand_sides_are_worth_a_factorization_and_one_is_not(device):
 def test_where_a_method_has_no_room_the_next_is_tried(device, monkeypatch):
     S, b = system(device, ring(0.7, 1.0)), pictures()
     assert ltcl.solve(S, b).method == "gmres"
-    monkeypatch.setattr(device, "memory", 40_000)  # bytes: three directions of the survey, not twenty
+    monkeypatch.setattr(
+        device, "memory", 40_000
+    )  # bytes: three directions of the survey, not twenty
     s = ltcl.solve(S, b)
     assert (s.method, "gmres failed" in s.reason) == ("direct", True)
     assert residual(np.eye(N) + ring(0.7, 1.0), s.x, b) <= 1e-2
@@ -127,7 +151,9 @@ def test_where_nothing_converges_it_raises_with_the_best_iterate(device, monkeyp
 @pytest.mark.parametrize("seed", range(3))
 def test_the_survey_of_a_diffuse_scene_holds_its_spectrum_and_foresees_gmres(device, seed, rho):
     scene, b = lambertian(300, rho, seed, density=0.2), np.random.default_rng(6).uniform(size=300)
-    S, plain = (IdentityPlus(Dense(device, scene.R), weights=weights) for weights in (scene.weights, None))
+    S, plain = (
+        IdentityPlus(Dense(device, scene.R), weights=weights) for weights in (scene.weights, None)
+    )
     seen, eigenvalues = auto.survey(S), np.linalg.eigvals(scene.S).real
     assert seen.spectrum[1] >= eigenvalues.max() * (1 - 1e-3)
     # Single ones a little below the rest may be missed: one product more, not a divergence.

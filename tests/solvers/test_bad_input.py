@@ -23,15 +23,27 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "S is not square": ({"S": np.ones((4, 3))}, InputError, r"S has shape \(4, 3\)"),
     "S is a vector": ({"S": np.ones(4)}, InputError, r"S has shape \(4,\)"),
     "S is complex": ({"S": np.eye(4) * 1j}, InputTypeError, "matrix holds complex"),
-    "S has NaN": ({"S": np.full((4, 4), np.nan)}, InputError, "matrix has 16 NaN or infinite value"),
-    "b is short": ({"b": np.ones(3)}, InputError, r"b has shape \(3,\); it must be \(4,\) or \(4, k\)"),
+    "S has NaN": (
+        {"S": np.full((4, 4), np.nan)},
+        InputError,
+        "matrix has 16 NaN or infinite value",
+    ),
+    "b is short": (
+        {"b": np.ones(3)},
+        InputError,
+        r"b has shape \(3,\); it must be \(4,\) or \(4, k\)",
+    ),
     "b is a picture": ({"b": np.ones((4, 1, 1))}, InputError, r"b has shape \(4, 1, 1\)"),
     "b is empty": ({"b": np.ones((4, 0))}, InputError, r"b has shape \(4, 0\)"),
     "b is a number": ({"b": 1.0}, InputError, r"b has shape \(\)"),
     "b has NaN": ({"b": [1, 2, np.nan, 4]}, InputError, "b has 1 NaN or infinite value"),
     "b has Inf": ({"b": [1, 2, 3, np.inf]}, InputError, "b has 1 NaN or infinite value"),
     "b is text": ({"b": "light"}, InputTypeError, "b is the text"),
-    "method is unknown": ({"method": "gauss"}, InputError, "method is 'gauss'; .* jacobi, .*, auto"),
+    "method is unknown": (
+        {"method": "gauss"},
+        InputError,
+        "method is 'gauss'; .* jacobi, .*, auto",
+    ),
     "method is an array": ({"method": np.ones(2)}, InputError, "method is array"),
     "rtol is zero": ({"rtol": 0.0}, InputError, "rtol is 0; .*or atol above 0"),
     "rtol is negative": ({"rtol": -0.1}, InputError, "rtol is -0.1.* 0"),
@@ -44,11 +56,23 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "x0 is short": ({"x0": np.ones(3)}, InputError, r"x0 has shape \(3,\); it must be \(4,\)"),
     "x0 has NaN": ({"x0": [np.nan] * 4}, InputError, "x0 has 4 NaN or infinite value"),
     "callback is a number": ({"callback": 3}, InputTypeError, "callback is 3"),
-    "S is a transport": ({"S": ltcl.Transport(np.eye(4), (2, 2))}, InputTypeError, "S.*T.interreflection"),
+    "S is a transport": (
+        {"S": ltcl.Transport(np.eye(4), (2, 2))},
+        InputTypeError,
+        "S.*T.interreflection",
+    ),
     "unknown option": ({"light": 3}, InputTypeError, "unknown option 'light'"),
-    "no option, but of others": ({"with_residual": True}, InputTypeError, "unknown option 'with_residual'"),
+    "no option, but of others": (
+        {"with_residual": True},
+        InputTypeError,
+        "unknown option 'with_residual'",
+    ),
     "no option, but a class variable": ({"name": "x"}, InputTypeError, "unknown option 'name'"),
-    "of another method": ({"restart": 3, "arnoldi": 2}, InputTypeError, "one of method=.(chebyshev|gmres)"),
+    "of another method": (
+        {"restart": 3, "arnoldi": 2},
+        InputTypeError,
+        "one of method=.(chebyshev|gmres)",
+    ),
 }
 
 
@@ -74,7 +98,17 @@ OPTIONS: dict[tuple[str, str], list[Any]] = {
     ("sor", "omega"): [*DAMPING, 2.0],
     ("chebyshev", "arnoldi"): [-1, 1, 1.5, "few"],
     ("chebyshev", "spectrum"): [
-        *[(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0,), 3.0, "ab", (0.5, np.inf), (np.nan, 1.0), (1.0, "b")]
+        *[
+            (0.0, 1.0),
+            (-1.0, 1.0),
+            (2.0, 1.0),
+            (1.0,),
+            3.0,
+            "ab",
+            (0.5, np.inf),
+            (np.nan, 1.0),
+            (1.0, "b"),
+        ]
     ],
     ("cg", "weights"): [np.ones(4), [1.0, 0.0, -1.0], [1.0, np.nan, 1.0], "area"],
     ("monte_carlo", "samples"): [0, 0.5, 1 << 32],
@@ -91,14 +125,19 @@ OPTIONS: dict[tuple[str, str], list[Any]] = {
 def test_an_unusable_option_is_refused_with_its_value(method, option):
     for value in OPTIONS[method, option]:
         says = f"{option} .*{value}" if isinstance(value, (int, float)) else option
-        refused(says, np.eye(3), np.ones(3), method, (InputError, InputTypeError), **{option: value})
+        refused(
+            says, np.eye(3), np.ones(3), method, (InputError, InputTypeError), **{option: value}
+        )
 
 
 def product_of(result: Callable[[np.ndarray], Any]) -> LinearOperator:
     return by_products(2, lambda x: result(np.array([[2.0, 0.5], [0.5, 1.0]]) @ x))
 
 
-HALF, BLUE = IdentityPlus(as_operator(np.eye(3) / 2)), np.pad(np.full((1, 3), np.nan), ((2, 0), (0, 0)))
+HALF, BLUE = (
+    IdentityPlus(as_operator(np.eye(3) / 2)),
+    np.pad(np.full((1, 3), np.nan), ((2, 0), (0, 0))),
+)
 ROWLESS = IdentityPlus(as_operator(aslinearoperator(np.eye(3) / 2)))
 PAIR = np.eye(5)  # has an inverse, its second block of two has none
 PAIR[2:4, 2:4] = [[1.0, 2.0], [2.0, 4.0]]
@@ -129,7 +168,14 @@ TOGETHER: list[Row] = [
     (HALF, ONE, "auto", {"exact": np.eye(4)}, InputError, r"exact.*\(4, 4\)"),
     (HALF, ONE, "auto", {"exact": np.full((3, 3), np.nan)}, InputError, "NaN"),
     (HALF, ONE, "auto", {"exact": "T.npz"}, InputTypeError, "exact is"),
-    (HALF, ONE, "auto", {"exact": ltcl.Transport(np.eye(3), (1, 3))}, InputTypeError, "T.interreflection"),
+    (
+        HALF,
+        ONE,
+        "auto",
+        {"exact": ltcl.Transport(np.eye(3), (1, 3))},
+        InputTypeError,
+        "T.interreflection",
+    ),
 ]
 COLOUR: list[Row] = [
     ((HALF,) * 3, ONE, MC, {}, InputError, r"b.*\(3,\).*\(3, 3\)"),
@@ -142,7 +188,9 @@ COLOUR: list[Row] = [
 ]
 
 
-@pytest.mark.parametrize(("S", "b", "method", "options", "kind", "says"), [*NO_STEPS, *TOGETHER, *COLOUR])
+@pytest.mark.parametrize(
+    ("S", "b", "method", "options", "kind", "says"), [*NO_STEPS, *TOGETHER, *COLOUR]
+)
 def test_what_does_not_go_together_is_refused(S, b, method, options, kind, says):
     refused(says, S, b, method, kind, **options)
 

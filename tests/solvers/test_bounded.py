@@ -30,7 +30,9 @@ def within(
     """`minimise` with bounds and a start that may be of all pixels alike."""
     n, S = A.shape[1], Dense(ltcl.open_device(), A) if isinstance(A, np.ndarray) else A
     lower, upper = (np.broadcast_to(bound, n).astype(float) for bound in (lower, upper))
-    return minimise(S, b, lower, upper, np.broadcast_to(x0, (n, b.shape[1])).astype(float), **options)
+    return minimise(
+        S, b, lower, upper, np.broadcast_to(x0, (n, b.shape[1])).astype(float), **options
+    )
 
 
 def exact(A: np.ndarray, b: np.ndarray, lower: Any, upper: Any) -> np.ndarray:
@@ -45,7 +47,9 @@ def exact(A: np.ndarray, b: np.ndarray, lower: Any, upper: Any) -> np.ndarray:
     return x
 
 
-def errors(A: np.ndarray, x: np.ndarray, b: np.ndarray | float, w: np.ndarray | float = 1.0) -> np.ndarray:
+def errors(
+    A: np.ndarray, x: np.ndarray, b: np.ndarray | float, w: np.ndarray | float = 1.0
+) -> np.ndarray:
     return np.linalg.norm(w * (A.astype(np.float64) @ x.astype(np.float64) - b), axis=0)
 
 
@@ -59,7 +63,9 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     x = np.where(random.random((rows, k)) < 0.3, lower[:, None], np.minimum(x, upper[:, None]))
     q, g, d, h, r, Ad, w = (gallery.vectors(rows, k, seed) for seed in range(7, 14))
     q[random.random((rows, k)) < 0.1], w = 0, np.square(w)
-    Q, G, D, H, R, Y, W, X, L, U = (device.upload(part) for part in (q, g, d, h, r, Ad, w, x, lower, upper))
+    Q, G, D, H, R, Y, W, X, L, U = (
+        device.upload(part) for part in (q, g, d, h, r, Ad, w, x, lower, upper)
+    )
     columns = Columns(X, *NAMES)
     slices, tolerance = columns.slices, reference.gamma(rows / 64 + 40) * 8 * rows
     start = np.zeros((4 + 3 * slices, k))
@@ -87,7 +93,9 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     np.testing.assert_allclose(squares.get().sum(axis=0), curvature, rtol=1e-4)
 
     V = R.like()
-    columns.bind("bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4)()
+    columns.bind(
+        "bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4
+    )()
     with np.errstate(divide="ignore", invalid="ignore"):
         length = np.where(gd < 0, np.fmin(-gd / curvature, np.fmax(1 / share, 1)), 0.0)
     moved, left = reference.bounded_move(length, lower, upper, step, x), r - length * Ad
@@ -103,7 +111,9 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
 @pytest.mark.parametrize("rho", [0.8, 4.0])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("bright", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("seed", [0, 79])  # of the second, lengths and steps once took turns for ever
+@pytest.mark.parametrize(
+    "seed", [0, 79]
+)  # of the second, lengths and steps once took turns for ever
 def test_it_finds_the_least_squares(rho, weighted, bright, seed):
     S, random = lambertian(60, rho, seed=3).S.astype(np.float32), np.random.default_rng(seed)
     lower, upper = np.zeros(60), random.uniform(0.3, 0.9, 60)
@@ -143,7 +153,9 @@ def test_never_above_the_start_and_never_certified_too_low(seed, shape, k, scale
     s = within(A, b, lower, upper, x0, rtol=1e-5, maxiter=int(rng.choice([1, 2, 5, 200])))
     rounding = 1e-5 * (np.linalg.norm(b, axis=0) + scale)
     best = errors(A, exact(A / 1.0, b / scale, lower / scale, upper / scale) * scale, b)
-    assert (errors(A, s.x, b) <= errors(A, np.clip(x0, lower[:, None], upper[:, None]), b) + rounding).all()
+    assert (
+        errors(A, s.x, b) <= errors(A, np.clip(x0, lower[:, None], upper[:, None]), b) + rounding
+    ).all()
     assert (s.least <= best + rounding).all()
     assert (s.x >= lower.astype(np.float32)[:, None]).all()
     assert (s.x <= upper.astype(np.float32)[:, None]).all()

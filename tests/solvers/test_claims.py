@@ -60,8 +60,10 @@ def in_wavelets(device, seed: int, eps: float, both: bool) -> tuple[IdentityPlus
     return S, np.eye(16) + (H.T @ C @ H if both else C.astype(float) @ H)
 
 
-LOST = np.array(  # the float32 product of I + LOST with the x of BiCGStab is b; in float64 it misses by 28 %
-    [[-0.8966292142868042, -0.2433648407459259], [0.3770374655723572, -1.8876547621322632]], np.float32
+# the float32 product of I + LOST with the x of BiCGStab is b; in float64 it misses by 28 %
+LOST = np.array(
+    [[-0.8966292142868042, -0.2433648407459259], [0.3770374655723572, -1.8876547621322632]],
+    np.float32,
 )
 SCALES = [(1e10, 1e-30), (1e30, 1e-5), (1e-30, 1e30), (1e-36, 1e3)]
 
@@ -70,7 +72,9 @@ def hard_systems(device, name: str) -> list[tuple[Any, np.ndarray, np.ndarray]]:
     """S as it is given, the same in float64, and b."""
     if name in KINDS:
         singular = [nearly_singular(seed, 10.0 ** -(1 + seed)) for seed in range(12)]
-        each = [(S, np.random.default_rng(seed).uniform(size=len(S))) for seed, S in enumerate(singular)]
+        each = [
+            (S, np.random.default_rng(seed).uniform(size=len(S))) for seed, S in enumerate(singular)
+        ]
         return [(KINDS[name](S), S, b) for S, b in [*each, (THIRD, np.ones(2))]]
     if name == "float32":
         return [(IdentityPlus(Dense(device, LOST)), np.eye(2) + LOST, np.array([1.8, 0.3]))]
@@ -89,7 +93,10 @@ def test_hard_systems_are_solved_or_fail(device, method, name):
         with contextlib.suppress(*([InputError] if method in READS_ROWS else [])):
             s = ltcl.solve(A, b, method, rtol=1e-3, throw=False)
             assert not s.converged or true_residual(S, s.x, b) <= 1.01e-3
-            if S is THIRD and method in ("direct", "auto"):  # which factorize the numbers that were given
+            if S is THIRD and method in (
+                "direct",
+                "auto",
+            ):  # which factorize the numbers that were given
                 assert s.converged
                 assert true_residual(S, s.x, b) <= 1e-8
 
@@ -106,7 +113,10 @@ def test_T_in_float64_is_judged_in_float64(device, method):
 def test_threads_share_one_factorization(device):
     S = IdentityPlus(Dense(device, np.random.default_rng(0).uniform(0.0, 1.0 / 128, (128, 128))))
     with ThreadPoolExecutor(4) as pool:
-        tasks = [pool.submit(ltcl.solve, S, np.ones((128, 3)), "direct", throw=False) for _ in range(2000)]
+        tasks = [
+            pool.submit(ltcl.solve, S, np.ones((128, 3)), "direct", throw=False)
+            for _ in range(2000)
+        ]
     assert all(task.result().converged for task in tasks)
 
 
@@ -178,10 +188,18 @@ def test_direct_under_a_memory_limit_is_refused_in_our_words(device):
 def test_errors_with_attributes_unpickle(device):
     with pytest.raises(ConvergenceError) as caught:
         ltcl.solve(np.eye(2) * 5.0, np.ones(2), "jacobi")
-    assert pickle.loads(pickle.dumps(caught.value)).solution.residual == caught.value.solution.residual  # noqa: S301
-    missing, below = PhotographMissing("number 3 is missing", 3), ToleranceError("rtol is 1e-9", 1e-6)
+    copied = pickle.loads(pickle.dumps(caught.value))  # noqa: S301 - our own
+    assert copied.solution.residual == caught.value.solution.residual
+    missing, below = (
+        PhotographMissing("number 3 is missing", 3),
+        ToleranceError("rtol is 1e-9", 1e-6),
+    )
     for error in (caught.value, missing, below):
         back = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
-        assert (type(back), str(back), vars(back).keys()) == (type(error), str(error), vars(error).keys())
+        assert (type(back), str(back), vars(back).keys()) == (
+            type(error),
+            str(error),
+            vars(error).keys(),
+        )
         assert isinstance(error, LtclError)
     assert (pickle.loads(pickle.dumps(below)).least, missing.number) == (1e-6, 3)  # noqa: S301

@@ -12,7 +12,16 @@ from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, SubsetBasis, Ti
 from ltcl.solvers import Status
 from tests.bases import Given, rotation
 from tests.problems import lambertian, residual
-from tests.solvers.helpers import CLOSED, ITERATIVE, READS_ROWS, SOME, N, by_products, compressed, subset
+from tests.solvers.helpers import (
+    CLOSED,
+    ITERATIVE,
+    READS_ROWS,
+    SOME,
+    N,
+    by_products,
+    compressed,
+    subset,
+)
 
 SKEW = lambertian(N, rho=0.5, density=0.7)  # self-adjoint in the inner product of its weights only
 EXACT = np.eye(N) + CLOSED.R
@@ -28,7 +37,9 @@ def transforms(monkeypatch, W):
 
 def products(launches) -> int:
     """Products and steps that were launched, of at most eight right-hand sides."""
-    return sum(count for name, count in launches.items() if name.startswith(("csr_matvec", "tile_matvec")))
+    return sum(
+        count for name, count in launches.items() if name.startswith(("csr_matvec", "tile_matvec"))
+    )
 
 
 @pytest.mark.parametrize("method", ITERATIVE)
@@ -150,7 +161,10 @@ def test_below_float32_it_refines_in_float64(device, kind, rtol):
     """Against the numbers that were given; of an operator those that it has, float32."""
     exact = KINDS[kind](device)
     S = np.eye(N) + CLOSED.R.astype(np.float32) if kind == "operator" else EXACT
-    for b in (rng.uniform(0.0, 1.0, N), rng.uniform(0.0, 1.0, (N, 5)) * 10.0 ** np.arange(-20, 5, 5)):
+    for b in (
+        rng.uniform(0.0, 1.0, N),
+        rng.uniform(0.0, 1.0, (N, 5)) * 10.0 ** np.arange(-20, 5, 5),
+    ):
         for method in ("auto", "gmres"):
             s = ltcl.solve(compressed(device)[0], b, method, rtol=rtol, exact=exact)
             assert s.converged

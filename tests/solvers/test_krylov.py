@@ -99,12 +99,16 @@ TEXTBOOKS: dict[str, tuple[Callable[..., np.ndarray], int]] = {  # products of a
     ("bicgstab", 4.0, 0.1),
 ])  # fmt: skip
 def test_iterates_are_those_of_the_textbook(device, method, rho, skew, steps):
-    random = np.random.default_rng(1)  # residuals fall at every step: the best iterate is the last one
+    random = np.random.default_rng(
+        1
+    )  # residuals fall at every step: the best iterate is the last one
     scene = lambertian(40, rho, 29)
     S, b = scene.S + skew * random.normal(size=(40, 40)), random.normal(size=(40, 2))
     weights, (iterate, products) = scene.weights, TEXTBOOKS[method]
     options: dict[str, Any] = {"weights": 2.0**200 * weights} if method == "cg" else {}
-    s = ltcl.solve(as_operator(S, device), b, method, maxiter=steps, rtol=1e-6, throw=False, **options)
+    s = ltcl.solve(
+        as_operator(S, device), b, method, maxiter=steps, rtol=1e-6, throw=False, **options
+    )
     assert s.iterations == steps
     assert s.products <= products * (steps + 1) - 1 + s.converged  # whose end is confirmed
     for x, column in zip(s.x.T, b.T, strict=True):
@@ -121,7 +125,9 @@ def test_a_transport_brings_its_weights(device):
     b = dense @ random.uniform(size=n)
     s = ltcl.solve(S, b, "cg", rtol=1e-4)
     assert residual(dense, s.x, b) <= 1e-4 * (1 + 1e-2)
-    np.testing.assert_array_equal(ltcl.solve(S, b, "cg", rtol=1e-4, weights=1.0 / T.first_bounce).x, s.x)
+    np.testing.assert_array_equal(
+        ltcl.solve(S, b, "cg", rtol=1e-4, weights=1.0 / T.first_bounce).x, s.x
+    )
     plain = ltcl.solve(S, b, "cg", rtol=1e-4, weights=np.ones(n), throw=False)
     assert not plain.converged or plain.products > s.products
 
@@ -133,11 +139,14 @@ def test_the_residual_of_gmres_never_grows(device, restart):
     s = ltcl.solve(as_operator(scene.S, device), b, "gmres", restart=restart, rtol=1e-4)
     assert residual(scene.S, s.x, b) <= 1e-4 * (1 + 1e-2)
     assert all(after <= before * (1 + 1e-4) for before, after in itertools.pairwise(s.residuals))
-    assert s.products <= s.iterations + 1  # the end is confirmed, where the recursion does not prove it
+    assert (
+        s.products <= s.iterations + 1
+    )  # the end is confirmed, where the recursion does not prove it
 
 
 @pytest.mark.parametrize(
-    ("method", "S"), [("gmres", np.diag([1.0, 4.0, 0.0])), ("bicgstab", np.eye(3) + np.eye(3, k=-1))]
+    ("method", "S"),
+    [("gmres", np.diag([1.0, 4.0, 0.0])), ("bicgstab", np.eye(3) + np.eye(3, k=-1))],
 )
 def test_what_stops_the_textbook_is_solved(device, method, S):
     """A singular S; and S b with s = -e_2, S^T b = e_1: r_1 is orthogonal to r_0*, and rho is 0."""
@@ -168,8 +177,12 @@ def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k
     waited, taken, counts = [], [], []
     read, write, empty = Array.get, Array.set, type(device).empty
     monkeypatch.setattr(Array, "get", lambda array: waited.append(array) or read(array))
-    monkeypatch.setattr(Array, "set", lambda array, values: waited.append(array) or write(array, values))
-    monkeypatch.setattr(type(device), "empty", lambda self, *a, **b: taken.append(a) or empty(self, *a, **b))
+    monkeypatch.setattr(
+        Array, "set", lambda array, values: waited.append(array) or write(array, values)
+    )
+    monkeypatch.setattr(
+        type(device), "empty", lambda self, *a, **b: taken.append(a) or empty(self, *a, **b)
+    )
     for steps in (6, 18):
         waited.clear()
         taken.clear()
@@ -186,7 +199,9 @@ def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k
     made, waits_made, allocated = ((last - first) / 12 for first, last in zip(*counts, strict=True))
     assert made <= launches + products * (pieces - 1)
     assert waits_made <= waits
-    assert allocated <= 0.5  # what reading residuals and keeping the best iterate take, once in some steps
+    assert (
+        allocated <= 0.5
+    )  # what reading residuals and keeping the best iterate take, once in some steps
 
 
 SIZES = pytest.mark.parametrize(("rows", "k"), [(1, 1), (53, 5), (257, 3), (40, 70), (5001, 1)])
@@ -207,7 +222,10 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     columns.bind("vector_dots", 0, 0, 0, W, on_device, W, W, sums, across=7)()
     found = sums.get().reshape(columns.slices, 7, k).sum(axis=0)
     np.testing.assert_allclose(
-        found, reference.vector_dots([(v, w) for v in (*V, w)], np.ones_like(w)), rtol=0, atol=tolerance
+        found,
+        reference.vector_dots([(v, w) for v in (*V, w)], np.ones_like(w)),
+        rtol=0,
+        atol=tolerance,
     )
 
     pairs = columns.sums(2)
@@ -220,12 +238,19 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     small = np.linspace(-1e-3, 1e-3, 7 * k).reshape(7, k).astype(np.float32)
     small[6] = 4.0  # <w, w>
     for again, finish in ((0, 0), (1, 1)):
-        out, arguments = W.like(), (6, 1, again, finish, device.upload(small), before, h, on_device, W)
+        out, arguments = (
+            W.like(),
+            (6, 1, again, finish, device.upload(small), before, h, on_device, W),
+        )
         columns.bind("krylov_subtract", *arguments, out, extra=8)()
         wanted = reference.krylov_subtract(V, w, small[:6], small[6] if finish else None)
         np.testing.assert_allclose(out.get(), wanted, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(h.get()[:6], small[:6] + again * np.float32(1e-3), rtol=0, atol=1e-9)
-        np.testing.assert_allclose(h.get()[6], np.sqrt(4 - np.sum(small[:6] ** 2, axis=0)), rtol=1e-6)
+        np.testing.assert_allclose(
+            h.get()[:6], small[:6] + again * np.float32(1e-3), rtol=0, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            h.get()[6], np.sqrt(4 - np.sum(small[:6] ** 2, axis=0)), rtol=1e-6
+        )
     np.testing.assert_array_equal(on_device.get()[6], out.get().ravel())  # the next direction
 
 
@@ -241,7 +266,9 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     def summed(*totals: float) -> tuple[np.ndarray, Array]:
         """Sums (sums, k) that differ by column, and the same in slices on the device."""
         values = np.outer(totals, 1.0 + np.arange(k) / (2 * k))
-        return values, device.upload(np.repeat(values[None] / slices, slices, axis=0).reshape(-1, k))
+        return values, device.upload(
+            np.repeat(values[None] / slices, slices, axis=0).reshape(-1, k)
+        )
 
     def state(**rows: float) -> Array:
         """Numbers of even steps, by row."""
@@ -261,7 +288,9 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     alpha, *wanted = reference.krylov_cg(sums, 2.0 * ones, 0.7 * ones, ~rest, *vectors[:5])
     for array, new in zip(arrays[1:], wanted, strict=True):
         np.testing.assert_allclose(array.get(), new, **close)
-    np.testing.assert_allclose(numbers.get()[5], np.where(rest, 0.7, alpha), rtol=1e-5)  # read by odd steps
+    np.testing.assert_allclose(
+        numbers.get()[5], np.where(rest, 0.7, alpha), rtol=1e-5
+    )  # read by odd steps
     np.testing.assert_allclose(squares(numbers), np.sum(wanted[-1] ** 2, axis=0), rtol=1e-4)
 
     r, v, half, t, p, x, g = vectors

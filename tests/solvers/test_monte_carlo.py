@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Monte Carlo: unbiased, its errors as large as it says; hybrid: Jacobi in the mean; what has no variance is
-refused. Three S at once: one walk a sample, and walks of their own where sharing is of no use."""
+"""Monte Carlo: unbiased, its errors as large as it says; hybrid: Jacobi in the mean; what has no
+variance is refused. Three S at once: one walk a sample, and walks of their own where sharing is of
+no use."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ from tests.problems import lambertian, residual
 from tests.solvers.helpers import SAMPLED, refused
 
 N = 43
-SCENES = [lambertian(N, rho, density=0.7) for rho in (0.6, 0.3, 0.5)]  # as the albedos of a wall differ
+SCENES = [
+    lambertian(N, rho, density=0.7) for rho in (0.6, 0.3, 0.5)
+]  # as the albedos of a wall differ
 SCENE = SCENES[0]
 CORNER = ltcl.scenes.box(10, sides=3, albedo=0.4).transport().systems[0]
 ROOM = CORNER.to_dense().astype(float)
@@ -43,7 +46,11 @@ SYSTEMS: dict[str, tuple[list[np.ndarray], float]] = {  # R of S = I + sign R, o
     "colour, apart": ([with_empty_rows(N, c, c, 9 + c, 42) for c in range(3)], 1.0),
     "colour, one is dark": ([SCENE.R, np.zeros((N, N)), SCENES[2].R], 1.0),
 }
-VARIANTS: dict[str, dict[str, Any]] = {"usual": {}, "long": {"albedo": 0.47}, "adjoint": {"adjoint": True}}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "usual": {},
+    "long": {"albedo": 0.47},
+    "adjoint": {"adjoint": True},
+}
 WAYS: list[dict[str, Any]] = [{}, {"adjoint": True}, {"gather": True}, {"method": "hybrid"}]
 
 
@@ -52,7 +59,9 @@ def sample(S: Any, b: np.ndarray, method: str = "monte_carlo", **options: Any) -
 
 
 def operator(device, R: np.ndarray, form: str, sign: float = 1.0) -> IdentityPlus:
-    return IdentityPlus(CSR(device, scipy.sparse.csr_array(R)) if form == "csr" else Dense(device, R), sign)
+    return IdentityPlus(
+        CSR(device, scipy.sparse.csr_array(R)) if form == "csr" else Dense(device, R), sign
+    )
 
 
 def system(device, name: str) -> tuple[Any, np.ndarray]:
@@ -73,7 +82,11 @@ def pictures(dense: np.ndarray, k: int | None = None) -> np.ndarray:
 
 def solved(dense: np.ndarray, b: np.ndarray) -> np.ndarray:
     b = b.astype(float)
-    return np.linalg.solve(dense, b) if b.ndim == dense.ndim else np.linalg.solve(dense, b[..., None])[..., 0]
+    return (
+        np.linalg.solve(dense, b)
+        if b.ndim == dense.ndim
+        else np.linalg.solve(dense, b[..., None])[..., 0]
+    )
 
 
 def error_of(solution: Solution) -> np.ndarray:
@@ -163,7 +176,11 @@ def test_a_target_error_is_met_at_every_pixel_however_few_the_lights(lights):
 
 @pytest.mark.parametrize(
     ("name", "units"),
-    [*(("a scene", unit) for unit in (1e-30, 1.0, 1e25)), ("colour", 1.0), ("colour", (1e-20, 1.0, 1e15))],
+    [
+        *(("a scene", unit) for unit in (1e-30, 1.0, 1e25)),
+        ("colour", 1.0),
+        ("colour", (1e-20, 1.0, 1e15)),
+    ],
 )
 def test_a_target_error_is_in_the_units_of_x_and_reached_in_every_channel(device, name, units):
     """The brightest channel needs the most walks, and the others get as many."""
@@ -182,7 +199,10 @@ def test_stopping_by_the_spread_leaves_no_bias(device):
     """Skewed scores: where few have met light, those with the smallest spread have the smallest mean."""
     scene = lambertian(20, rho=0.5)
     S, b = IdentityPlus(Dense(device, scene.R)), np.eye(20)[7]
-    runs, exact = [sample(S, b, error=5e-3, seed=seed) for seed in range(60)], np.linalg.solve(scene.S, b)
+    runs, exact = (
+        [sample(S, b, error=5e-3, seed=seed) for seed in range(60)],
+        np.linalg.solve(scene.S, b),
+    )
     z = [(s.x - exact) / error_of(s) for s in runs]
     assert abs(np.mean(z)) < 4 / np.size(z) ** 0.5
     assert 0.85 < np.std(z) < 1.05  # errors have room for what was not met
@@ -222,9 +242,13 @@ def test_final_gather_lowers_the_error_as_theory_says(device):
     b, R = np.random.default_rng(3).random((N, 2)), dense - np.eye(N)
     exact, ratios, factors = np.linalg.solve(dense, b), [], []
     for seed in range(60):
-        plain, gathered = (sample(S, b, samples=100, seed=seed, gather=gather) for gather in (False, True))
+        plain, gathered = (
+            sample(S, b, samples=100, seed=seed, gather=gather) for gather in (False, True)
+        )
         np.testing.assert_allclose(gathered.x, b - R @ plain.x, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(error_of(gathered), np.sqrt(R**2 @ error_of(plain) ** 2), rtol=1e-4)
+        np.testing.assert_allclose(
+            error_of(gathered), np.sqrt(R**2 @ error_of(plain) ** 2), rtol=1e-4
+        )
         ratios.append(np.mean(((gathered.x - exact) / error_of(gathered)) ** 2))
         factors.append(np.linalg.norm(gathered.x - exact) / np.linalg.norm(plain.x - exact))
     assert 0.7 < np.mean(ratios) < 1.4
@@ -236,7 +260,9 @@ def test_pixels_cost_and_get_the_same_alone(device):
     b = gallery.vectors(N, 3)
     whole = sample(S, b, samples=100, seed=7)
     seen, pixels = [], [40, 3, 3]
-    some = sample(S, b, samples=100, seed=7, pixels=pixels, callback=lambda *step: seen.append(step))
+    some = sample(
+        S, b, samples=100, seed=7, pixels=pixels, callback=lambda *step: seen.append(step)
+    )
     np.testing.assert_array_equal(seen, [(0, 1.0), (1, np.nan)])
     np.testing.assert_array_equal(some.x, whole.x[[40, 3, 3]])
     np.testing.assert_array_equal(error_of(some), error_of(whole)[[40, 3, 3]])
@@ -301,7 +327,12 @@ def test_a_variance_is_finite_where_moments_grow_less_than_walks_end(device, adj
     R = gallery.sparse(37, 37, 0.7).toarray().astype(float)
     R[3] *= 5.0
     R /= np.sqrt(radius(drawn(R.T if adjoint else R)))
-    for growth, m, finite in ((0.98, None, True), (1.02, None, False), (0.5, 0.34, True), (0.5, 0.33, False)):
+    for growth, m, finite in (
+        (0.98, None, True),
+        (1.02, None, False),
+        (0.5, 0.34, True),
+        (0.5, 0.33, False),
+    ):
         S, b = operator(device, R * growth**0.5, form), np.ones(37)
         options = {"samples": 2, "albedo": m, "adjoint": adjoint}
         if finite:
@@ -339,7 +370,10 @@ def test_the_mean_of_many_hybrid_runs_is_the_iterate_of_jacobi(device, form, dua
     M, sign = (SCENE.R, 1.0) if dual == "inverse" else (SCENE.A, -1.0)
     b = gallery.vectors(N, 2)
     options: dict[str, Any] = {"samples": 16, "maxiter": 3, "rtol": 1e-6}
-    runs = [sample(operator(device, M, form, sign), b, "hybrid", seed=s, **options).x for s in range(100)]
+    runs = [
+        sample(operator(device, M, form, sign), b, "hybrid", seed=s, **options).x
+        for s in range(100)
+    ]
     x, jacobi = np.stack(runs).astype(float), b
     for _ in range(3):
         jacobi = b - sign * M @ jacobi
@@ -411,9 +445,9 @@ def test_a_sample_in_colour_is_one_walk_and_not_three(device, method):
         before = device.launches.copy()
         call()
         launches = (device.launches - before).items()
-        assert {name: count for name, count in launches if name in {"walk_rows", "walk_columns"}} == {
-            "walk_rows": steps
-        }
+        assert {
+            name: count for name, count in launches if name in {"walk_rows", "walk_columns"}
+        } == {"walk_rows": steps}
 
 
 @pytest.mark.parametrize("options", [{}, {"adjoint": True}, {"method": "hybrid"}])
@@ -424,8 +458,12 @@ def test_the_largest_residual_is_told_and_all_products_are_counted(device, optio
     assert (s.status, s.products) == (Status.SAMPLED, 3)
     largest = max(residual(*one) for one in zip(dense, s.x, b, strict=True))
     assert s.residual == pytest.approx(largest, rel=1e-4)
-    assert [step for step, _ in seen] == list(range(len(seen)))  # NaN while it draws and knows no residual
-    np.testing.assert_array_equal([value for _, value in seen][1:-1], np.full(len(seen) - 2, np.nan))
+    assert [step for step, _ in seen] == list(
+        range(len(seen))
+    )  # NaN while it draws and knows no residual
+    np.testing.assert_array_equal(
+        [value for _, value in seen][1:-1], np.full(len(seen) - 2, np.nan)
+    )
     assert (seen[0][1], seen[-1][1]) == (1.0, s.residual)
     each = solve_each(S, list(b), samples=16, **{"method": "monte_carlo"} | options)
     np.testing.assert_array_equal(np.stack([one.x for one in each]), s.x)
@@ -445,4 +483,6 @@ def test_where_shared_walks_have_no_variance_channels_have_their_own(device):
     Rs *= np.random.default_rng(0).choice((-1, 1), Rs.shape)
     S = tuple(IdentityPlus(Dense(device, 0.6 * R / np.linalg.norm(R, 2))) for R in Rs)
     for samples in (64, 1):  # too few where light is signed
-        assert ("share no walks" in sample(S, b, "hybrid", samples=samples).reason) == (samples == 1)
+        assert ("share no walks" in sample(S, b, "hybrid", samples=samples).reason) == (
+            samples == 1
+        )

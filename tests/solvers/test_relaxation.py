@@ -39,14 +39,19 @@ def test_k_iterations_are_k_sweeps(device, form, name, dual, sweeps):
     b = random.uniform(0.0, 1.0, (SCENE.n, 5))
     x0, S = random.normal(size=b.shape), np.eye(SCENE.n) + sign * matrix
     A = IdentityPlus(as_operator(form(matrix), device), sign)
-    s = ltcl.solve(A, b, method, **options, x0=x0, rtol=1e-7, atol=1e-30, maxiter=sweeps, throw=False)
+    s = ltcl.solve(
+        A, b, method, **options, x0=x0, rtol=1e-7, atol=1e-30, maxiter=sweeps, throw=False
+    )
     if method == "block_gauss_seidel":
         wanted = reference.block_gauss_seidel(S, x0, b, options["block"], s.iterations)
     else:
         wanted = reference.sor(S, x0, b, options.get("omega", 1.0), s.iterations)
     assert s.iterations == sweeps or s.residual < 1e-6
-    # Each sweep rounds a sum of n float32 products; inverses of blocks are no larger than S^-1 here.
-    np.testing.assert_allclose(s.x, wanted, rtol=0, atol=sweeps * SCENE.n * 2**-24 * np.abs(wanted).max())
+    # Each sweep rounds a sum of n float32 products; inverses of blocks are no larger than S^-1
+    # here.
+    np.testing.assert_allclose(
+        s.x, wanted, rtol=0, atol=sweeps * SCENE.n * 2**-24 * np.abs(wanted).max()
+    )
     assert s.residuals[-1] == pytest.approx(residual(S, wanted, b), rel=1e-3, abs=1e-5)
 
 
@@ -77,7 +82,9 @@ def test_what_one_sweep_solves(device, form):
         b = random.uniform(0.0, 1.0, (len(S), 3))
         s = ltcl.solve(as_operator(form(S), device), b, method, block=block, rtol=1e-5)
         assert s.iterations == 1
-        np.testing.assert_allclose(s.x, np.linalg.solve(S, b), rtol=0, atol=1e-5 * float(np.linalg.norm(b)))
+        np.testing.assert_allclose(
+            s.x, np.linalg.solve(S, b), rtol=0, atol=1e-5 * float(np.linalg.norm(b))
+        )
     b = random.uniform(0.0, 1.0, (4 * 8, 3))
     assert ltcl.solve(as_operator(form(apart), device), b, "gauss_seidel", rtol=1e-5).iterations > 5
 

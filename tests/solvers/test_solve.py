@@ -41,7 +41,9 @@ FORMS = {
     "host": lambda device, S: Host(device, by_products(N, lambda x: S @ x)),
     "identity plus csr": lambda device, S: IdentityPlus(FORMS["csr"](device, S - np.eye(N))),
     "identity minus dense": lambda device, S: IdentityPlus(Dense(device, np.eye(N) - S), sign=-1),
-    "identity minus host": lambda device, S: IdentityPlus(Host(device, aslinearoperator(np.eye(N) - S)), -1),
+    "identity minus host": lambda device, S: IdentityPlus(
+        Host(device, aslinearoperator(np.eye(N) - S)), -1
+    ),
 }
 
 
@@ -87,16 +89,23 @@ def test_every_method_on_every_operator(device, method, name, columns):
     assert s.x.shape == b.shape
     assert residual(S, s.x, b) <= options["rtol"] * (1 + slack)
     exact = np.linalg.solve(S, b)
-    assert np.linalg.norm(s.x - exact) <= options["rtol"] * np.linalg.cond(S) * np.linalg.norm(exact)
+    assert np.linalg.norm(s.x - exact) <= options["rtol"] * np.linalg.cond(S) * np.linalg.norm(
+        exact
+    )
     assert len(s.residuals) == s.iterations + 1
-    assert s.residuals[0] == pytest.approx(1.0, rel=1e-5) or "some" in name  # a part is solved at once
+    assert (
+        s.residuals[0] == pytest.approx(1.0, rel=1e-5) or "some" in name
+    )  # a part is solved at once
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e25])
 def test_units_of_light_do_not_matter(device, method, scale):
     """Squares of these values leave float32; each column keeps its own tolerance, and a dark one is dark."""
-    S, b = as_operator(SCENE.S, device), random.uniform(0.5, 1.0, (N, 4)) * (1.0, 1e-5, 1e5, 0.0) * scale
+    S, b = (
+        as_operator(SCENE.S, device),
+        random.uniform(0.5, 1.0, (N, 4)) * (1.0, 1e-5, 1e5, 0.0) * scale,
+    )
     s = ltcl.solve(S, b, method, rtol=1e-4)
     assert residual(SCENE.S, s.x.astype(np.float64) / scale, b / scale) <= 1e-4 * (1 + 1e-3)
     assert not s.x[:, 3].any()
@@ -142,7 +151,9 @@ def test_a_start_at_the_solution_ends_there(device, method):
 
 def test_a_solution_shows_itself_in_one_line(device):
     s = ltcl.solve(np.eye(N), np.ones((N, 1000)), "gmres")
-    assert re.fullmatch(r"<ltcl Solution of 43 x 1000 values by gmres: converged after .*>", repr(s))
+    assert re.fullmatch(
+        r"<ltcl Solution of 43 x 1000 values by gmres: converged after .*>", repr(s)
+    )
 
 
 @pytest.mark.parametrize("method", [method for method in ALL if method not in ("direct", "auto")])

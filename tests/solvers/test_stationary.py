@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Steps are partial sums of the series (eq. 10, 18, 20), and no more than theory says; then all methods at
-every albedo, bounces added and undone."""
+"""Steps are partial sums of the series (eq. 10, 18, 20), and no more than theory says; then all
+methods at every albedo, bounces added and undone."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ random = np.random.default_rng(3)
 
 
 @pytest.mark.parametrize("terms", [1, 2, 7, 12])
-@pytest.mark.parametrize(("matrix", "sign"), [(SCENE.R, 1), (SCENE.A, -1)], ids=["inverse", "forward"])
+@pytest.mark.parametrize(
+    ("matrix", "sign"), [(SCENE.R, 1), (SCENE.A, -1)], ids=["inverse", "forward"]
+)
 @PLAIN
 def test_k_steps_are_k_terms(device, method, options, matrix, sign, terms):
     """Of I - R + R^2 - ... (eq. 10) on S = I + R, and of I + A + A^2 + ... (eq. 4) on I - A."""
@@ -33,10 +35,16 @@ def test_k_steps_are_k_terms(device, method, options, matrix, sign, terms):
     S = IdentityPlus(Dense(device, matrix), sign)
     s = ltcl.solve(S, b, method, rtol=1e-6, maxiter=terms, throw=False, **options)
     assert (s.iterations, len(s.residuals)) == (terms, terms + 1)
-    exact = sum((np.linalg.matrix_power(-sign * matrix, k) @ b for k in range(terms)), np.zeros_like(b))
+    exact = sum(
+        (np.linalg.matrix_power(-sign * matrix, k) @ b for k in range(terms)), np.zeros_like(b)
+    )
     # Each step rounds a sum of n float32 products.
-    np.testing.assert_allclose(s.x, exact, rtol=0, atol=terms * SCENE.n * 2**-24 * np.abs(exact).max())
-    assert residual(np.eye(SCENE.n) + sign * matrix, s.x, b) == pytest.approx(s.residual, rel=1e-2, abs=1e-6)
+    np.testing.assert_allclose(
+        s.x, exact, rtol=0, atol=terms * SCENE.n * 2**-24 * np.abs(exact).max()
+    )
+    assert residual(np.eye(SCENE.n) + sign * matrix, s.x, b) == pytest.approx(
+        s.residual, rel=1e-2, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("columns", [(), (3,)])
@@ -107,9 +115,19 @@ def test_a_few_arnoldi_steps_lose_no_products(device, arnoldi, rho, rtol):
 ALBEDOS = (0.5, 0.8, 0.92, 0.95, 0.99)
 DUALS = ("forward", "inverse")
 ONE_WAY = {("jacobi", "inverse"), ("neumann", "inverse")}  # below an albedo of 1/2 only (eq. 14)
-WRONG = [(0.5, 2.0), (0.3, 1.2), (0.9, 1.1), (0.04, 0.9), (1.5, 4.0)]  # either end may leave out eigenvalues
+WRONG = [
+    (0.5, 2.0),
+    (0.3, 1.2),
+    (0.9, 1.1),
+    (0.04, 0.9),
+    (1.5, 4.0),
+]  # either end may leave out eigenvalues
 CASES = [
-    *((*case, 6, None) for case in itertools.product((*ITERATIVE, "auto"), DUALS) if case not in ONE_WAY),
+    *(
+        (*case, 6, None)
+        for case in itertools.product((*ITERATIVE, "auto"), DUALS)
+        if case not in ONE_WAY
+    ),
     *itertools.product(["chebyshev"], DUALS, (2, 3), [None]),
     *itertools.product(["chebyshev"], DUALS, [6], WRONG),
 ]
@@ -133,11 +151,13 @@ def pictures(n: int) -> list[np.ndarray]:
 @pytest.mark.parametrize("albedo", ALBEDOS)
 @pytest.mark.parametrize(("method", "dual", "sides", "bounds"), CASES)
 def test_every_method_passes_both_ways(device, method, dual, albedo, sides, bounds):
-    """Chebyshev by at most half as many products again as with the true spectrum, and two to learn by; wrong
-    bounds are repaired, and not slower than plain damping by far."""
+    """Chebyshev by at most half as many products again as with the true spectrum, and two to learn
+    by; wrong bounds are repaired, and not slower than plain damping by far."""
     S, (least, most) = room(albedo, dual, sides)
     options, A = {} if bounds is None else {"spectrum": bounds}, as_operator(S, device)
-    budget = theory.richardson_products(least, 2.0 * most, 1e-3) + 3  # the slowest, to a tenth of rtol
+    budget = (
+        theory.richardson_products(least, 2.0 * most, 1e-3) + 3
+    )  # the slowest, to a tenth of rtol
     if bounds is not None:
         budget = 2 * theory.chebyshev_products(*theory.free_bounds(A), 1e-4) + 30
     elif method == "chebyshev":

@@ -26,13 +26,19 @@ def test_converged_is_true_of_x_and_met_down_to_rounding(device, method, rtol, r
     scene = lambertian(64, rho, seed=11)
     b = random.uniform(0.0, 1.0, (64, 5)) * np.logspace(-4, 4, 5)
     R = IdentityPlus(Dense(device, scene.R))  # rounded to float32
-    for S, rounding in ((R, 2**-22), (scene.S, 1e-2 * rtol), (scipy.sparse.csr_array(scene.S), 1e-2 * rtol)):
+    for S, rounding in (
+        (R, 2**-22),
+        (scene.S, 1e-2 * rtol),
+        (scipy.sparse.csr_array(scene.S), 1e-2 * rtol),
+    ):
         s = ltcl.solve(S, b, method, rtol=rtol, throw=False)
         assert s.converged or rtol < 1e-5
         if s.converged:
             assert residual(scene.S, s.x, b) <= rtol * (1 + 1e-3) + rounding
             assert s.residual <= rtol
-        if method not in ("cg", "bicgstab") and rtol > 1e-6:  # those of cg rise and fall between two readings
+        if (
+            method not in ("cg", "bicgstab") and rtol > 1e-6
+        ):  # those of cg rise and fall between two readings
             assert all(value > rtol for value in s.residuals[:-1])
 
 
@@ -55,16 +61,28 @@ def test_below_the_floor_of_float32_it_stagnates(device, method):
     assert residual(scene.S, s.x, b) < 1e-5
 
 
-TURN, SIGNS = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.diag([1.0, -1.0])  # <b, S b> = 0 for b = (1, 1)
-whole = np.random.default_rng(0).integers(-9, 9, (6, 6)).astype(float)  # float32 holds these to the bit
+TURN, SIGNS = (
+    np.array([[0.0, 1.0], [-1.0, 0.0]]),
+    np.diag([1.0, -1.0]),
+)  # <b, S b> = 0 for b = (1, 1)
+whole = (
+    np.random.default_rng(0).integers(-9, 9, (6, 6)).astype(float)
+)  # float32 holds these to the bit
 SINGULAR = {
     "to the bit": np.array([[1.0, 2.0], [2.0, 4.0]]),
     "a zero row": np.diag([1.0, 0.0, 1.0]),
-    "to rounding": np.vstack([whole[:5], whole[0] + whole[1] - whole[2]]),  # the last pivot is 1e-15, not 0
+    "to rounding": np.vstack(
+        [whole[:5], whole[0] + whole[1] - whole[2]]
+    ),  # the last pivot is 1e-15, not 0
 }
-LARGE = np.full((6, 6), 9.0) - 8.0 * np.eye(6)  # far beyond what any splitting takes, not self-adjoint
+LARGE = np.full((6, 6), 9.0) - 8.0 * np.eye(
+    6
+)  # far beyond what any splitting takes, not self-adjoint
 LARGE[0] *= (1, -1, -1, -1, -1, -1)
-FAR, NEAR = np.diag([6.0, 0.8, 0.8]), np.diag([2.0, 0.8, 0.8])  # I - S S~^-1 is 1 - 6 / 2 at one pixel
+FAR, NEAR = (
+    np.diag([6.0, 0.8, 0.8]),
+    np.diag([2.0, 0.8, 0.8]),
+)  # I - S S~^-1 is 1 - 6 / 2 at one pixel
 ENDS: dict[str, tuple[Any, Any, str, Status, dict[str, Any]]] = {  # S, b, method, its end, options
     "negative": (np.diag([-1.0, -2.0, -3.0]), np.ones(3), "cg", Status.INDEFINITE, {}),
     "singular": (np.diag([0.0, 1.0, 2.0]), [1.0, 0.0, 0.0], "cg", Status.INDEFINITE, {}),
@@ -73,19 +91,55 @@ ENDS: dict[str, tuple[Any, Any, str, Status, dict[str, Any]]] = {  # S, b, metho
     "nilpotent": ([[0.0, 1.0], [0.0, 0.0]], [1.0, 0.0], "gmres", Status.BREAKDOWN, {}),
     "turn, BiCGStab": (TURN, [1.0, 1.0], "bicgstab", Status.NO_STEP, {}),
     "signs": (SIGNS, [1.0, 1.0], "bicgstab", Status.NO_STEP, {}),
-    "ring": (np.eye(30) + 3.0 * np.roll(np.eye(30), 1, axis=1), None, "chebyshev", Status.DIVERGED, {}),
+    "ring": (
+        np.eye(30) + 3.0 * np.roll(np.eye(30), 1, axis=1),
+        None,
+        "chebyshev",
+        Status.DIVERGED,
+        {},
+    ),
     "large": (LARGE, np.ones(6), "gauss_seidel", Status.DIVERGED, {}),
-    "neither falls nor grows": (enclosure(30, 0.5).S, np.ones(30), "jacobi", Status.STAGNATED, {}),  # fig. 5c
+    "neither falls nor grows": (
+        enclosure(30, 0.5).S,
+        np.ones(30),
+        "jacobi",
+        Status.STAGNATED,
+        {},
+    ),  # fig. 5c
     "start beyond float32": (
         *(np.eye(6) + np.triu(np.full((6, 6), 10.0)), np.ones(6), "neumann", Status.DIVERGED),
         {"x0": np.full(6, 1e6)},
     ),
-    "below float64": (lambertian(60, 4.0).S, np.ones(60), "direct", Status.STAGNATED, {"rtol": 1e-30}),
-    "refined by Jacobi": (np.diag([1.5, 0.8, 0.8]), np.ones(3), "jacobi", Status.DIVERGED, {"exact": FAR}),
+    "below float64": (
+        lambertian(60, 4.0).S,
+        np.ones(60),
+        "direct",
+        Status.STAGNATED,
+        {"rtol": 1e-30},
+    ),
+    "refined by Jacobi": (
+        np.diag([1.5, 0.8, 0.8]),
+        np.ones(3),
+        "jacobi",
+        Status.DIVERGED,
+        {"exact": FAR},
+    ),
     "refined": (NEAR, np.ones(3), "gmres", Status.DIVERGED, {"exact": FAR}),
     "refined by LU": (NEAR, np.ones(3), "direct", Status.DIVERGED, {"exact": FAR}),
-    "a step diverges": (np.diag([1.0, 3.5]), np.ones(2), "jacobi", Status.DIVERGED, {"exact": np.eye(2)}),
-    "a step is singular": (SINGULAR["a zero row"], None, "direct", Status.BREAKDOWN, {"exact": np.eye(3)}),
+    "a step diverges": (
+        np.diag([1.0, 3.5]),
+        np.ones(2),
+        "jacobi",
+        Status.DIVERGED,
+        {"exact": np.eye(2)},
+    ),
+    "a step is singular": (
+        SINGULAR["a zero row"],
+        None,
+        "direct",
+        Status.BREAKDOWN,
+        {"exact": np.eye(3)},
+    ),
 } | {
     f"{name}, {method}": (S, None, method, Status.BREAKDOWN, {})
     for name, S in SINGULAR.items()
@@ -114,7 +168,8 @@ def test_overflow_is_divergence(device, method, signs):
     S = np.where(np.eye(8) == 1, 1.0, 3e38 * signs * np.ones((8, 8)))
     options = small_blocks(method, 1)  # of two rows and more, blocks are singular in float64
     s = ltcl.solve(as_operator(S, device), np.full(8, 1.9), method, throw=False, **options)
-    # GMRES multiplies S with unit directions only; with signs that cancel, those products stay in float32.
+    # GMRES multiplies S with unit directions only; with signs that cancel, those products stay in
+    # float32.
     assert s.status is Status.DIVERGED or (method == "gmres" and np.ndim(signs))
     assert np.isfinite(s.x).all()
 
@@ -147,7 +202,9 @@ def test_starts_far_off(device, method, size):
 FAILURES = [status for status in Status if status not in (Status.CONVERGED, Status.PRECOMPUTED)]
 
 
-@pytest.mark.parametrize("method", ["jacobi", "richardson", "southwell", "chebyshev", "gmres", "bicgstab"])
+@pytest.mark.parametrize(
+    "method", ["jacobi", "richardson", "southwell", "chebyshev", "gmres", "bicgstab"]
+)
 @pytest.mark.parametrize("status", FAILURES)
 def test_every_failure_says_what_to_try_instead(status, method):
     text = str(Solution(np.zeros(3), status, 3, 4, (1.0, 0.5, 0.7), 0.0, method))

@@ -28,7 +28,9 @@ def dense(M: int = 12, N: int = 12, dtype: str = "float32", seed: int = 1) -> np
     return T.astype(dtype)
 
 
-def sparse(N: int = 12, dtype: str = "float32", seed: int = 1, pattern: int = 1) -> scipy.sparse.csr_array:
+def sparse(
+    N: int = 12, dtype: str = "float32", seed: int = 1, pattern: int = 1
+) -> scipy.sparse.csr_array:
     """(N, N) csr; equal `pattern` gives equal places, `seed` the values."""
     keep = np.random.default_rng(pattern).random((N, N)) < 0.3
     np.fill_diagonal(keep, True)
@@ -62,7 +64,9 @@ def batch(store: BlockStore, T: scipy.sparse.csr_array, block: int) -> scipy.spa
     return scipy.sparse.csr_array(T[:, start:stop].T)
 
 
-def fill(store: BlockStore, *, with_variance=False, final=True, report=lambda c, b: None) -> BlockStore:
+def fill(
+    store: BlockStore, *, with_variance=False, final=True, report=lambda c, b: None
+) -> BlockStore:
     """Every batch of `transport()` that is missing; `report` each."""
     for channel, block in store.missing():
         T = transport(*store.layout.shape, channel)
@@ -83,7 +87,9 @@ def rows(store: BlockStore, channel: int = 0) -> np.ndarray:
 def contents(path: Path) -> dict[str, str]:
     """SHA-256 of every file by its name."""
     files = [file for file in path.rglob("*") if file.is_file()]
-    return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return {
+        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files
+    }
 
 
 def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -> None:
@@ -95,7 +101,9 @@ def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -
         if "response" not in store.extras:
             store.extra("response", np.arange(5.0))
         store.update(finished=True)
-    store.finalize(memory=64 * 40)  # or remove what a process that was killed at the very end has left
+    store.finalize(
+        memory=64 * 40
+    )  # or remove what a process that was killed at the very end has left
 
 
 def in_child(work: Callable[[], None]) -> int:

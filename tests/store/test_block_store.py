@@ -35,14 +35,26 @@ def refused(path: Path, word: str = "") -> None:
 
 
 @settings(deadline=None, max_examples=25)
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 10), st.integers(1, 600), st.sampled_from((1, 3)))
+@given(
+    st.integers(1, 9),
+    st.integers(1, 9),
+    st.integers(1, 10),
+    st.integers(1, 600),
+    st.sampled_from((1, 3)),
+)
 def test_any_shape_in_any_blocks_and_memory(
     tmp_path_factory: pytest.TempPathFactory, M: int, N: int, size: int, memory: int, channels: int
 ) -> None:
     path = tmp_path_factory.mktemp("store") / "T.zarr"
     grids = {"shape": (M, N), "grid": (1, N), "camera_grid": (M, 1)}
-    store = fill(make(path, **grids, block_rows=size, channels=channels), with_variance=True, final=False)
-    assert (store.final, store.missing(), len(store.written)) == (False, [], -(-N // size) * channels)
+    store = fill(
+        make(path, **grids, block_rows=size, channels=channels), with_variance=True, final=False
+    )
+    assert (store.final, store.missing(), len(store.written)) == (
+        False,
+        [],
+        -(-N // size) * channels,
+    )
     store.finalize(memory=memory)
     again = BlockStore.open(path)
     assert (again.final, again.missing()) == (True, [])
@@ -133,7 +145,11 @@ def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
 def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
     store = make(tmp_path / "T.zarr", provenance={"rig": "virtual", "seed": 3})
     types, shapes = ("bool", "uint8", "int64", "float16", "float64"), ((), (0,), (3,), (2, 0, 4))
-    arrays = {f"an.array-{dtype}-{len(shape)}": np.ones(shape, dtype) for dtype in types for shape in shapes}
+    arrays = {
+        f"an.array-{dtype}-{len(shape)}": np.ones(shape, dtype)
+        for dtype in types
+        for shape in shapes
+    }
     for name, array in arrays.items():
         store.extra(name, array)
     store.update(step=4, name="π")
@@ -195,7 +211,11 @@ def test_bad_blocks_are_refused(tmp_path: Path) -> None:
 
 
 def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
-    path, other, record = tmp_path / "T.zarr", tmp_path / "other", ltcl.store.Record((np.eye(6),), (2, 3))
+    path, other, record = (
+        tmp_path / "T.zarr",
+        tmp_path / "other",
+        ltcl.store.Record((np.eye(6),), (2, 3)),
+    )
     fill(make(path))
     with pytest.raises(FileError, match="overwrite=True"):
         make(path)
@@ -286,8 +306,12 @@ def test_a_huge_shape_is_only_a_list_of_missing_blocks(store: BlockStore) -> Non
 
 
 @pytest.mark.parametrize("store", ["final"], indirect=True)
-@pytest.mark.parametrize("change", [{"shape": [1 << 40]}, {"data_type": "O"}, {"codecs": [{"name": "gzip"}]}])
-def test_arrays_that_declare_terabytes_or_hold_no_numbers(store: BlockStore, change: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "change", [{"shape": [1 << 40]}, {"data_type": "O"}, {"codecs": [{"name": "gzip"}]}]
+)
+def test_arrays_that_declare_terabytes_or_hold_no_numbers(
+    store: BlockStore, change: dict[str, Any]
+) -> None:
     file = store.path / "channel_0" / "block_000000.0" / "values" / "zarr.json"
     file.write_text(json.dumps(json.loads(file.read_bytes()) | change))
     sums = contents(store.path)

@@ -13,14 +13,27 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import FileError, InputTypeError, LtclError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, SubsetBasis, Tiles, Wavelet
+from ltcl.operators import (
+    CSR,
+    Compressed,
+    Dense,
+    IdentityPlus,
+    ScaledColumns,
+    SubsetBasis,
+    Tiles,
+    Wavelet,
+)
 from ltcl.store import Parts, formats
 from tests.problems import enclosure, lambertian
 
 random = np.random.default_rng()
 GRID, N = (6, 7), 42
 F = np.linspace(0.3, 0.5, 3 * N).reshape(3, N)
-CORES: dict[str, Any] = {"csr": CSR, "dense": lambda device, C: Dense(device, C.toarray()), "tiles": Tiles}
+CORES: dict[str, Any] = {
+    "csr": CSR,
+    "dense": lambda device, C: Dense(device, C.toarray()),
+    "tiles": Tiles,
+}
 
 
 def system(device: Any, W: Any, core: str, channel: int = 0) -> IdentityPlus:
@@ -40,7 +53,9 @@ def compressed(
 
 
 def ordered(device: Any, basis: str | None) -> Any:
-    W = SubsetBasis(device, GRID, np.arange(N)[::-1], Wavelet(device, GRID, basis, 2) if basis else None)
+    W = SubsetBasis(
+        device, GRID, np.arange(N)[::-1], Wavelet(device, GRID, basis, 2) if basis else None
+    )
     return ltcl.Transport(ScaledColumns(system(device, W, "tiles"), F[0]), GRID, first_bounce=F[0])
 
 
@@ -63,7 +78,9 @@ TRANSPORTS: dict[str, Any] = {
 
 @pytest.mark.parametrize("name", TRANSPORTS)
 @pytest.mark.parametrize("extension", [".npz", ".zarr"])
-def test_the_same_transport_comes_back(device: Any, tmp_path: Path, extension: str, name: str) -> None:
+def test_the_same_transport_comes_back(
+    device: Any, tmp_path: Path, extension: str, name: str
+) -> None:
     C, path = TRANSPORTS[name](device), tmp_path / f"C{extension}"
     ltcl.save(path, C)
     if name == "dark":
@@ -90,7 +107,12 @@ def test_what_is_known_without_a_device(device: Any, tmp_path: Path) -> None:
     ltcl.save(tmp_path / "C.npz", C)
     parts = formats.read(tmp_path / "C.npz")
     assert isinstance(parts, Parts)
-    assert (parts.shape, parts.grid, parts.error, parts.kinds) == ((N, N), GRID, 0.06, ("tiles", "db2"))
+    assert (parts.shape, parts.grid, parts.error, parts.kinds) == (
+        (N, N),
+        GRID,
+        0.06,
+        ("tiles", "db2"),
+    )
     packed = [S.R.core.packed for S in C.systems]
     assert parts.entries == sum(np.count_nonzero(core.codes) for core in packed)
     assert parts.nbytes > sum(core.codes.nbytes + core.columns.nbytes for core in packed)
@@ -105,7 +127,8 @@ def test_what_no_file_holds_is_refused(device: Any, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# Either file of the fixture `saved`: the array that is replaced, or of None left out, and what is refused.
+# Either file of the fixture `saved`: the array that is replaced, or of None left out, and what is
+# refused.
 ALIEN: list[tuple[str, str, Any, str]] = [
     ("C", "grid", None, "'grid'"),
     ("C", "system_0.sign", None, "1 channels, but there are 0 operators"),
@@ -194,7 +217,9 @@ def mutants(array: np.ndarray) -> Any:
 
 
 @pytest.mark.parametrize("core", CORES)
-def test_whatever_arrays_say_there_is_a_transport_or_one_line(device: Any, tmp_path: Path, core: str) -> None:
+def test_whatever_arrays_say_there_is_a_transport_or_one_line(
+    device: Any, tmp_path: Path, core: str
+) -> None:
     """No array is believed: kernels never see an index that is beyond."""
     path, refusals = tmp_path / "C.npz", []
     ltcl.save(path, compressed(device, core=core))

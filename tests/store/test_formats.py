@@ -18,16 +18,25 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import FileError, InputTypeError, LtclError, MemoryLimitError
-from ltcl.noise import Noise
 from ltcl.store import Record, formats
 from ltcl.store.record import Matrix
+from ltcl.transport.noise import Noise
 
 from .stores import dense, sparse
 
 random = np.random.default_rng()
 read: Any = formats.read
 COORDINATE = b"%%MatrixMarket matrix coordinate real general\n"
-NO_NUMBERS = (b"x", b"1.5E", b"5,1", b"1..2", b"1 2", b"1\0", b"+-1", b"nan")  # SciPy reads 1 of 1..2
+NO_NUMBERS = (
+    b"x",
+    b"1.5E",
+    b"5,1",
+    b"1..2",
+    b"1 2",
+    b"1\0",
+    b"+-1",
+    b"nan",
+)  # SciPy reads 1 of 1..2
 ARRAY = b"%%MatrixMarket matrix array real general\n"
 
 
@@ -59,9 +68,13 @@ def refusal(path: Path, kind: type[LtclError]) -> str:
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
-def test_everything_comes_back(tmp_path: Path, extension: str, kind: str, channels: int, dtype: str) -> None:
+def test_everything_comes_back(
+    tmp_path: Path, extension: str, kind: str, channels: int, dtype: str
+) -> None:
     square = kind == "sparse"  # else there is no first bounce
-    T: Any = [sparse(12, dtype, k, k) if square else dense(10, 12, dtype, k) for k in range(channels)]
+    T: Any = [
+        sparse(12, dtype, k, k) if square else dense(10, 12, dtype, k) for k in range(channels)
+    ]
     F = random.uniform(1, 2, (12,) if channels == 1 else (3, 12)) if square else None
     record = Record(
         tuple(T), (3, 4), None if square else (2, 5), F, np.eye(3) + 0.1 if channels == 3 else None
@@ -72,7 +85,9 @@ def test_everything_comes_back(tmp_path: Path, extension: str, kind: str, channe
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
     back = read(path).in_memory()
     if extension == ".mat" and square:  # MATLAB's sparse ones are of float64
-        back = replace(back, matrices=tuple(scipy.sparse.csr_array(T, dtype=dtype) for T in back.matrices))
+        back = replace(
+            back, matrices=tuple(scipy.sparse.csr_array(T, dtype=dtype) for T in back.matrices)
+        )
     same(back, record)
 
 
@@ -81,7 +96,9 @@ def test_npy_keeps_the_matrix_alone(tmp_path: Path, T: Any, caplog: Any) -> None
     with caplog.at_level(logging.WARNING):
         formats.write(tmp_path / "T.npy", Record(T))
         assert not caplog.messages
-        formats.write(tmp_path / "T.mat", replace(Record(T), noise=Noise.uniform(T[0].shape, [0.1] * len(T))))
+        formats.write(
+            tmp_path / "T.mat", replace(Record(T), noise=Noise.uniform(T[0].shape, [0.1] * len(T)))
+        )
         assert "T.mat: .mat does not keep the noise" in caplog.text
         if len(T) == 3:
             formats.write(tmp_path / "T.npy", Record(T, first_bounce=np.ones(12)))
@@ -97,14 +114,18 @@ def test_mtx_keeps_one_matrix_and_the_grids(tmp_path: Path, make: Any, grids: An
     path, T = tmp_path / "T.MTX", tuple(make(seed=k).astype(np.float64) for k in (1, 2, 3))
     formats.write(path, Record(T[:1], *grids))
     same(read(path), Record(T[:1], *grids))
-    np.testing.assert_array_equal(as_dense(scipy.sparse.csr_array(scipy.io.mmread(path))), as_dense(T[0]))
+    np.testing.assert_array_equal(
+        as_dense(scipy.sparse.csr_array(scipy.io.mmread(path))), as_dense(T[0])
+    )
     with pytest.raises(FileError, match=r"three channels"):
         formats.write(path, Record(T, *grids))
 
 
 @pytest.mark.parametrize("kind", ["array", "matrix"])
 @pytest.mark.parametrize("layout", ["csr", "csc", "coo", "bsr", "dia"])
-def test_every_layout_of_scipy_is_read_and_one_is_written(tmp_path: Path, layout: str, kind: str) -> None:
+def test_every_layout_of_scipy_is_read_and_one_is_written(
+    tmp_path: Path, layout: str, kind: str
+) -> None:
     T = getattr(scipy.sparse, f"{layout}_{kind}")(sparse(dtype="float64"))
     scipy.sparse.save_npz(tmp_path / "T.npz", T, compressed=kind == "matrix")
     (result,) = read(tmp_path / "T.npz").matrices
@@ -116,7 +137,16 @@ def test_every_layout_of_scipy_is_read_and_one_is_written(tmp_path: Path, layout
     np.testing.assert_array_equal(loaded.toarray(), T.toarray())
 
 
-_READ = {">f4": "f4", ">f8": "f8", "f2": "f4", "u1": "f4", ">u2": "f4", "i4": "f8", "u8": "f8", "?": "f4"}
+_READ = {
+    ">f4": "f4",
+    ">f8": "f8",
+    "f2": "f4",
+    "u1": "f4",
+    ">u2": "f4",
+    "i4": "f8",
+    "u8": "f8",
+    "?": "f4",
+}
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -141,7 +171,10 @@ def test_types_and_byte_orders(tmp_path: Path, stored: str, expected: str, order
 def test_named_arrays_are_read(tmp_path: Path, arrays: Any) -> None:
     np.savez_compressed(tmp_path / "T.npz", **arrays, grid=[3, 4])
     camera_grid = (2, 6) if "camera_grid" in arrays else None
-    same(read(tmp_path / "T.npz"), Record((dense(),), (3, 4), camera_grid, arrays.get("first_bounce")))
+    same(
+        read(tmp_path / "T.npz"),
+        Record((dense(),), (3, 4), camera_grid, arrays.get("first_bounce")),
+    )
 
 
 VARIABLES = {"a": dense(), "b": 2 * dense(), "grid": np.array([3, 4])}
@@ -157,7 +190,9 @@ def test_any_variable_by_its_name(tmp_path: Path, extension: str) -> None:
         scipy.io.savemat(path, VARIABLES)
     else:
         with h5py.File(path, "w", userblock_size=512) as file:
-            file.update({n: array.T if extension == ".mat" else array for n, array in VARIABLES.items()})
+            file.update(
+                {n: array.T if extension == ".mat" else array for n, array in VARIABLES.items()}
+            )
     for name in ("a", "b"):
         np.testing.assert_array_equal(ltcl.load(path, variable=name).matrices[0], VARIABLES[name])
     text = refusal(path, FileError)
@@ -174,7 +209,13 @@ def test_any_variable_by_its_name(tmp_path: Path, extension: str) -> None:
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize(
     "LTM",
-    [dense(dtype="float64"), dense(), np.eye(12), sparse().tocsc().astype(float), random.random((12, 12, 3))],
+    [
+        dense(dtype="float64"),
+        dense(),
+        np.eye(12),
+        sparse().tocsc().astype(float),
+        random.random((12, 12, 3)),
+    ],
 )
 def test_matlab_5(tmp_path: Path, LTM: Any, compressed: bool) -> None:
     """With other variables, and in colour."""
@@ -191,7 +232,11 @@ def test_sparse_matrices_of_matlab_7_3(tmp_path: Path) -> None:
     with h5py.File(path, "w", userblock_size=512) as file:
         group = file.create_group("LTM")
         group.attrs["MATLAB_sparse"] = np.uint64(12)
-        group["data"], group["ir"], group["jc"] = T.data, T.indices.astype("u8"), T.indptr.astype("u8")
+        group["data"], group["ir"], group["jc"] = (
+            T.data,
+            T.indices.astype("u8"),
+            T.indptr.astype("u8"),
+        )
     np.testing.assert_array_equal(as_dense(read(path).matrices[0]), T.toarray())
 
 
@@ -202,7 +247,9 @@ def test_mtx_of_others(tmp_path: Path, make: Any, symmetry: str, field: str) -> 
     """With other line ends, and with and without the last."""
     path, T = tmp_path / "T.mtx", np.arange(16.0).reshape(4, 4)
     T = {"general": T, "symmetric": T + T.T, "skew-symmetric": T - T.T}[symmetry]
-    scipy.io.mmwrite(path, make(T), symmetry=symmetry, field=field, comment="ltcl knows nothing of me")
+    scipy.io.mmwrite(
+        path, make(T), symmetry=symmetry, field=field, comment="ltcl knows nothing of me"
+    )
     if symmetry == "skew-symmetric":
         assert symmetry in refusal(path, FileError)
         return
@@ -214,7 +261,13 @@ def test_mtx_of_others(tmp_path: Path, make: Any, symmetry: str, field: str) -> 
 
 def parts(**changes: object) -> dict[str, object]:
     """A good (2, 3) matrix in SciPy's layout, with changes."""
-    good = {"format": "csr", "shape": [2, 3], "data": np.ones(3), "indices": [0, 2, 1], "indptr": [0, 2, 3]}
+    good = {
+        "format": "csr",
+        "shape": [2, 3],
+        "data": np.ones(3),
+        "indices": [0, 2, 1],
+        "indptr": [0, 2, 3],
+    }
     return good | changes
 
 
@@ -301,7 +354,9 @@ def test_a_small_archive_cannot_declare_terabytes(tmp_path: Path, claims: tuple[
     assert "TiB" in refusal(tmp_path / "T.npz", FileError)
 
 
-@pytest.mark.parametrize("extension", [".npz", ".mtx", ".h5", "5.mat", ".zarr"])  # .npy stays on the disk
+@pytest.mark.parametrize(
+    "extension", [".npz", ".mtx", ".h5", "5.mat", ".zarr"]
+)  # .npy stays on the disk
 def test_an_honest_giant_is_a_matter_of_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extension: str
 ) -> None:
@@ -345,7 +400,9 @@ REFUSED: list[tuple[str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("extension", "content", "text"), REFUSED)
-def test_what_holds_no_transport_is_refused(tmp_path: Path, extension: str, content: Any, text: str) -> None:
+def test_what_holds_no_transport_is_refused(
+    tmp_path: Path, extension: str, content: Any, text: str
+) -> None:
     path = tmp_path / f"T{extension}"
     path.write_bytes(content) if isinstance(content, bytes) else np.savez(path, **content)
     assert text in refusal(path, FileError)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A process that ends at any moment loses nothing that was committed, and going on gives the same store.
 
-It ends by SIGKILL or by Ctrl-C at a line of ltcl's code, or is killed from outside at a random time.
-LTCL_KILLS=N in the environment takes N moments of each kind, and 0 every line.
+It ends by SIGKILL or by Ctrl-C at a line of ltcl's code, or is killed from outside at a random
+time. LTCL_KILLS=N in the environment takes N moments of each kind, and 0 every line.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ MOMENTS = int(os.environ.get("LTCL_KILLS", "8"))
 ENDS = {"SIGKILL": (stores.kill, -signal.SIGKILL), "Ctrl-C": (stores.interrupt, 2)}
 
 
-def end_at_lines(folder: Path, prepare: Callable[[Path], object], work: Any, end: str) -> Iterator[Any]:
+def end_at_lines(
+    folder: Path, prepare: Callable[[Path], object], work: Any, end: str
+) -> Iterator[Any]:
     """Folder of a store whose `work` (path, report) ended at a line, and the blocks it reported."""
     act, status = ENDS[end]
     prepare(folder / "count" / "T.zarr")
@@ -77,7 +79,9 @@ def check_committed(path: Path, reported: set[tuple[int, int]]) -> None:
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_an_acquisition_that_ends_at_any_line(tmp_path: Path, finished: dict[str, str], end: str) -> None:
+def test_an_acquisition_that_ends_at_any_line(
+    tmp_path: Path, finished: dict[str, str], end: str
+) -> None:
     for path, reported in end_at_lines(tmp_path, lambda path: None, stores.acquire, end):
         if path.exists():
             check_committed(path, reported)
@@ -114,7 +118,9 @@ REPLACING: dict[str, Callable[..., object]] = {
 
 @pytest.mark.parametrize("end", ENDS)
 @pytest.mark.parametrize("name", REPLACING)
-def test_one_store_is_there_at_every_line_of_replacing_it(tmp_path: Path, name: str, end: str) -> None:
+def test_one_store_is_there_at_every_line_of_replacing_it(
+    tmp_path: Path, name: str, end: str
+) -> None:
     """The old one or the new one, whole."""
     good = stores.fill(stores.make(tmp_path / "good.zarr", shape=(12, 12), camera_grid=None)).path
     prepare = functools.partial(shutil.copytree, good)
@@ -157,7 +163,9 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, name: str) -> None:
     store = stores.fill(stores.make(tmp_path / "T.zarr"), final=False)
     before, works = stores.batch(store, stores.transport(), 1), itertools.repeat(mock.DEFAULT)
     for failing in range(60):
-        calls = itertools.chain([mock.DEFAULT] * failing, [OSError(28, "No space left on device")], works)
+        calls = itertools.chain(
+            [mock.DEFAULT] * failing, [OSError(28, "No space left on device")], works
+        )
         with mock.patch.object(os, name, wraps=getattr(os, name), side_effect=calls):
             try:
                 store.write(0, 1, 2 * before)

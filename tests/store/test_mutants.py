@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Damaged files of every format: no crash, no error of a library, no memory for what is only declared.
 
-LTCL_MUTANTS=4000 in the environment tries as many; by default it is a tenth. They are read in a process of
-its own, ``python -m tests.store.test_mutants FOLDER COUNT``: each file (of a store, one of its files) in turn
-has bits flipped, is cut, gets bytes appended, or has bytes of its head replaced.
+LTCL_MUTANTS=4000 in the environment tries as many; by default it is a tenth. They are read in a
+process of its own, ``python -m tests.store.test_mutants FOLDER COUNT``: each file (of a store, one
+of its files) in turn has bits flipped, is cut, gets bytes appended, or has bytes of its head
+replaced.
 """
 
 from __future__ import annotations
@@ -87,13 +88,19 @@ def write_samples(folder: Path, device: Device) -> None:
     for extension in (".npz", ".npy", ".mtx", ".h5", ".mat", ".zarr"):
         formats.write(folder / f"dense{extension}", Record((dense(),), grid))
         if extension != ".npy":
-            formats.write(folder / f"sparse{extension}", Record((sparse(),), grid, first_bounce=np.ones(12)))
+            formats.write(
+                folder / f"sparse{extension}", Record((sparse(),), grid, first_bounce=np.ones(12))
+            )
     formats.write(folder / "rgb.npz", Record(rgb, grid, mixing=np.eye(3)))
     np.savez_compressed(folder / "deflated.npz", T=dense(), grid=grid)
     for layout in ("csc", "coo", "bsr", "dia"):
-        scipy.sparse.save_npz(folder / f"{layout}.npz", getattr(scipy.sparse, f"{layout}_array")(sparse()))
+        scipy.sparse.save_npz(
+            folder / f"{layout}.npz", getattr(scipy.sparse, f"{layout}_array")(sparse())
+        )
     for name, LTM in (("full.mat", dense()), ("deflated.mat", sparse().astype(float))):
-        scipy.io.savemat(folder / name, {"LTM": LTM, "note": "text"}, do_compression=name == "deflated.mat")
+        scipy.io.savemat(
+            folder / name, {"LTM": LTM, "note": "text"}, do_compression=name == "deflated.mat"
+        )
     with h5py.File(folder / "7.3.mat", "w", userblock_size=512) as file:
         file["LTM"] = dense()
     scipy.io.mmwrite(folder / "symmetric.mtx", sparse() + sparse().T, symmetry="symmetric")
@@ -111,7 +118,9 @@ def test_damaged_files_of_every_format(tmp_path: Path, device: Device) -> None:
     assert done.returncode == 0, done.stderr[-2000:]  # a crash ends with a negative one
     outcome = json.loads(done.stdout)
     assert outcome["raw"] == []
-    assert 0.5 * COUNT < outcome["refused"] < 0.95 * COUNT  # other numbers in .mtx or HDF5 are as valid
+    assert (
+        0.5 * COUNT < outcome["refused"] < 0.95 * COUNT
+    )  # other numbers in .mtx or HDF5 are as valid
     assert outcome["grown"] < 64 << 20
 
 

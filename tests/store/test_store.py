@@ -10,7 +10,7 @@ import scipy.sparse
 from ltcl import store
 from ltcl.errors import FileError, InputTypeError
 from ltcl.store import formats
-from ltcl.transport import Transport
+from ltcl.transport.transport import Transport
 from tests.store.stores import dense
 
 COLOUR = [dense(seed=seed) for seed in range(3)]
@@ -70,14 +70,22 @@ def test_first_bounce_is_the_callers_then_the_files_then_the_diagonal(tmp_path):
         ("T", "diagonal", diagonal),
         ("plain", None, diagonal),
     ):
-        assert store.load(tmp_path / f"{name}.npz", first_bounce=F).first_bounce.tolist() == expected
+        assert (
+            store.load(tmp_path / f"{name}.npz", first_bounce=F).first_bounce.tolist() == expected
+        )
 
 
 def test_what_cannot_be_saved(tmp_path):
     operator = scipy.sparse.linalg.aslinearoperator(dense())
     for T, text in (
-        (Transport(operator, grid=(3, 4), first_bounce=np.ones(12)), "only arrays, sparse matrices"),
-        (Transport([[dense(seed=c + d) for d in range(3)] for c in range(3)], grid=(3, 4)), "3 x 3 blocks"),
+        (
+            Transport(operator, grid=(3, 4), first_bounce=np.ones(12)),
+            "only arrays, sparse matrices",
+        ),
+        (
+            Transport([[dense(seed=c + d) for d in range(3)] for c in range(3)], grid=(3, 4)),
+            "3 x 3 blocks",
+        ),
         (dense(), "T is a ndarray"),
     ):
         with pytest.raises(InputTypeError, match=text):
@@ -90,7 +98,9 @@ def test_paths_that_lead_nowhere(tmp_path):
     (tmp_path / "folder.npz").mkdir()
     T = Transport(dense(), grid=(3, 4))
     for name in ("none.npz", "empty.npz", "folder.npz", r"T.xyz", "T"):
-        with pytest.raises(FileError, match=f"{name}: .*(no such|empty|folder|xyz|has no extension)"):
+        with pytest.raises(
+            FileError, match=f"{name}: .*(no such|empty|folder|xyz|has no extension)"
+        ):
             store.load(tmp_path / name)
     for work in (store.load, store.BlockStore.open, lambda path: store.save(path, T)):
         for path, text in (("a\0b.zarr", r"a\\x00b\.zarr"), ("", "path is ''"), (3, "path is 3")):
@@ -105,6 +115,8 @@ def test_a_store_whose_every_entry_is_known_is_dense_elsewhere(tmp_path):
     T = np.random.default_rng(0).uniform(0.1, 0.2, (3, 6, 6)) + np.eye(6)
     store.save(tmp_path / "T.zarr", Transport(T, (2, 3)))
     exact = store.load(tmp_path / "T.zarr", first_bounce="exact")
-    np.testing.assert_allclose(exact.first_bounce, [1 / np.diag(np.linalg.inv(M)) for M in T], rtol=1e-6)
+    np.testing.assert_allclose(
+        exact.first_bounce, [1 / np.diag(np.linalg.inv(M)) for M in T], rtol=1e-6
+    )
     formats.write(tmp_path / "T.npy", formats.read(tmp_path / "T.zarr"))
     np.testing.assert_array_equal(np.load(tmp_path / "T.npy"), T)

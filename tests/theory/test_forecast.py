@@ -76,14 +76,16 @@ def test_sweeps_beyond_those_tried_go_on_at_their_rate(device, monkeypatch):
     ],
 )
 def test_sweeps_that_diverge_or_break_down_are_foreseen(S, products, certificate):
-    found = theory.gauss_seidel_forecast(Host(ltcl.open_device(), aslinearoperator(np.array(S))), 1e-2)
+    found = theory.gauss_seidel_forecast(
+        Host(ltcl.open_device(), aslinearoperator(np.array(S))), 1e-2
+    )
     assert found.products == pytest.approx(products, nan_ok=True)
     assert found.certificate == certificate
 
 
 @pytest.mark.parametrize("albedo", [0.45, 0.51, 0.8])
 def test_what_is_foreseen_and_what_nothing_foretells(device, albedo):
-    """Gauss-Seidel converges where Jacobi does not; Krylov methods need a spectrum, cg a self-adjoint S."""
+    """Gauss-Seidel converges where Jacobi does not; Krylov methods need a spectrum, cg a self- adjoint S."""
     S = IdentityPlus(Dense(device, enclosure(40, albedo).R))
     known = S, theory.spectral_radius(S.R, norms=S.R.norms()), theory.free_bounds(S)
     found = theory.forecasts(*known, 1e-2)

@@ -24,7 +24,9 @@ def with_values(values: np.ndarray, seed: int) -> np.ndarray:
 SPECTRA = {
     "one far above the rest": lambda n: np.r_[1e4, np.ones(n - 1)],
     "one hardly above the rest": lambda n: np.r_[1.05, np.ones(n - 1)],
-    "cluster at the top": lambda n: np.r_[1 + 1e-5 * np.arange(n // 2), np.linspace(0, 0.9, n - n // 2)],
+    "cluster at the top": lambda n: np.r_[
+        1 + 1e-5 * np.arange(n // 2), np.linspace(0, 0.9, n - n // 2)
+    ],
     "evenly spread": lambda n: np.linspace(0, 1, n),
     "fast decay": lambda n: 0.5 ** np.arange(n),
     "crowded below the top": lambda n: 1 - np.linspace(0, 1, n) ** 2,
@@ -35,7 +37,12 @@ SPECTRA = {
 
 @pytest.mark.parametrize("spectrum", SPECTRA)
 @settings(max_examples=12, deadline=None)
-@given(n=st.integers(2, 150), seed=st.integers(0, 2**16), steps=st.integers(1, 20), starts=st.integers(1, 8))
+@given(
+    n=st.integers(2, 150),
+    seed=st.integers(0, 2**16),
+    steps=st.integers(1, 20),
+    starts=st.integers(1, 8),
+)
 def test_the_bound_is_never_below_the_norm(device, spectrum, n, seed, steps, starts):
     values = SPECTRA[spectrum](n)
     A = Dense(device, with_values(values, seed))
@@ -57,7 +64,9 @@ def test_the_bound_fails_as_often_as_it_may(device):
     """One step of one start and even odds: the bound is sharp where one value stands alone."""
     n, runs = 40, 400
     A = Dense(device, np.diag(np.r_[1.0, np.zeros(n - 1) + 1e-3]))
-    found = [theory.two_norm(A, confidence=0.5, starts=1, maxsteps=1, seed=seed) for seed in range(runs)]
+    found = [
+        theory.two_norm(A, confidence=0.5, starts=1, maxsteps=1, seed=seed) for seed in range(runs)
+    ]
     failed = sum(norm.upper < 1.0 for norm in found)
     assert failed <= runs / 2 + 4 * np.sqrt(runs) / 2
 

@@ -28,7 +28,9 @@ def test_bounces_2_to_n_cancel_and_the_rest_has_a_closed_form(n, bounces):
     assert found[:2] == (1, -1 if n else 0)[: bounces + 1]
     assert not any(found[2 : n + 1])
     beyond = range(max(2, n + 1), bounces + 1)
-    assert [found[j] for j in beyond] == [(-1) ** n * comb(j - 2, n - 1) if n else 0 for j in beyond]
+    assert [found[j] for j in beyond] == [
+        (-1) ** n * comb(j - 2, n - 1) if n else 0 for j in beyond
+    ]
 
 
 @pytest.mark.parametrize("m", [0.1, 0.3, 0.45, 0.49])
@@ -42,7 +44,8 @@ def test_errors_in_a_closed_box_stay_below_the_bounds_with_the_same_slope(m):
         for norm in (2, np.inf):
             forward.append(np.linalg.norm(box.S - partial, norm) / theory.forward_error_bound(m, n))
             inverse.append(
-                np.linalg.norm(exact - inverse_series(box.R, n), norm) / theory.inverse_error_bound(m, n)
+                np.linalg.norm(exact - inverse_series(box.R, n), norm)
+                / theory.inverse_error_bound(m, n)
             )
     np.testing.assert_allclose(forward, 1.0, rtol=1e-6)
     assert max(inverse) <= 1.0

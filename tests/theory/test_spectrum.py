@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ltcl import theory
-from ltcl.diagnostics import reciprocity_defect
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense, IdentityPlus, as_operator
+from ltcl.transport.diagnostics import reciprocity_defect
 from tests.problems import enclosure, lambertian
 
 random = np.random.default_rng(40)
@@ -43,7 +43,9 @@ def test_a_closed_room_has_the_radius_of_eq_14_at_once(device, m):
     assert found.products < 20
 
 
-@pytest.mark.parametrize("R", [np.zeros((5, 5)), np.triu(np.ones((5, 5)), 1)], ids=["zero", "nilpotent"])
+@pytest.mark.parametrize(
+    "R", [np.zeros((5, 5)), np.triu(np.ones((5, 5)), 1)], ids=["zero", "nilpotent"]
+)
 def test_light_that_never_returns_has_radius_zero(device, R):
     found = theory.spectral_radius(as_operator(R, device))
     assert (found.value, found.albedo) == (0.0, 0.0)
@@ -51,11 +53,19 @@ def test_light_that_never_returns_has_radius_zero(device, R):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0.01, 50.0), st.floats(0.05, 1.0), st.integers(2, 30), st.booleans())
+@given(
+    st.integers(0, 10_000),
+    st.floats(0.01, 50.0),
+    st.floats(0.05, 1.0),
+    st.integers(2, 30),
+    st.booleans(),
+)
 def test_free_bounds_hold_the_spectrum_of_any_diffuse_scene(device, seed, rho, density, n, forward):
     scene = lambertian(n, rho, seed, density)
     spectrum = np.linalg.eigvals(np.eye(n) - scene.A if forward else scene.S)
-    assert np.abs(spectrum.imag).max() < 1e-6 * (1 + rho)  # self-adjoint in the area / albedo product
+    assert np.abs(spectrum.imag).max() < 1e-6 * (
+        1 + rho
+    )  # self-adjoint in the area / albedo product
     R = CSR(device, scipy.sparse.csr_array(scene.A)) if forward else Dense(device, scene.R)
     lower, upper = theory.free_bounds(IdentityPlus(R, -1 if forward else 1))
     room = 1e-5 * (1 + rho)
@@ -67,13 +77,23 @@ def test_free_bounds_hold_the_spectrum_of_any_diffuse_scene(device, seed, rho, d
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0.01, 50.0), st.floats(0.0, 1.0), st.integers(1, 30), st.booleans())
-def test_collatz_and_wielandt_hold_rho_of_any_nonnegative_matrix(device, seed, scale, density, n, directed):
+@given(
+    st.integers(0, 10_000),
+    st.floats(0.01, 50.0),
+    st.floats(0.0, 1.0),
+    st.integers(1, 30),
+    st.booleans(),
+)
+def test_collatz_and_wielandt_hold_rho_of_any_nonnegative_matrix(
+    device, seed, scale, density, n, directed
+):
     """Reducible, nilpotent and periodic ones included; eigenvalues of those are good to eps^(1/n) only."""
     rng = np.random.default_rng(seed)
     R = (scale * rng.random((n, n)) * (rng.random((n, n)) < density)).astype(np.float32)
     R = np.tril(R) if directed else R
-    wanted = float(R.diagonal().max() if directed else np.abs(np.linalg.eigvals(np.float64(R))).max())
+    wanted = float(
+        R.diagonal().max() if directed else np.abs(np.linalg.eigvals(np.float64(R))).max()
+    )
     operator = Dense(device, R)
     found = theory.spectral_radius(operator, norms=operator.norms())
     assert found.certificate == "collatz-wielandt"
@@ -90,7 +110,9 @@ DARK = lambertian(30, 0.8).R
 DARK[[3, 7]] = 0.0  # which must not loosen the lower bound
 
 
-@pytest.mark.parametrize("R", [np.array([[0.8]]), lambertian(10, 0.8).R, lambertian(300, 0.8).R, WALLS, DARK])
+@pytest.mark.parametrize(
+    "R", [np.array([[0.8]]), lambertian(10, 0.8).R, lambertian(300, 0.8).R, WALLS, DARK]
+)
 @pytest.mark.parametrize("form", [Dense, CSR])
 def test_the_bounds_close_on_rho(device, form, R):
     rho = np.abs(np.linalg.eigvals(R)).max()

@@ -19,7 +19,8 @@ def question(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str | byt
         return json.dumps(header)
     kinds = {name: f"{array.dtype.kind}{array.dtype.itemsize}" for name, array in arrays.items()}
     entries = [
-        {"name": name, "shape": list(array.shape), "dtype": kinds[name]} for name, array in arrays.items()
+        {"name": name, "shape": list(array.shape), "dtype": kinds[name]}
+        for name, array in arrays.items()
     ]
     text = json.dumps({**header, "arrays": entries}).encode()
     text += b" " * (-len(text) % 4)

@@ -19,17 +19,22 @@ import ltcl
 from ltcl.acquisition import FolderRig
 from ltcl.images import to_srgb
 from ltcl.images.pictures import to_linear
+from ltcl.show.window import Window
 from ltcl.viewer import server
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.server import Viewer
-from ltcl.viewer.window import Window
 
 pytest.importorskip("playwright", reason='playwright is not installed: pip install "ltcl[test]"')
 
 from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
 FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-FLAGS += ["--disable-component-update", "--disable-sync", "--disable-gpu", "--enable-unsafe-swiftshader"]
+FLAGS += [
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+]
 PATIENCE = 20.0  # seconds
 VIEWS = ("probe", "bounces", "relight", "compensate")
 ALBEDO = (0.8, 0.5, 0.3)
@@ -37,7 +42,11 @@ ALBEDO = (0.8, 0.5, 0.3)
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    chromium = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if chromium is None:
         pytest.skip("Chromium is not installed (Debian: apt install chromium)")
     with sync_playwright() as playwright:
@@ -72,7 +81,10 @@ def page(browser: Browser, viewer: Any) -> Iterator[Page]:
     with browser.new_context(viewport={"width": 1280, "height": 800}) as context:
         page, wrong = context.new_page(), []
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+        page.on(
+            "console",
+            lambda message: wrong.append(message.text) if message.type == "error" else None,
+        )
         visit(page, viewer, "probe")
         yield page
         assert [text for text in wrong if "400 (Bad Request)" not in text] == []  # a refused upload
@@ -96,7 +108,9 @@ def pixels(page: Page, name: str) -> tuple[np.ndarray, float]:
     return np.array(codes, np.float64).reshape(shape)[..., :3], white
 
 
-def shows(page: Page, name: str, light: np.ndarray, *, logarithmic: bool = False, atol: float = 1.01) -> None:
+def shows(
+    page: Page, name: str, light: np.ndarray, *, logarithmic: bool = False, atol: float = 1.01
+) -> None:
     """Wait until a canvas has these pixels, to `atol` codes; fail with the difference."""
     light = np.broadcast_to(light if light.ndim == 3 else light[..., None], (*light.shape[:2], 3))
     deadline, codes, expected = time.monotonic() + PATIENCE, np.inf, np.zeros(1)
@@ -122,7 +136,9 @@ def at(page: Page, name: str, row: int, col: int, grid: tuple[int, int]) -> tupl
     """The middle of a pixel of a canvas, on the page."""
     box = canvas(page, name).bounding_box()
     assert box is not None
-    return box["x"] + (col + 0.5) / grid[1] * box["width"], box["y"] + (row + 0.5) / grid[0] * box["height"]
+    return box["x"] + (col + 0.5) / grid[1] * box["width"], box["y"] + (row + 0.5) / grid[0] * box[
+        "height"
+    ]
 
 
 def unit(grid: tuple[int, int], row: int, col: int) -> np.ndarray:
@@ -194,7 +210,9 @@ def test_display_by_keys_and_clicks(page: Page, T: ltcl.Transport) -> None:
     assert (heat[brightest] == heat.reshape(-1, 3).max(axis=0)).all()
 
 
-def test_zoom_by_wheel_and_buttons_keeps_pixels_under_the_pointer(page: Page, T: ltcl.Transport) -> None:
+def test_zoom_by_wheel_and_buttons_keeps_pixels_under_the_pointer(
+    page: Page, T: ltcl.Transport
+) -> None:
     box = canvas(page, "probe-projector").bounding_box()
     assert box is not None
     x, y = at(page, "probe-projector", 1, 2, T.grid)
@@ -232,7 +250,9 @@ def test_bounces_are_mixed_by_sliders(page: Page, T: ltcl.Transport, picture: np
     shows(page, "bounces-mix", T @ np.ones(T.grid, np.float32))
 
 
-def test_film_builds_the_picture_bounce_by_bounce(page: Page, T: ltcl.Transport, picture: np.ndarray) -> None:
+def test_film_builds_the_picture_bounce_by_bounce(
+    page: Page, T: ltcl.Transport, picture: np.ndarray
+) -> None:
     page.emulate_media(reduced_motion="reduce")
     page.locator("#tab-bounces").click()
     page.wait_for_selector("#bounces-5")
@@ -244,9 +264,13 @@ def test_film_builds_the_picture_bounce_by_bounce(page: Page, T: ltcl.Transport,
     shows(page, "bounces-mix", picture)
 
 
-def test_uncertainty_is_an_overlay(browser: Browser, corner: ltcl.scenes.Scene, picture: np.ndarray) -> None:
+def test_uncertainty_is_an_overlay(
+    browser: Browser, corner: ltcl.scenes.Scene, picture: np.ndarray
+) -> None:
     random, clean = np.random.default_rng(5), corner.transport()
-    noisy = [np.asarray(matrix) + 2e-3 * random.standard_normal(clean.shape) for matrix in clean.matrices]
+    noisy = [
+        np.asarray(matrix) + 2e-3 * random.standard_normal(clean.shape) for matrix in clean.matrices
+    ]
     T = ltcl.Transport([matrix.astype(np.float32) for matrix in noisy], grid=corner.grid)
     b = ltcl.separate(T, picture, 1)
     with browser.new_context() as context, ltcl.view(T, picture, open_browser=False) as viewer:
@@ -279,7 +303,9 @@ def test_painting_relights(page: Page, T: ltcl.Transport) -> None:
     page.mouse.move(*at(page, "relight-pattern", 1, 6, T.grid), steps=8)
     page.mouse.up()
     light = painted(page)
-    assert light[1, 3] == pytest.approx(to_linear(np.array([255, 128, 0], np.uint8), "auto"), abs=0.02)
+    assert light[1, 3] == pytest.approx(
+        to_linear(np.array([255, 128, 0], np.uint8), "auto"), abs=0.02
+    )
     assert not light[4:].any()
     shows(page, "relight-seen", T @ light)
     page.locator("#relight-eraser").click()
@@ -359,7 +385,11 @@ class Late:
     """The first answer of a kind comes when `come` is set; `asked` is set when it has been computed."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, viewer: Any, do: str) -> None:
-        self.come, self.asked, self._answer = threading.Event(), threading.Event(), viewer._scene.answer
+        self.come, self.asked, self._answer = (
+            threading.Event(),
+            threading.Event(),
+            viewer._scene.answer,
+        )
         self._do = do
         monkeypatch.setattr(viewer._scene, "answer", self)
 
@@ -517,10 +547,14 @@ def test_projector_window_shows_what_is_painted(page: Page, T: ltcl.Transport) -
     assert box is not None
     h, w = T.grid
     assert box["width"] / w == box["height"] / h == int(box["width"] / w)  # whole pixels
-    assert window.locator("#show").evaluate("c => getComputedStyle(c).imageRendering") == "pixelated"
+    assert (
+        window.locator("#show").evaluate("c => getComputedStyle(c).imageRendering") == "pixelated"
+    )
 
 
-def test_reload_and_resize_keep_the_view(page: Page, T: ltcl.Transport, picture: np.ndarray) -> None:
+def test_reload_and_resize_keep_the_view(
+    page: Page, T: ltcl.Transport, picture: np.ndarray
+) -> None:
     page.locator("#tab-bounces").click()
     shows(page, "bounces-mix", picture)
     page.reload()
@@ -589,7 +623,9 @@ def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
             return [...c.getContext("2d").getImageData(0, 0, c.width, c.height).data]; }"""
         )
         np.testing.assert_array_equal(np.reshape(shown, (*codes.shape, 4))[..., 1], codes)
-        assert str(page.locator("#scan-histogram polyline").get_attribute("points")).count(",") == 32
+        assert (
+            str(page.locator("#scan-histogram polyline").get_attribute("points")).count(",") == 32
+        )
         assert page.locator("#scan-warnings li").count() == 0
         second.write_bytes(b"no picture")
         page.locator("#scan-warnings li").get_by_text("photograph 2").wait_for()
@@ -608,7 +644,9 @@ def test_projector_window_shows_patterns_next_by_key(page: Page) -> None:
             """() => { const c = document.getElementById("show");
             return [...c.getContext("2d").getImageData(0, 0, c.width, c.height).data]; }"""
         )
-        np.testing.assert_array_equal(np.reshape(found, (4, 6, 4))[..., 0], np.rint(255 * patterns[-1]))
+        np.testing.assert_array_equal(
+            np.reshape(found, (4, 6, 4))[..., 0], np.rint(255 * patterns[-1])
+        )
         assert not window.key_pressed()
         for key in ("Space", "ArrowRight", "PageDown"):
             page.keyboard.press(key)
@@ -633,7 +671,9 @@ def test_two_pages_at_once(page: Page, viewer: Any, T: ltcl.Transport) -> None:
 
 def test_rectangular_transport_has_no_bounces(browser: Browser) -> None:
     random = np.random.default_rng(3)
-    T = ltcl.Transport(random.random((5 * 8, 4 * 6), dtype=np.float32), grid=(4, 6), camera_grid=(5, 8))
+    T = ltcl.Transport(
+        random.random((5 * 8, 4 * 6), dtype=np.float32), grid=(4, 6), camera_grid=(5, 8)
+    )
     picture = (T @ np.full(T.grid, 0.5, np.float32)).astype(np.float32)
     with browser.new_context() as context, ltcl.view(T, picture, open_browser=False) as viewer:
         page = context.new_page()
@@ -666,7 +706,9 @@ def test_bad_file_is_refused_in_words(page: Page, tmp_path: Path) -> None:
     page.wait_for_selector("#compensate-more:not([hidden])")
     (tmp_path / "broken.png").write_bytes(b"no picture")
     page.locator("#compensate-file").set_input_files(tmp_path / "broken.png")
-    page.get_by_text("broken.png: is truncated, damaged or no picture: cannot identify image file").wait_for()
+    page.get_by_text(
+        "broken.png: is truncated, damaged or no picture: cannot identify image file"
+    ).wait_for()
 
 
 def test_tabs_by_keys(page: Page) -> None:
@@ -686,7 +728,9 @@ def test_phone(browser: Browser, viewer: Any) -> None:
             visit(page, viewer, view)
             assert page.evaluate("document.documentElement.scrollWidth") == 360
         visit(page, viewer, "probe")
-        over, under = (canvas(page, name).bounding_box() for name in ("probe-projector", "probe-camera"))
+        over, under = (
+            canvas(page, name).bounding_box() for name in ("probe-projector", "probe-camera")
+        )
         assert over is not None
         assert under is not None
         assert over["width"] > 320
@@ -696,17 +740,23 @@ def test_phone(browser: Browser, viewer: Any) -> None:
 
 
 @pytest.mark.parametrize("width", [1280, 360])
-def test_nothing_serious_stands_in_the_way_of_access(browser: Browser, viewer: Any, width: int) -> None:
+def test_nothing_serious_stands_in_the_way_of_access(
+    browser: Browser, viewer: Any, width: int
+) -> None:
     axe = pytest.importorskip(
         "axe_playwright_python.sync_playwright", reason='pip install "ltcl[test]"'
     ).Axe()
-    with browser.new_context(viewport={"width": width, "height": 800}, reduced_motion="reduce") as context:
+    with browser.new_context(
+        viewport={"width": width, "height": 800}, reduced_motion="reduce"
+    ) as context:
         page = context.new_page()
         for view in VIEWS:
             visit(page, viewer, view)
             page.wait_for_selector("body[data-state=ready]")
             found = axe.run(page).response["violations"]
-            assert [each["id"] for each in found if each["impact"] in ("serious", "critical")] == [], view
+            assert [
+                each["id"] for each in found if each["impact"] in ("serious", "critical")
+            ] == [], view
         page.goto(f"{viewer.url}projector")
         page.wait_for_selector("body[data-state=ready]")
         found = axe.run(page).response["violations"]

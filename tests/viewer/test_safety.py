@@ -54,8 +54,12 @@ class Running:
                 received += part
         return received
 
-    def request(self, path: str, host: str | None = None, more: str = "", method: str = "GET") -> bytes:
-        lines = f"{method} {path} HTTP/1.1\r\nHost: {self.host if host is None else host}\r\n{more}\r\n"
+    def request(
+        self, path: str, host: str | None = None, more: str = "", method: str = "GET"
+    ) -> bytes:
+        lines = (
+            f"{method} {path} HTTP/1.1\r\nHost: {self.host if host is None else host}\r\n{more}\r\n"
+        )
         return self.raw(lines.encode("latin-1"))
 
 
@@ -127,7 +131,13 @@ def test_ways_out_of_the_table_of_files(running):
         "%",
         "*",
     ]
-    paths += ["result/", "result/../T.npz", "result/x.exr", "result/report.json/..", "result/%2e%2e/T.npz"]
+    paths += [
+        "result/",
+        "result/../T.npz",
+        "result/x.exr",
+        "result/report.json/..",
+        "result/%2e%2e/T.npz",
+    ]
     paths += [
         "a" * 5000,
         "%00",
@@ -177,7 +187,11 @@ def test_wrong_tokens_hosts_and_origins(running):
         f"[::ffff:127.0.0.1]:{running.port}",
         f"0.0.0.0:{running.port}",
     ]
-    names += [f"127.0.0.2:{running.port}", f"2130706433:{running.port}", f"localhost.evil:{running.port}"]
+    names += [
+        f"127.0.0.2:{running.port}",
+        f"2130706433:{running.port}",
+        f"localhost.evil:{running.port}",
+    ]
     origins = [
         "null",
         "",
@@ -201,7 +215,10 @@ def test_wrong_tokens_hosts_and_origins(running):
             response = running.request(path + end, name, f"Origin: {origin}\r\n{more}", method)
             assert status(response) in (400, 403), (path, name, origin, end, response)
             assert token.encode() not in response
-    for end, method, more in (("picture", "POST", "Content-Length: 0\r\n"), ("socket", "GET", UPGRADE)):
+    for end, method, more in (
+        ("picture", "POST", "Content-Length: 0\r\n"),
+        ("socket", "GET", UPGRADE),
+    ):
         assert (
             status(running.request(f"/{token}/{end}", more=more, method=method)) == 403
         )  # without an origin
@@ -216,7 +233,10 @@ def test_wrong_methods_and_what_is_no_request(running):
         for path in (page, page + "index.html", page + "result/report.json"):
             assert status(running.request(path, more=origin, method=method)) in (400, 404), method
     for method in ("GET", "PUT", "DELETE", "HEAD"):
-        assert status(running.request(page + "picture", more=origin, method=method)) in (400, 404), method
+        assert status(running.request(page + "picture", more=origin, method=method)) in (
+            400,
+            404,
+        ), method
     line = f"GET {page} HTTP/1.1\r\n".encode()
     garbage = [
         b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
@@ -244,16 +264,22 @@ def png(w: int, h: int) -> bytes:
     """A PNG of a few bytes that says it has w x h pixels."""
 
     def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
 
     header = struct.pack(">IIBBBBB", w, h, 8, 2, 0, 0, 0)
     body = zlib.compress(bytes(1000))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    )
 
 
 def test_uploads(running):
     origin = f"Origin: http://{running.host}\r\n"
-    bmp = b"BM" + struct.pack("<IHHIIiiHHIIiiII", 200, 0, 0, 54, 40, 60_000, 60_000, 1, 24, 0, 0, 0, 0, 0, 0)
+    bmp = b"BM" + struct.pack(
+        "<IHHIIiiHHIIiiII", 200, 0, 0, 54, 40, 60_000, 60_000, 1, 24, 0, 0, 0, 0, 0, 0
+    )
     files = {
         "a.png": png(100_000, 100_000),
         "b.png": png(8001, 8000),
@@ -283,16 +309,24 @@ def test_uploads(running):
     contents = [*files.items(), *((name, png(1, 1)) for name in names)]
     for name, content in contents:
         more = f"{origin}Content-Length: {len(content)}\r\n\r\n"
-        head = f"POST /{running.token}/picture?name={name} HTTP/1.1\r\nHost: {running.host}\r\n{more}"
+        head = (
+            f"POST /{running.token}/picture?name={name} HTTP/1.1\r\nHost: {running.host}\r\n{more}"
+        )
         response = running.raw(head.encode() + content)
         assert status(response) == 400, (name, response)
     for length in (str((64 << 20) + 1), "9" * 30, "-1", "x", "1, 2", "", "0x10"):
         more = f"{origin}Content-Length: {length}\r\n"
         assert (
-            status(running.request(f"/{running.token}/picture?name=a.png", more=more, method="POST")) == 400
+            status(
+                running.request(f"/{running.token}/picture?name=a.png", more=more, method="POST")
+            )
+            == 400
         )
     chunked = f"{origin}Transfer-Encoding: chunked\r\n"
-    assert status(running.request(f"/{running.token}/picture?name=a.png", more=chunked, method="POST")) == 400
+    assert (
+        status(running.request(f"/{running.token}/picture?name=a.png", more=chunked, method="POST"))
+        == 400
+    )
 
 
 def frames() -> list[str | bytes]:
@@ -342,12 +376,23 @@ def frames() -> list[str | bytes]:
     entry = {"name": "pattern", "shape": [4, 8, 1], "dtype": "u1"}
     wrong = [
         {"shape": shape}
-        for shape in ([4, 8], [4, 8, 1, 1], [-4, -8, 1], [4, 8, 1e0], [1 << 30, 8, 1], "481", None, [4, 8, 2])
+        for shape in (
+            [4, 8],
+            [4, 8, 1, 1],
+            [-4, -8, 1],
+            [4, 8, 1e0],
+            [1 << 30, 8, 1],
+            "481",
+            None,
+            [4, 8, 2],
+        )
     ]
     wrong += [{"dtype": dtype} for dtype in ("f8", "O", "<f2", "u2", "", None, ["u1"], "i1")] + [
         {"name": [1]}
     ]
-    wrong += [{"dtype": dtype, "shape": [32 // size // 8, 8, 1]} for dtype, size in (("f2", 2), ("f4", 4))]
+    wrong += [
+        {"dtype": dtype, "shape": [32 // size // 8, 8, 1]} for dtype, size in (("f2", 2), ("f4", 4))
+    ]
     for change in wrong:
         text = json.dumps({"id": 1, "do": "relight", "arrays": [entry | change]}).encode()
         text += b" " * (-len(text) % 4)
@@ -414,7 +459,11 @@ def test_one_that_does_not_read_delays_nobody_and_is_closed(monkeypatch, device)
     pixels = 1 << 20  # a picture of 4 MB, more than what lies in sockets
     T = scipy.sparse.csr_array((np.ones(pixels), (np.arange(pixels), np.arange(pixels) % 4)))
     T = ltcl.Transport(T, (2, 2), camera_grid=(1024, 1024))
-    with ltcl.view(T, open_browser=False) as viewer, Page(viewer.url) as page, socket.socket() as small:
+    with (
+        ltcl.view(T, open_browser=False) as viewer,
+        Page(viewer.url) as page,
+        socket.socket() as small,
+    ):
         small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         small.connect(("127.0.0.1", int(page.origin.split(":")[2])))
         address = viewer.url.replace("http", "ws", 1) + "socket"

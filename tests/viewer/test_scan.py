@@ -29,18 +29,16 @@ from ltcl.acquisition.agreement import ROUGH
 from ltcl.acquisition.radiometry import Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
+from ltcl.show.window import Window, play
 from ltcl.viewer.answers import Scene
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.server import Viewer
-from ltcl.viewer.window import Window, play
 from tests import json_schema
 from tests.viewer.page import Page
 
 PATIENCE = 30.0  # seconds
 BY_HAND = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
-VIRTUAL = (
-    '[rig]\nkind = "virtual"\ntransport = "T.npz"\n[acquire]\ngeometry = "aligned"\nstrategy = "pixel"\n'
-)
+VIRTUAL = '[rig]\nkind = "virtual"\ntransport = "T.npz"\n[acquire]\ngeometry = "aligned"\nstrategy = "pixel"\n'
 random = np.random.default_rng(0)
 
 
@@ -54,7 +52,10 @@ def news(page: Page, seen: int = 0, count: int = 0, **wanted: Any) -> dict[str, 
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         found = page.ask("scan", seen=seen)
-        if found.items() >= wanted.items() and len(found["photographs"] + found["warnings"]) >= count:
+        if (
+            found.items() >= wanted.items()
+            and len(found["photographs"] + found["warnings"]) >= count
+        ):
             return found
         time.sleep(0.1)
     raise AssertionError(f"nothing with {wanted}")
@@ -99,14 +100,25 @@ def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
     project(tmp_path, BY_HAND)
     rig, codes = FolderRig(tmp_path, (4, 6)), 0.1 + 0.1 * random.random((20, 30))
     rig.prepare(
-        [(pattern, t) for pattern in (np.eye(4, 6), np.ones((4, 6)), np.zeros((4, 6))) for t in (0.1, 0.4)]
+        [
+            (pattern, t)
+            for pattern in (np.eye(4, 6), np.ones((4, 6)), np.zeros((4, 6)))
+            for t in (0.1, 0.4)
+        ]
     )
-    for shot, factor in zip(rig.shots, (1, 4, 1, 1.5, 9, 9), strict=True):  # of 0.4 s: 4 times as bright
+    for shot, factor in zip(
+        rig.shots, (1, 4, 1, 1.5, 9, 9), strict=True
+    ):  # of 0.4 s: 4 times as bright
         path = tmp_path / f"{shot.save_as}.png"
         images.write(path, np.minimum(factor * codes, 1), encoding="linear")
     scan = Scan(tmp_path, None)
     valid = SimpleNamespace(valid=np.ones(6))
-    known: Any = {"exposures": (0.1, 0.4), "response": Response.identity(), "noise": ROUGH, "offset": 0.0}
+    known: Any = {
+        "exposures": (0.1, 0.4),
+        "response": Response.identity(),
+        "noise": ROUGH,
+        "offset": 0.0,
+    }
     known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
     scan._calibration = cast(Any, SimpleNamespace(**known))
     warnings = scan.scan(0)[0]["warnings"]
@@ -138,7 +150,9 @@ def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
         assert (page.hello["grid"], page.hello["scan"]) == ([4, 8], True)
 
 
-def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.scenes.dihedral(4, albedo=0.6).transport())
     acquisition = project(tmp_path, VIRTUAL)
     scan, grids, make = Scan(tmp_path, None), [], Scene.__init__
@@ -217,7 +231,10 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
         assert rigs.show(tmp_path, window, advance, photograph) == 3
         window.wait(1.0)
         headers = {"Origin": window.url.rsplit("/", 2)[0]}
-        for path, data, code in (("result/report.json", None, 404), ("picture?name=a.png", b"", 400)):
+        for path, data, code in (
+            ("result/report.json", None, 404),
+            ("picture?name=a.png", b"", 400),
+        ):
             with pytest.raises(HTTPError, match=str(code)):  # a window has neither
                 urlopen(Request(f"{window.url}{path}", data, headers))  # noqa: S310
         window.close()
@@ -226,7 +243,9 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
 
 
 @pytest.mark.parametrize("slow", [0.0, 0.15])
-def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: Path, slow: float) -> None:
+def test_a_film_is_compensated_frame_by_frame_and_never_late(
+    device, tmp_path: Path, slow: float
+) -> None:
     T = ltcl.scenes.dihedral(4, albedo=(0.7, 0.5, 0.3)).transport()
     film = [np.full((*T.grid, 3), 0.02 * (k + 1), np.float32) for k in range(20)]
     write_video(tmp_path / "film.mkv", film, 20.0)
@@ -236,13 +255,17 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: P
         scene = Scene(T, "T", {}, None)
         facts = play(scene, source, window, 0.5, lambda *what, detail: told.append(what), rtol=1e-4)
         window.close()
-    expected = [scene.codes(ltcl.compensate(T, each, gain=0.5, rtol=1e-4).pattern, 1.0) for each in pictures]
+    expected = [
+        scene.codes(ltcl.compensate(T, each, gain=0.5, rtol=1e-4).pattern, 1.0) for each in pictures
+    ]
     numbers = [number - 1 for _, number, _ in told]
     assert facts["shown"] == len(numbers) == len(shown)
     assert (facts["shown"] + facts["dropped"], numbers) == (numbers[-1] + 1, sorted({*numbers}))
     for found, number in zip(shown, numbers, strict=True):
         np.testing.assert_allclose(found.astype(int), expected[number].astype(int), atol=1)
-    assert facts["latency"] < slow + 1.0  # on a busy machine; were nothing dropped, it would add up to 2 s
+    assert (
+        facts["latency"] < slow + 1.0
+    )  # on a busy machine; were nothing dropped, it would add up to 2 s
     assert facts["dropped"] > 5 or not slow
     assert "dropped" in window.title
 
@@ -265,9 +288,19 @@ def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) 
 def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey: bool) -> None:
     T = ltcl.scenes.dihedral(4, albedo=0.6 if is_grey else (0.7, 0.5, 0.3)).transport()
     for k in range(2):
-        images.write(tmp_path / f"{k}.png", 0.3 + 0.2 * random.random((*T.grid, 3) if k else T.grid))
-    source, background = open_frames(tmp_path), np.full((*T.grid, *(3,) * (not is_grey)), 0.05, np.float32)
-    rules: Any = {"inverse": ltcl.invert(T, 1e-4), "background": background, "rtol": 1e-3, "clamp": True}
+        images.write(
+            tmp_path / f"{k}.png", 0.3 + 0.2 * random.random((*T.grid, 3) if k else T.grid)
+        )
+    source, background = (
+        open_frames(tmp_path),
+        np.full((*T.grid, *(3,) * (not is_grey)), 0.05, np.float32),
+    )
+    rules: Any = {
+        "inverse": ltcl.invert(T, 1e-4),
+        "background": background,
+        "rtol": 1e-3,
+        "clamp": True,
+    }
     with Window("film", open_browser=False) as window, looking(window.url) as shown:
         scene = Scene(T, "T", {}, None)
         assert play(scene, source, window, 0.5, lambda *_, **__: None, **rules)["shown"] == 2
@@ -277,7 +310,14 @@ def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey:
         exact = np.atleast_3d(scene.codes(light, 1.0))
         np.testing.assert_allclose(found.astype(int), exact.astype(int), atol=1)
     with pytest.raises(errors.InputError, match="inverse"):
-        play(scene, source, window, 0.5, print, inverse=ltcl.invert(ltcl.scenes.dihedral(5).transport()))
+        play(
+            scene,
+            source,
+            window,
+            0.5,
+            print,
+            inverse=ltcl.invert(ltcl.scenes.dihedral(5).transport()),
+        )
 
 
 def port() -> int:
@@ -285,7 +325,9 @@ def port() -> int:
         return free.getsockname()[1]
 
 
-def test_pages_find_the_next_viewer_on_a_port_that_was_named(device, monkeypatch, tmp_path: Path) -> None:
+def test_pages_find_the_next_viewer_on_a_port_that_was_named(
+    device, monkeypatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("LTCL_CACHE", str(tmp_path))
     T, number = ltcl.Transport(np.eye(6) / 2, (2, 3)), port()
 
@@ -336,7 +378,10 @@ def film(folder: Path) -> Path:
 def test_play_and_show_run(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
     for command, *more in (["play", tmp_path / "T.npz", "--no-browser"], ["show", "--browser"]):
-        with running(command, film(tmp_path / "film"), *more) as (_, url), looking(url, keys=True) as shown:
+        with (
+            running(command, film(tmp_path / "film"), *more) as (_, url),
+            looking(url, keys=True) as shown,
+        ):
             pass
         assert len(shown) >= 2
 
@@ -346,7 +391,10 @@ def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
     with running("view", tmp_path, "--no-browser") as (process, url), Page(url) as page:
         assert page.hello["scan"]
         process.send_signal(signal.SIGINT)
-    with running("show", film(tmp_path / "film"), "--browser") as (process, url), looking(url) as shown:
+    with (
+        running("show", film(tmp_path / "film"), "--browser") as (process, url),
+        looking(url) as shown,
+    ):
         while not shown:
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
@@ -354,5 +402,7 @@ def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_holds_nothing_is_called_so(tmp_path: Path) -> None:
-    with pytest.raises(errors.FileError, match=r"folder with neither zarr\.json.*acquisition\.toml"):
+    with pytest.raises(
+        errors.FileError, match=r"folder with neither zarr\.json.*acquisition\.toml"
+    ):
         ltcl.load(tmp_path)

@@ -43,8 +43,12 @@ TRANSPORTS = {
     "grey": lambda: ltcl.scenes.dihedral(6, albedo=0.7).transport(),
     "colour": lambda: ltcl.scenes.dihedral(6, albedo=(0.8, 0.6, 0.4)).transport(),
     "rectangular": lambda: ltcl.Transport(random.random((35, 12)), (3, 4), camera_grid=(5, 7)),
-    "sparse": lambda: ltcl.Transport(scipy.sparse.random(30, 30, 0.3, "csr") + scipy.sparse.eye(30), (5, 6)),
-    "mixing": lambda: ltcl.Transport(random.random((3, 12, 12)) + np.eye(12), (3, 4), mixing=MIXING),
+    "sparse": lambda: ltcl.Transport(
+        scipy.sparse.random(30, 30, 0.3, "csr") + scipy.sparse.eye(30), (5, 6)
+    ),
+    "mixing": lambda: ltcl.Transport(
+        random.random((3, 12, 12)) + np.eye(12), (3, 4), mixing=MIXING
+    ),
     "blocks": lambda: ltcl.Transport(random.random((3, 3, 20, 12)), (3, 4), camera_grid=(4, 5)),
     "compressed": compressed,
 }
@@ -52,7 +56,10 @@ TRANSPORTS = {
 
 @contextmanager
 def viewing(T: ltcl.Transport, *arguments: Any, **settings: Any) -> Iterator[Page]:
-    with ltcl.view(T, *arguments, open_browser=False, **settings) as viewer, Page(viewer.url) as page:
+    with (
+        ltcl.view(T, *arguments, open_browser=False, **settings) as viewer,
+        Page(viewer.url) as page,
+    ):
         yield page
 
 
@@ -81,12 +88,19 @@ def whole(T: ltcl.Transport) -> np.ndarray:
 
 def near(found: np.ndarray, exact: np.ndarray) -> None:
     assert found.size == exact.size
-    np.testing.assert_allclose(found.ravel(), exact.ravel(), rtol=0, atol=ROUNDING * np.abs(exact).max())
+    np.testing.assert_allclose(
+        found.ravel(), exact.ravel(), rtol=0, atol=ROUNDING * np.abs(exact).max()
+    )
 
 
 def test_hello_says_what_T_is(shown):
     T, page = shown
-    facts = {"grid": list(T.grid), "camera_grid": list(T.camera_grid), "channels": T.channels, "scan": False}
+    facts = {
+        "grid": list(T.grid),
+        "camera_grid": list(T.camera_grid),
+        "channels": T.channels,
+        "scan": False,
+    }
     facts |= {"square": T.is_square, "compressed": T.is_compressed, "error": T.error, "next": False}
     assert page.hello.items() >= {"do": "hello", **facts}.items()
 
@@ -94,7 +108,10 @@ def test_hello_says_what_T_is(shown):
 def test_columns_and_rows_are_those_of_T(shown):
     T, page = shown
     A, c = whole(T), T.channels
-    for ask, name, grid, matrix in (("column", "picture", T.grid, A), ("row", "pattern", T.camera_grid, A.T)):
+    for ask, name, grid, matrix in (
+        ("column", "picture", T.grid, A),
+        ("row", "pattern", T.camera_grid, A.T),
+    ):
         for pixel in ([0, 0], [grid[0] - 1, 1]):
             unit = np.zeros((*grid, c))
             unit[tuple(pixel)] = 1
@@ -125,7 +142,9 @@ def test_bounces_of_a_picture_and_of_the_pattern(colour):
             total = rest.sum()
             for name in ("direct", "bounce_1", "bounce_2"):
                 b = np.stack([F[c] * np.linalg.solve(A[c], rest[:, c]) for c in range(3)], axis=1)
-                np.testing.assert_allclose(found[name].reshape(-1, 3), b, rtol=0, atol=4e-3 * rest.max())
+                np.testing.assert_allclose(
+                    found[name].reshape(-1, 3), b, rtol=0, atol=4e-3 * rest.max()
+                )
                 assert found[f"{name}_std"].shape == found[name].shape
                 rest = rest - b
                 shares.append(b.sum() / total)
@@ -140,7 +159,9 @@ def test_a_compensation_and_its_downloads(colour, tmp_path):
         exact = np.linalg.solve(whole(colour), desired.ravel())
         np.testing.assert_allclose(found["pattern"].ravel(), exact, atol=0.02)
         near(found["target"], desired)
-        np.testing.assert_allclose(found["appearance"].ravel(), desired.ravel(), atol=0.02 * desired.max())
+        np.testing.assert_allclose(
+            found["appearance"].ravel(), desired.ravel(), atol=0.02 * desired.max()
+        )
         assert not found["out_of_reach"].any()
         assert found["gain"] == 1.0
         assert found["clipped"] == 0.0
@@ -168,7 +189,9 @@ def test_a_compensation_and_its_downloads(colour, tmp_path):
         np.testing.assert_array_equal(images.read_codes(tmp_path / "codes.png"), codes)
         np.testing.assert_array_equal(images.read_codes(tmp_path / "pattern.png"), codes)
         written = json.loads((tmp_path / "report.json").read_text())
-        assert written.items() >= {"picture": "wanted", "error": found["error"], "gain": 1.0}.items()
+        assert (
+            written.items() >= {"picture": "wanted", "error": found["error"], "gain": 1.0}.items()
+        )
 
         brighter = page.ask("compensate", picture=1, gain="auto", bounds=[0, 2])
         assert brighter["gain"] > 1.9
@@ -206,11 +229,17 @@ def test_uploads_are_relit_and_wrong_ones_refused(colour):
         assert told == {"picture": 1, "name": "a b.png", "shape": [*codes.shape]}
         assert page.ask("pictures")["pictures"] == [{"picture": 1, "name": "a b.png"}]
         near(
-            page.ask("relight", picture=1)["picture"], whole(colour) @ images.from_srgb(codes / 255.0).ravel()
+            page.ask("relight", picture=1)["picture"],
+            whole(colour) @ images.from_srgb(codes / 255.0).ravel(),
         )
         assert upload(page, "large.png", png(np.zeros((40, 50), np.uint8)))["shape"] == [40, 50, 1]
         assert page.ask("relight", picture=2)["picture"].max() == 0
-        for name, content in {"a.txt": b"text", "a.png": b"text", "a.exr": b"text", "": b"x"}.items():
+        for name, content in {
+            "a.txt": b"text",
+            "a.png": b"text",
+            "a.exr": b"text",
+            "": b"x",
+        }.items():
             (wrong,) = upload(page, name, content).items()
             assert wrong[0] == "error"
             assert " object at " not in wrong[1]
@@ -230,7 +259,9 @@ def test_projector_windows_show_what_is_relit_and_compensated(colour):
         found = page.ask("compensate", picture=1, bounds=[0, 2])
         pushed = window.next()
         assert pushed["do"] == "show"
-        np.testing.assert_allclose(pushed["codes"], 255 * images.to_srgb(found["pattern"] / 2), atol=0.6)
+        np.testing.assert_allclose(
+            pushed["codes"], 255 * images.to_srgb(found["pattern"] / 2), atol=0.6
+        )
 
 
 def test_a_measured_T_shows_the_codes_of_its_projector(device, tmp_path):
@@ -403,7 +434,9 @@ def test_the_command_runs_until_ctrl_c(tmp_path):
         tmp_path / "wanted.png",
         "--no-browser",
     ]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stderr is not None
         url = process.stderr.readline().split()[0]
         with Page(url) as page:

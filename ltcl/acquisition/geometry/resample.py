@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs on the projector's grid, by least squares where camera pixels are smaller than its own.
 
-A camera pixel m shows the mean over its footprint, so with p the radiance of projector pixels, even on each,
+A camera pixel m shows the mean over its footprint, so with p the radiance of projector pixels, even
+on each,
 
-    c = C p + e,  C_mn = part of footprint m that lies in pixel n,  var e_m = S^2 + K^2 sum_n C_mn (1 - C_mn)
+    c = C p + e,  C_mn = part of footprint m that lies in pixel n,  var e_m = S^2 + K^2 sum_n C_mn
+    (1 - C_mn)
 
-where the second term is what an error of the map does to pixels that straddle. Regularised least squares,
-`(C^T V^-1 C + I) p = C^T V^-1 c`, is solved for each pixel with its neighbours, 5 x 5; pixels just outside
-the projector's grid are unknown, too. Entries below a thousandth of a row's largest are dropped, and rows sum
-to one; a pixel that camera pixels do not separate from its neighbours is not seen. Where most are larger than
-0.85 of the projector's, a pixel is a mean of those that see it, by the part of a tent over twice their
-footprint that lies in it.
+where the second term is what an error of the map does to pixels that straddle. Regularised least
+squares, `(C^T V^-1 C + I) p = C^T V^-1 c`, is solved for each pixel with its neighbours, 5 x 5;
+pixels just outside the projector's grid are unknown, too. Entries below a thousandth of a row's
+largest are dropped, and rows sum to one; a pixel that camera pixels do not separate from its
+neighbours is not seen. Where most are larger than 0.85 of the projector's, a pixel is a mean of
+those that see it, by the part of a tent over twice their footprint that lies in it.
 
-A dark pixel next to a bright one, of which few camera pixels were decoded, would be a small difference of two
-large numbers: where what its weights take away of white is more than 0.7 of what they add, errors are
-multiplied by 6, and it counts as not seen.
+A dark pixel next to a bright one, of which few camera pixels were decoded, would be a small
+difference of two large numbers: where what its weights take away of white is more than 0.7 of what
+they add, errors are multiplied by 6, and it counts as not seen.
 
-Known limits, measured with maps from Gray code of a corner of 16 x 16 pixels (`bench/geometry.py`): with 1.5
-camera pixels to a projector pixel's side pictures have errors of up to 5.4 %, with 2 of 2 %, with 3 and 4 of
-1 %; with 500 electrons at full scale and 3 pixels of 3.5 %. Where light varies within a projector pixel, the
-value is that at a place 0.03 pixels from its centre.
+Known limits, measured with maps from Gray code of a corner of 16 x 16 pixels (`bench/geometry.py`):
+with 1.5 camera pixels to a projector pixel's side pictures have errors of up to 5.4 %, with 2 of 2
+%, with 3 and 4 of 1 %; with 500 electrons at full scale and 3 pixels of 3.5 %. Where light varies
+within a projector pixel, the value is that at a place 0.03 pixels from its centre.
 """
 
 from __future__ import annotations
@@ -35,29 +37,39 @@ from ltcl import checks
 from ltcl.acquisition.geometry.correspondence import Correspondence
 from ltcl.errors import InputError
 
-# In brackets: the error of pictures of noise with 2 camera pixels to a side and an exact map, measured.
+# In brackets: the error of pictures of noise with 2 camera pixels to a side and an exact map,
+# measured.
 NOISE, MAP = 0.02, 0.1  # S and K, of the light (S half, twice: 0.9 %; K half: 0.8 %, twice: 1.1 %)
 REACH = 2  # pixels to each side that are solved together (1: 1.0 %, 2 and 3: 0.9 %)
 POINTS = 8  # of a footprint, to each side (4: 1.2 %, 8: 0.9 %, 16: 0.6 % in four times the time)
 RIM = REACH + 1  # unknown pixels around the grid, and what a window reads around these
 LEAST = 0.001  # of the largest weight of a row (0: 0.9 %, 0.01: 1.2 %)
 AT_ONCE = 1 << 12  # pixels solved, or camera pixels cast on the grid: 20 MB of 25 x 25 systems
-BREAK = 2.5  # times the other difference: one that crosses the border of an object (perspective: below 1.1)
-WIDEST = 6.0  # times the median: what no camera pixel spans on a surface that it sees at less than 80 degrees
-SEPARABLE = 0.85  # length of a camera pixel in projector pixels: above, least squares err by 10 % and more
-RESOLVED = 0.9  # part of the answer of least squares that is a pixel's own light; with less it is not seen
+# times the other difference: one that crosses the border of an object (perspective: below 1.1)
+BREAK = 2.5
+# times the median: what no camera pixel spans on a surface that it sees at less than 80 degrees
+WIDEST = 6.0
+SEPARABLE = (
+    0.85  # length of a camera pixel in projector pixels: above, least squares err by 10 % and more
+)
+RESOLVED = (
+    0.9  # part of the answer of least squares that is a pixel's own light; with less it is not seen
+)
 NEGATIVE = 0.7  # of what is added under white: more of it taken away leaves nothing that is known
-AREA, HALF = 0.15, 0.5  # of a pixel's area, seen where it is separated (less: an error of the map), where not
+AREA, HALF = (
+    0.15,
+    0.5,
+)  # of a pixel's area, seen where it is separated (less: an error of the map), where not
 
 
 @dataclass(frozen=True)
 class Resampling:
     """Resampling of photographs (H, W) = `camera_grid` to the projector's `grid` (h, w).
 
-    Rows of `weights` (N, M), float32, sum to 1 for projector pixels that are seen; others are empty. They are
-    negative only where least squares take away what camera pixels show of a neighbour. `coverage` (h, w):
-    what fraction of each projector pixel camera pixels cover; `doubtful` (h, w): pixels that count as not
-    seen for what white showed (`ascertained`).
+    Rows of `weights` (N, M), float32, sum to 1 for projector pixels that are seen; others are
+    empty. They are negative only where least squares take away what camera pixels show of a
+    neighbour. `coverage` (h, w): what fraction of each projector pixel camera pixels cover;
+    `doubtful` (h, w): pixels that count as not seen for what white showed (`ascertained`).
 
     >>> R = Resampling.of(Correspondence.aligned((4, 5)))
     >>> bool(np.allclose(R.apply(np.full((4, 5), 3.0)), 3.0)), bool(R.seen.all())
@@ -75,7 +87,9 @@ class Resampling:
         """The resampling by a measured map; InputError where no two neighbouring pixels of it are valid."""
         footprints = Footprints.of(mapping)
         if not footprints.known.any():
-            raise InputError("mapping has no two valid neighbours; the size of a camera pixel is unknown")
+            raise InputError(
+                "mapping has no two valid neighbours; the size of a camera pixel is unknown"
+            )
         C, pixels = footprints.shares(), inner(mapping.grid)
         coverage = np.asarray(np.abs(np.linalg.det(footprints.J)).ravel() @ C)[pixels]
         if footprints.width < SEPARABLE:
@@ -86,20 +100,28 @@ class Resampling:
         matrix = scipy.sparse.csr_array(_rows(seen) @ matrix, dtype=np.float32)
         matrix.eliminate_zeros()
         matrix.sort_indices()
-        coverage = np.where(seen, np.minimum(coverage, 1.0), 0.0).reshape(mapping.grid).astype(np.float32)
+        coverage = (
+            np.where(seen, np.minimum(coverage, 1.0), 0.0).reshape(mapping.grid).astype(np.float32)
+        )
         return cls(matrix, coverage, mapping.grid, mapping.camera_grid)
 
     @classmethod
     def aligned(cls, grid: tuple[int, int]) -> Resampling:
         """The identity: the camera already on the projector's grid."""
         h, w = checks.grid("grid", grid)
-        return cls(scipy.sparse.csr_array(_rows(np.ones(h * w))), np.ones((h, w), np.float32), (h, w), (h, w))
+        return cls(
+            scipy.sparse.csr_array(_rows(np.ones(h * w))),
+            np.ones((h, w), np.float32),
+            (h, w),
+            (h, w),
+        )
 
     def ascertained(self, white: Any, valid: Any) -> Resampling:
         """The same without pixels that would be small differences of large numbers.
 
-        `white` (H, W[, c]) is what the camera shows under white, less ambient light, where that is `valid`.
-        Rows 0 and 1 of camera pixels that are half in a dark pixel and half in a bright one:
+        `white` (H, W[, c]) is what the camera shows under white, less ambient light, where that is
+        `valid`. Rows 0 and 1 of camera pixels that are half in a dark pixel and half in a bright
+        one:
 
         >>> weights = scipy.sparse.csr_array([[2.0, -1.0], [0.0, 1.0]], dtype=np.float32)
         >>> R = Resampling(weights, np.ones((1, 2), np.float32), (1, 2), (1, 2))
@@ -133,7 +155,9 @@ class Resampling:
         array = checks.real(name, image)
         H, W = self.camera_grid
         if array.ndim not in (2, 3) or array.shape[:2] != (H, W):
-            raise InputError(f"{name} has shape {array.shape}; it must be ({H}, {W}) or ({H}, {W}, c)")
+            raise InputError(
+                f"{name} has shape {array.shape}; it must be ({H}, {W}) or ({H}, {W}, c)"
+            )
         flat = checks.finite(name, array).reshape(H * W, -1).astype(np.float32, copy=False)
         return (matrix @ flat).reshape(*self.grid, *array.shape[2:])
 
@@ -142,8 +166,9 @@ class Resampling:
 class Footprints:
     """Parallelograms on the projector's grid that camera pixels see.
 
-    They span `J` (H, W, 2, 2) float64, d(x, y) / d(u, v), where that is `known` (H, W); those `straddling`
-    are next to a pixel that is not known, or not next to it on the surface: they may see two surfaces.
+    They span `J` (H, W, 2, 2) float64, d(x, y) / d(u, v), where that is `known` (H, W); those
+    `straddling` are next to a pixel that is not known, or not next to it on the surface: they may
+    see two surfaces.
     """
 
     mapping: Correspondence
@@ -155,8 +180,9 @@ class Footprints:
     def of(cls, mapping: Correspondence) -> Footprints:
         """Differences to both valid neighbours, averaged; of one only, where the other leads across a border.
 
-        Where a row or a column of pixels stands alone, and on a side of 1 of the projector's grid, camera
-        pixels count as squares. Those that would span six times the median have no footprint.
+        Where a row or a column of pixels stands alone, and on a side of 1 of the projector's grid,
+        camera pixels count as squares. Those that would span six times the median have no
+        footprint.
         """
         x = np.stack([mapping.x, mapping.y], axis=-1).astype(np.float64)  # NaN where not valid
         (du, both_u), (dv, both_v) = _slope(x, 1), _slope(x, 0)
@@ -178,7 +204,8 @@ class Footprints:
     def shares(self, tent: bool = False) -> scipy.sparse.csr_array:
         """C (M, pixels), on the grid with its rim: `inner` are the columns of the projector's pixels.
 
-        With `tent`, of twice the footprint, less towards its border: as bilinear interpolation weighs.
+        With `tent`, of twice the footprint, less towards its border: as bilinear interpolation
+        weighs.
         """
         h, w = self.mapping.grid
         width, points = w + 2 * RIM, 2 * POINTS if tent else POINTS
@@ -198,7 +225,9 @@ class Footprints:
             place = (j * width + i)[known[some]]
             indptr = np.append(0, np.cumsum(known[some], dtype=np.int32) * points**2)
             ones = np.full(place.size, 1.0 / points**2)
-            chunk = scipy.sparse.csr_array((ones, place.ravel(), indptr), (len(i), (h + 2 * RIM) * width))
+            chunk = scipy.sparse.csr_array(
+                (ones, place.ravel(), indptr), (len(i), (h + 2 * RIM) * width)
+            )
             chunk.sum_duplicates()
             shares.append(chunk)
         return scipy.sparse.csr_array(scipy.sparse.vstack(shares))
@@ -221,7 +250,9 @@ def _slope(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     size = np.linalg.norm(steps, axis=-1, keepdims=True)
     use = np.isfinite(size) & ~(size > BREAK * size[::-1])
     total, count = np.where(use, steps, 0.0).sum(axis=0), use.sum(axis=0)
-    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), count[..., 0] == 2
+    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), count[
+        ..., 0
+    ] == 2
 
 
 def _unmix(C: scipy.sparse.csr_array, footprints: Footprints) -> scipy.sparse.csr_array:

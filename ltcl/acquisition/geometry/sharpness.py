@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How sharp a camera sees the projector's pixels, from the stripes that give their places.
 
-With b = 1 and -1 where a pattern of stripes is on and off, and D the photograph of it less that of its
-inverse, on the projector's grid, light from elsewhere is in both and cancels. What is left of pixel n is
+With b = 1 and -1 where a pattern of stripes is on and off, and D the photograph of it less that of
+its inverse, on the projector's grid, light from elsewhere is in both and cancels. What is left of
+pixel n is
 
     D_n = l_n ((1 - q) b_n + q (b_n-1 + b_n+1) / 2)
 
-along an axis: l its direct light, and q the part of what comes out at it that is its neighbours', for camera
-pixels are too large for the grid, or out of focus. Least squares over the finest patterns of the axis give q;
-the median of the pixels counts. Blocks of k x k pixels share a k-th of it. The relative error of a picture of
-noise, even in [0, 1], is
+along an axis: l its direct light, and q the part of what comes out at it that is its neighbours',
+for camera pixels are too large for the grid, or out of focus. Least squares over the finest
+patterns of the axis give q; the median of the pixels counts. Blocks of k x k pixels share a k-th of
+it. The relative error of a picture of noise, even in [0, 1], is
 
     blur = sqrt(a_y a_x - 2 (1 - q_y) (1 - q_x) + 1) / 2,    a = (1 - q)^2 + q^2 / 2
 
-Errors of the map blur as a q of 0.07 times the square of a camera pixel's width does (measured: 0.5 % with a
-width of 0.27, 3.9 % with 0.72); the larger counts. Known limit: uneven light passes for a q of up to 0.02.
+Errors of the map blur as a q of 0.07 times the square of a camera pixel's width does (measured: 0.5
+% with a width of 0.27, 3.9 % with 0.72); the larger counts. Known limit: uneven light passes for a
+q of up to 0.02.
 """
 
 from __future__ import annotations
@@ -31,9 +33,16 @@ from ltcl.acquisition.geometry.resample import SEPARABLE, Footprints, Resampling
 from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
-BAD, HOPELESS = 0.035, 0.3  # blur from which there is a warning (a sharp camera has 1 to 2 %), and a refusal
-OF_MAP = 0.07  # q of errors of the map, of camera pixels as wide as the projector's: measured, above
-OF_MEANS = 13 / 32  # q of means by a tent: E |a + b + c|, even in [-1/2, 1/2] (footprint: a, tent: b + c)
+BAD, HOPELESS = (
+    0.035,
+    0.3,
+)  # blur from which there is a warning (a sharp camera has 1 to 2 %), and a refusal
+OF_MAP = (
+    0.07  # q of errors of the map, of camera pixels as wide as the projector's: measured, above
+)
+OF_MEANS = (
+    13 / 32
+)  # q of means by a tent: E |a + b + c|, even in [-1/2, 1/2] (footprint: a, tent: b + c)
 _LEAST = 3  # patterns that determine l and q
 
 
@@ -52,7 +61,9 @@ class Sharpness:
     width: float
 
     @classmethod
-    def of(cls, mapping: Correspondence, R: Resampling, light: Sequence[np.ndarray] = ()) -> Sharpness:
+    def of(
+        cls, mapping: Correspondence, R: Resampling, light: Sequence[np.ndarray] = ()
+    ) -> Sharpness:
         """By photographs (H, W[, c]) of Gray code, linear in light; without and of small grids by the map."""
         width = Footprints.of(mapping).width
         by_map = min(OF_MEANS * width, 1.0) if width >= SEPARABLE else 0.0
@@ -115,9 +126,13 @@ def _leak(R: Resampling, light: Sequence[np.ndarray], axis: int) -> float | None
     if len(fine) < _LEAST or len(light) < last or not seen.any():
         return None
     patterns = code.patterns()
-    b = np.stack([2.0 * patterns[k].take(0, 1 - axis) - 1.0 for k in fine], axis=-1)  # (n, patterns)
+    b = np.stack(
+        [2.0 * patterns[k].take(0, 1 - axis) - 1.0 for k in fine], axis=-1
+    )  # (n, patterns)
     A = np.stack([b[1:-1], (b[:-2] + b[2:]) / 2], axis=-1)
-    D = np.stack([R.apply(light[k] - light[k + 1]).reshape(*R.grid, -1).mean(axis=-1) for k in fine])
+    D = np.stack(
+        [R.apply(light[k] - light[k + 1]).reshape(*R.grid, -1).mean(axis=-1) for k in fine]
+    )
     D = np.moveaxis(D, 1 + axis, -1)[..., 1:-1]  # (patterns, lines, n - 2)
     z = np.einsum("nik,kjn->ijn", np.linalg.pinv(A), D)[:, seen]  # l (1 - q), l q
     l = z.sum(axis=0)

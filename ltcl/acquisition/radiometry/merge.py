@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs at several exposures as one picture of radiance, with its variance and what of it is valid.
 
-The light f(code) - black = L t + noise of exposure k has the variance V(L t_k) of the noise model, so
+The light f(code) - black = L t + noise of exposure k has the variance V(L t_k) of the noise model,
+so
 
-    L = sum_k w_k t_k light_k / sum_k w_k t_k^2,    w_k = 1 / V(L t_k),    variance = 1 / sum_k w_k t_k^2
+    L = sum_k w_k t_k light_k / sum_k w_k t_k^2,    w_k = 1 / V(L t_k),    variance = 1 / sum_k w_k
+    t_k^2
 
-Weights of a noisy value itself would favour samples that came out low. So L is computed twice: as the sum of
-light over the sum of seconds; then with the weights that this L predicts, and without exposures whose
-predicted value lies within 2 standard deviations of saturation or of the lowest code. Where all do, those
-that are not saturated count (known limit: there clipped noise makes the mean too high by up to 0.4 standard
-deviations); a pixel whose photographs are saturated or at the lowest code is invalid.
+Weights of a noisy value itself would favour samples that came out low. So L is computed twice: as
+the sum of light over the sum of seconds; then with the weights that this L predicts, and without
+exposures whose predicted value lies within 2 standard deviations of saturation or of the lowest
+code. Where all do, those that are not saturated count (known limit: there clipped noise makes the
+mean too high by up to 0.4 standard deviations); a pixel whose photographs are saturated or at the
+lowest code is invalid.
 """
 
 from __future__ import annotations
@@ -30,7 +33,9 @@ from ltcl.errors import InputError
 
 _MARGIN = 2.0  # standard deviations: clipping there moves a mean by less than a hundredth of one
 _BLOCK = 1 << 14  # pixels at once: 64 KiB of float32, which six exposures keep in a cache of 1 MiB
-_VALUES = 4096  # linear values that weights are tabulated at: photon noise changes by 1 % from 0.02 on
+_VALUES = (
+    4096  # linear values that weights are tabulated at: photon noise changes by 1 % from 0.02 on
+)
 _TINY = np.float32(1e-30)  # instead of a division by zero
 
 
@@ -52,7 +57,9 @@ class Radiance:
         """Light of one less that of another, as a picture less its black frame; variances add."""
         valid = self.valid & other.valid
         value = np.where(valid, self.value - other.value, np.float32(0.0))
-        return Radiance(value, np.where(valid, self.variance + other.variance, np.float32(np.inf)), valid)
+        return Radiance(
+            value, np.where(valid, self.variance + other.variance, np.float32(np.inf)), valid
+        )
 
 
 def merge(
@@ -66,11 +73,12 @@ def merge(
 ) -> Radiance:
     """Merge photographs of one scene into radiance, by weights of the noise model.
 
-    `images` (H, W) or (H, W, 3) are uint8, uint16, or floats with 1 for the largest code, in any order of
-    their `seconds`. `response` None: linear codes; `levels` (4096 for 12 bits in uint16) None: those of the
-    noise model or the type; `black`, a float or one a channel: linear value without light, None for that of
-    the noise model. InputError for mixed sizes or types, NaN, other seconds or levels, a longer exposure
-    that is not brighter; a response of three channels for grey photographs; a black of another shape.
+    `images` (H, W) or (H, W, 3) are uint8, uint16, or floats with 1 for the largest code, in any
+    order of their `seconds`. `response` None: linear codes; `levels` (4096 for 12 bits in uint16)
+    None: those of the noise model or the type; `black`, a float or one a channel: linear value
+    without light, None for that of the noise model. InputError for mixed sizes or types, NaN, other
+    seconds or levels, a longer exposure that is not brighter; a response of three channels for grey
+    photographs; a black of another shape.
 
     >>> light = np.array([[0.2, 2.0, 400.0]])
     >>> merged = merge([np.clip(light * t, 0, 1) for t in (0.1, 1.0)], [0.1, 1.0])
@@ -133,7 +141,9 @@ class _Channel:
         unsaturated = light <= self.saturation
         light -= self.black
         light *= unsaturated
-        pilot = light.sum(axis=0) / np.maximum(np.einsum("kn,k->n", unsaturated, self.t[:, 0]), _TINY)
+        pilot = light.sum(axis=0) / np.maximum(
+            np.einsum("kn,k->n", unsaturated, self.t[:, 0]), _TINY
+        )
         clear = unsaturated & (pilot > self.clear[0]) & (pilot < self.clear[1])
         L, precision = self._mean(pilot, clear, light)
         rest = np.flatnonzero(precision == 0)

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The response of a camera, from codes to linear light, and its estimation from photographs of one scene.
 
-A pixel p of radiance L_p, photographed for t_k seconds, has the code c_pk with f(c_pk) = L_p t_k plus noise.
-f is a monotone cubic spline, 0 without light and 1 at the largest code; f and all L_p minimise
+A pixel p of radiance L_p, photographed for t_k seconds, has the code c_pk with f(c_pk) = L_p t_k
+plus noise. f is a monotone cubic spline, 0 without light and 1 at the largest code; f and all L_p
+minimise
 
     sum_pk w_pk (f(c_pk) - L_p t_k)^2,    w_pk = 1 / variance(L_p t_k)
 
-L_p is eliminated, which leaves a quadratic form in the coefficients of f. After the first round it is
-linearised about the codes c' that f and L_p predict, f(c) = f(c') + f'(c') (c - c') (Gauss-Newton), so that
-noise of the codes does not flatten the curve. Exposures whose prediction lies within the noise of either end
-do not count; what moved is weighted down by Tukey's biweight. Known limit: exposures in equal ratios do not
-separate f from f times a wobble of that period in log f; ratios of 2, 3, 2, 3 are better than 4, 4, 4.
+L_p is eliminated, which leaves a quadratic form in the coefficients of f. After the first round it
+is linearised about the codes c' that f and L_p predict, f(c) = f(c') + f'(c') (c - c')
+(Gauss-Newton), so that noise of the codes does not flatten the curve. Exposures whose prediction
+lies within the noise of either end do not count; what moved is weighted down by Tukey's biweight.
+Known limit: exposures in equal ratios do not separate f from f times a wobble of that period in log
+f; ratios of 2, 3, 2, 3 are better than 4, 4, 4.
 """
 
 from __future__ import annotations
@@ -30,19 +32,30 @@ from ltcl.errors import InputError
 
 _TABLE, _FINE = 4097, 2049  # codes of the result; of the table that inverts it: 1/8 code of 8 bits
 # In brackets: the error of an sRGB camera's curve, from 0.02 to 0.9 of full scale, measured.
-_SAMPLES, _LEAST = 4096, 50  # pixels of a channel (1024: 0.14 %, 4096: 0.08 %); at least two an unknown
+_SAMPLES, _LEAST = (
+    4096,
+    50,
+)  # pixels of a channel (1024: 0.14 %, 4096: 0.08 %); at least two an unknown
 _BINS = 64  # of brightness, which have equal shares (16 to 128: 0.09 %)
 _ROUNDS = 8  # of reweighting (5: 0.09 %, 8 to 20: 0.08 %)
-_SMOOTH = 300.0  # weight of a relative change of slope by 1, in units of noise (30: 0.11 %, 1000: 0.07 %)
+_SMOOTH = (
+    300.0  # weight of a relative change of slope by 1, in units of noise (30: 0.11 %, 1000: 0.07 %)
+)
 _MARGIN = 2.5  # standard deviations that a prediction keeps from the ends (1: 0.08 %, 4: 0.09 %)
 _TUKEY = 5.0  # standard deviations at which a residual counts no more (3: 0.17 %, 8: 0.07 %)
 _NOISE_BINS = 16  # of light, in which the size of residuals gives the noise
 _DEGREE, _INTERVALS = 3, 24  # of the spline: it fits the curves of sRGB and of film to 4e-5
-_RISE, _RIDGE = 1e-7, 1e-12  # least step between coefficients, of a strictly monotone curve; rounding errors
+_RISE, _RIDGE = (
+    1e-7,
+    1e-12,
+)  # least step between coefficients, of a strictly monotone curve; rounding errors
 
-# Knots lie closer at both ends, as toe and shoulder of a film curve need. With coefficients that never fall a
-# B-spline never falls. With coefficients _PLACES (Greville's abscissae) the curve is the identity.
-_KNOTS = np.pad((1.0 - np.cos(np.pi * np.arange(_INTERVALS + 1) / _INTERVALS)) / 2.0, _DEGREE, "edge")
+# Knots lie closer at both ends, as toe and shoulder of a film curve need. With coefficients that
+# never fall a B-spline never falls. With coefficients _PLACES (Greville's abscissae) the curve is
+# the identity.
+_KNOTS = np.pad(
+    (1.0 - np.cos(np.pi * np.arange(_INTERVALS + 1) / _INTERVALS)) / 2.0, _DEGREE, "edge"
+)
 _SIZE = _INTERVALS + _DEGREE
 _PLACES = np.lib.stride_tricks.sliding_window_view(_KNOTS[1:-1], _DEGREE).mean(axis=1)
 
@@ -51,8 +64,9 @@ _PLACES = np.lib.stride_tricks.sliding_window_view(_KNOTS[1:-1], _DEGREE).mean(a
 class Response:
     """Tables (1, n) or (3, n) from n equally spaced codes in [0, 1] to linear sensor values, float64.
 
-    A table never falls; it is linear between and beyond its codes. Those of `calibrate` are 0 without light,
-    their first values negative. InputError for other shapes, NaN, and a table that falls or never rises.
+    A table never falls; it is linear between and beyond its codes. Those of `calibrate` are 0
+    without light, their first values negative. InputError for other shapes, NaN, and a table that
+    falls or never rises.
 
     >>> gamma = Response(np.linspace(0, 1, 257) ** 2.0)
     >>> gamma.linear(np.array([[0.0, 0.5, 1.0]]))
@@ -64,7 +78,9 @@ class Response:
     def __post_init__(self) -> None:
         values = np.atleast_2d(checks.real("values", self.values)).astype(np.float64)
         if values.ndim != 2 or values.shape[0] not in (1, 3) or values.shape[1] < 2:
-            raise InputError(f"values has shape {values.shape}; it must be (1, n) or (3, n), n at least 2")
+            raise InputError(
+                f"values has shape {values.shape}; it must be (1, n) or (3, n), n at least 2"
+            )
         checks.finite("values", values)
         if np.diff(values).min() < 0 or not np.all(values[:, -1] > values[:, 0]):
             raise InputError("values falls, or stays the same throughout; a response must rise")
@@ -90,11 +106,15 @@ class Response:
 
     def derivative(self, image: Any) -> np.ndarray:
         """Linear value per code, at codes (..., [3]) in [0, 1]; float32, same shape."""
-        return self._by_channel(image, lambda codes, table: (len(table) - 1) * _interpolate(codes, table)[1])
+        return self._by_channel(
+            image, lambda codes, table: (len(table) - 1) * _interpolate(codes, table)[1]
+        )
 
     def codes(self, linear: Any) -> np.ndarray:
         """Codes (..., [3]) that have these linear values, within [0, 1]; float32, same shape."""
-        return self._by_channel(linear, lambda x, table: np.interp(x, table, np.linspace(0, 1, len(table))))
+        return self._by_channel(
+            linear, lambda x, table: np.interp(x, table, np.linspace(0, 1, len(table)))
+        )
 
     def _by_channel(self, image: Any, function: Any) -> np.ndarray:
         array = checks.real("image", image)
@@ -121,9 +141,10 @@ def calibrate(
 ) -> Response:
     """Estimate the camera's response from one scene at two exposures or more; four to eight are better.
 
-    Photographs are as in `merge`, of a scene from black to white. Codes above `saturation` are not used. The
-    response has 4097 values a channel, 1 at the largest code and 0 without light. InputError for what `merge`
-    refuses, one exposure only, and too few pixels that are seen at two exposures.
+    Photographs are as in `merge`, of a scene from black to white. Codes above `saturation` are not
+    used. The response has 4097 values a channel, 1 at the largest code and 0 without light.
+    InputError for what `merge` refuses, one exposure only, and too few pixels that are seen at two
+    exposures.
 
     >>> light = np.linspace(0.002, 0.9, 10000).reshape(100, 100)
     >>> seconds = [0.1, 0.2, 0.6, 1.2]
@@ -148,14 +169,19 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
     brightness = codes.mean(axis=0)
     low, high = brightness.min(), brightness.max()
     bins = ((brightness - low) * (_BINS / (high - low + 1e-9))).astype(int)
-    # Weighted sampling without replacement (Efraimidis and Spirakis 2006), by 1 / size of a pixel's bin.
+    # Weighted sampling without replacement (Efraimidis and Spirakis 2006), by 1 / size of a pixel's
+    # bin.
     keys = np.random.default_rng(0).exponential(size=len(bins)) * np.bincount(bins)[bins]
     codes = codes[:, np.argsort(keys)[:_SAMPLES]].astype(np.float64)
     t, grid = bracket.seconds[:, None], np.linspace(0.0, 1.0, _FINE)
-    usable = (codes <= saturation) & (codes > (0.5 / (bracket.levels - 1) if bracket.levels else 0.0))
+    usable = (codes <= saturation) & (
+        codes > (0.5 / (bracket.levels - 1) if bracket.levels else 0.0)
+    )
     seen = int(np.count_nonzero((usable * t).max(axis=0) > np.where(usable, t, np.inf).min(axis=0)))
     if codes.max() < BLACK:
-        raise InputError(f"images are black, with {codes.max():.1%} of full scale at most: {NO_LIGHT}")
+        raise InputError(
+            f"images are black, with {codes.max():.1%} of full scale at most: {NO_LIGHT}"
+        )
     if seen < _LEAST:
         raise InputError(
             f"images have {seen} sampled pixel(s) that are neither black nor saturated at two exposures; "
@@ -173,7 +199,9 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
         theta = _solve(theta, weight, near, offset, t)
         table = _tabulate(theta, _FINE)
         light = np.interp(near, grid, table) + offset
-        x = (weight * t * light).sum(axis=0) / np.maximum((weight * t**2).sum(axis=0), 1e-300) * t  # L_p t_k
+        x = (
+            (weight * t * light).sum(axis=0) / np.maximum((weight * t**2).sum(axis=0), 1e-300) * t
+        )  # L_p t_k
         near = np.interp(x, table, grid)
         slope = np.interp(near, grid, np.gradient(table, grid))
         residual = np.interp(codes, grid, table) - x
@@ -195,7 +223,9 @@ def _noise(residual: np.ndarray, x: np.ndarray, slope: np.ndarray, levels: int) 
     # The median of |normal values| is 0.6745 standard deviations, 1 / 1.4826.
     variance = np.array([(1.4826 * np.median(np.abs(residual[members]))) ** 2 for members in bins])
     light = np.array([max(x[members].mean(), 0.0) for members in bins])
-    rounding = [NoiseModel(read=0.0, levels=levels).variance(0.0, slope[members]).mean() for members in bins]
+    rounding = [
+        NoiseModel(read=0.0, levels=levels).variance(0.0, slope[members]).mean() for members in bins
+    ]
     variance = np.maximum(variance, np.array(rounding) + 1e-12)
     columns = np.stack([light, np.ones_like(light)], axis=1) / variance[:, None]
     (gain, floor), _ = scipy.optimize.nnls(columns, 1.0 - rounding / variance)
@@ -207,8 +237,8 @@ def _solve(
 ) -> np.ndarray:
     """The monotone curve that is best with all L_p free: L_p = sum_k w t (f + offset) / sum_k w t^2.
 
-    It minimises theta^T M theta + 2 v^T theta, and keeps its value at one code: scaled at the code 1, where
-    hardly any pixel determines the curve, it would have a jump there.
+    It minimises theta^T M theta + 2 v^T theta, and keeps its value at one code: scaled at the code
+    1, where hardly any pixel determines the curve, it would have a jump there.
     """
     B = _design(near.ravel())
     C = ((w * t)[:, :, None] * B.reshape(*near.shape, _SIZE)).sum(axis=0)

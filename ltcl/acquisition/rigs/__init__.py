@@ -10,5 +10,13 @@ from ltcl.acquisition.rigs.live import LiveRig
 from ltcl.acquisition.rigs.mitsuba import MitsubaRig
 from ltcl.acquisition.rigs.virtual import VirtualRig, camera_map
 
-__all__ = ["Display", "FolderRig", "GPhoto2Camera", "LiveRig", "MitsubaRig", "OpenCVCamera", "VirtualRig"]
+__all__ = [
+    "Display",
+    "FolderRig",
+    "GPhoto2Camera",
+    "LiveRig",
+    "MitsubaRig",
+    "OpenCVCamera",
+    "VirtualRig",
+]
 __all__ += ["camera_map", "show"]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Display`: codes, full screen, on a projector that is a display of this computer; `show` of a folder there.
 
-Pixels of the grid become square blocks of display pixels, of codes round(255 x) for x in [0, 1], with black
-around. pygame-ce (SDL 2) draws. Known limits: 8 bits; one display in a process, used from the main thread.
+Pixels of the grid become square blocks of display pixels, of codes round(255 x) for x in [0, 1],
+with black around. pygame-ce (SDL 2) draws. Known limits: 8 bits; one display in a process, used
+from the main thread.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ _POLL = 0.05  # seconds
 class Display(Closing):
     """One display, full screen, that shows codes of `grid` (h, w), at most its pixels (extra `projector`).
 
-    `index` counts from 0; None is the second display, or the only one. InputError where it is missing, the
-    grid does not fit, or pygame has a window already; AcquisitionError where pygame-ce is not installed, or
-    no display goes full screen.
+    `index` counts from 0; None is the second display, or the only one. InputError where it is
+    missing, the grid does not fit, or pygame has a window already; AcquisitionError where pygame-ce
+    is not installed, or no display goes full screen.
 
     Examples
     --------
@@ -57,7 +58,9 @@ class Display(Closing):
         self.key_pressed()
         levels = enlarge(np.rint(codes * 255).astype(np.uint8), self.size)
         levels = np.broadcast_to(levels[..., None] if levels.ndim == 2 else levels, (*self.size, 3))
-        self._pygame.surfarray.blit_array(self._screen, levels.swapaxes(0, 1))  # pygame counts pixels (x, y)
+        self._pygame.surfarray.blit_array(
+            self._screen, levels.swapaxes(0, 1)
+        )  # pygame counts pixels (x, y)
         self._pygame.display.flip()
 
     def key_pressed(self) -> bool:
@@ -66,7 +69,9 @@ class Display(Closing):
             raise AcquisitionError("the display is closed")
         pygame, pressed = self._pygame, False
         for event in pygame.event.get():
-            if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
+            if event.type == pygame.QUIT or (
+                event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE
+            ):
                 self.close()
                 raise AcquisitionError("the display was closed by its window or the Escape key")
             pressed |= event.type == pygame.KEYDOWN
@@ -85,7 +90,9 @@ class Display(Closing):
         display = self._pygame.display
         display.init()
         sizes = display.get_desktop_sizes()
-        self.index = min(1, len(sizes) - 1) if index is None else checks.count("index", index, least=0)
+        self.index = (
+            min(1, len(sizes) - 1) if index is None else checks.count("index", index, least=0)
+        )
         if self.index not in range(len(sizes)):
             offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes)) or "none"
             raise InputError(f"index is {index}, of {offered}; a projector must extend the desktop")
@@ -96,7 +103,9 @@ class Display(Closing):
         self.period = 1.0 / rate if rate > 0 else None
         self._screen = display.set_mode((w, h), self._pygame.FULLSCREEN, display=self.index)
         if (actual := self._screen.get_size()) != (w, h):
-            raise AcquisitionError(f"full screen is {actual}, not {w, h}; switch the desktop's scaling off")
+            raise AcquisitionError(
+                f"full screen is {actual}, not {w, h}; switch the desktop's scaling off"
+            )
         self._pygame.mouse.set_visible(False)
         display.set_allow_screensaver(False)
 
@@ -109,12 +118,12 @@ def show(
 ) -> int:
     """Show the patterns of a folder, or one picture, full screen, one after the other; returns how many.
 
-    Of a `FolderRig` in the order of the shooting list, without photographs that are there already; else the
-    pictures of the folder by the numbers in their names. `display` counts from 0, or is an open one or the
-    like: `show(codes)` and `key_pressed()`. The next pattern is shown after a "key", at the "arrival" of the
-    photograph in the folder, or after so many seconds, as `advance` says. `progress` is called with each
-    `Shot`, how many were before it, and how many there are. Errors as of `Display`; InputError or FileError
-    for an unusable `advance`, nothing to show.
+    Of a `FolderRig` in the order of the shooting list, without photographs that are there already;
+    else the pictures of the folder by the numbers in their names. `display` counts from 0, or is an
+    open one or the like: `show(codes)` and `key_pressed()`. The next pattern is shown after a
+    "key", at the "arrival" of the photograph in the folder, or after so many seconds, as `advance`
+    says. `progress` is called with each `Shot`, how many were before it, and how many there are.
+    Errors as of `Display`; InputError or FileError for an unusable `advance`, nothing to show.
 
     Examples
     --------
@@ -125,7 +134,9 @@ def show(
     folder = as_path(folder)
     if isinstance(advance, str) and advance not in ("key", "arrival"):
         raise InputError(f"advance is {advance!r}; it must be 'key', 'arrival' or seconds")
-    patience = float("inf") if isinstance(advance, str) else checks.number("advance", advance, above=0.0)
+    patience = (
+        float("inf") if isinstance(advance, str) else checks.number("advance", advance, above=0.0)
+    )
     is_picture = folder.is_file() and advance != "arrival"
     folder, name = (folder.parent, folder.name) if is_picture else (folder, "")
     rig = FolderRig(folder, (1, 1))  # any grid has the same list

@@ -6,8 +6,8 @@
     folder/photographs/photo_000001.*       what the person puts there
     folder/shots.json                       the same list, for the rig itself
 
-A shot is known by a hash of what is projected, its seconds and the number of equal ones before it, so a run
-that is started again finds its photographs. Their codes are not changed.
+A shot is known by a hash of what is projected, its seconds and the number of equal ones before it,
+so a run that is started again finds its photographs. Their codes are not changed.
 """
 
 from __future__ import annotations
@@ -37,9 +37,13 @@ _SUFFIXES = (*images.BITS, *RAW)
 _KINDS = "camera RAW, TIFF, PNG, EXR, BMP or JPEG"
 _FORMAT = "ltcl shooting list 1"
 _PHOTO = re.compile(r"photo_(\d{1,9})", re.IGNORECASE | re.ASCII)
-_FULL, _DEFECTS = 1.001, 0.01  # full scale of floats with what rounding adds; share of pixels above it
+_FULL, _DEFECTS = (
+    1.001,
+    0.01,
+)  # full scale of floats with what rounding adds; share of pixels above it
 _EXIF, _EXPOSURE = 34665, 33434  # tags of EXIF 2.32
-_ROUNDING = 0.05  # EXIF holds nominal values, 1/30 s for 1/32 s; neighbouring thirds of a stop differ by 26 %
+# EXIF holds nominal values, 1/30 s for 1/32 s; neighbouring thirds of a stop differ by 26 %
+_ROUNDING = 0.05
 _Key = tuple[str, float]  # hash of a pattern, seconds
 
 
@@ -55,11 +59,12 @@ class Shot(NamedTuple):
 class FolderRig:
     """A projector and a camera that somebody works by hand, through a folder; `shots` are on the list there.
 
-    Photographs are PNG, TIFF, JPEG, BMP, EXR (full scale 1) or camera RAW (extra `camera`); one channel is
-    the green one. `pattern_bits`, 8 or 16, are of the patterns, `camera_bits` those in use in photographs of
-    16 bits (None: all; RAW is scaled to 16). `exposures` are the seconds that the camera offers, ascending
-    (None: any). For a `projector` of (H, W) pixels the grid's pixels become square blocks, as large as fit,
-    in the middle. InputError, FileError for an unusable argument or a damaged list.
+    Photographs are PNG, TIFF, JPEG, BMP, EXR (full scale 1) or camera RAW (extra `camera`); one
+    channel is the green one. `pattern_bits`, 8 or 16, are of the patterns, `camera_bits` those in
+    use in photographs of 16 bits (None: all; RAW is scaled to 16). `exposures` are the seconds that
+    the camera offers, ascending (None: any). For a `projector` of (H, W) pixels the grid's pixels
+    become square blocks, as large as fit, in the middle. InputError, FileError for an unusable
+    argument or a damaged list.
 
     Examples
     --------
@@ -126,8 +131,9 @@ class FolderRig:
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         """The photograph of a shot, as the camera stored it: uint8, uint16 or float, (H, W) or (H, W, 3).
 
-        Errors as of `prepare`. `PhotographMissing`, of the first of the list, where it is not there yet.
-        AcquisitionError where it is there twice, damaged, above full scale, or its exposure deviates by 5 %.
+        Errors as of `prepare`. `PhotographMissing`, of the first of the list, where it is not there
+        yet. AcquisitionError where it is there twice, damaged, above full scale, or its exposure
+        deviates by 5 %.
         """
         shot, key = self._enter(codes, seconds, self._asked)
         self._save()
@@ -136,13 +142,17 @@ class FolderRig:
             missing, files = self.missing(), self._files.get(shot.number, [])
             if not files:
                 first, place = self.shots[missing[0] - 1], f"{self.folder}, as {_KINDS}"
-                time = f"{first.seconds:.6g} s" + f" (1/{1 / first.seconds:.3g})" * (first.seconds < 0.3)
+                time = f"{first.seconds:.6g} s" + f" (1/{1 / first.seconds:.3g})" * (
+                    first.seconds < 0.3
+                )
                 text = f"project {first.pattern}, expose for {time}, save as {first.save_as} in {place}"
                 text = f"photograph {first.number} is missing ({len(missing)} in all): {text}"
                 raise PhotographMissing(text, first.number, first, len(missing))
             if len(files) > 1:
                 names = " and ".join(path.name for path in files)
-                raise AcquisitionError(f"photograph {shot.number} is there as {names}; keep one of them")
+                raise AcquisitionError(
+                    f"photograph {shot.number} is there as {names}; keep one of them"
+                )
         name = f"photograph {shot.number} ({files[0].name})"
         image = read_photograph(name, files[0], self.channels, shot.seconds)
         self._asked[key] += 1
@@ -165,12 +175,14 @@ class FolderRig:
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in the order of the numbers in their names.
 
-        Files that were copied before are left out: a card need not be emptied. Nothing is copied where as
-        many are not missing (InputError), or one is no photograph (FileError).
+        Files that were copied before are left out: a card need not be emptied. Nothing is copied
+        where as many are not missing (InputError), or one is no photograph (FileError).
         """
         numbers, paths = self.missing(), []
         copied = [path for paths in self._files.values() for path in paths]
-        order = {p: re.sub("[0-9]+", lambda n: n[0].zfill(20), p.name) for p in map(input_file, files)}
+        order = {
+            p: re.sub("[0-9]+", lambda n: n[0].zfill(20), p.name) for p in map(input_file, files)
+        }
         for path in sorted(order, key=order.__getitem__):
             if path.suffix.lower() not in _SUFFIXES:
                 raise FileError(f"{path}: is no photograph; it must be {_KINDS}")
@@ -180,7 +192,9 @@ class FolderRig:
                 paths.append(path)
         if len(paths) != len(numbers):
             which = f", {numbers[0]} to {numbers[-1]}" if numbers else ""
-            text = f"files holds {len(paths)} new photographs, but {len(numbers)} are missing{which}"
+            text = (
+                f"files holds {len(paths)} new photographs, but {len(numbers)} are missing{which}"
+            )
             raise InputError(f"{text}; give just these, or save them by the names on the list")
         for number, path in zip(numbers, paths, strict=True):
             target = self.folder / (self.shots[number - 1].save_as + path.suffix.lower())
@@ -189,7 +203,11 @@ class FolderRig:
 
     def describe(self) -> dict[str, Any]:
         """The rig as plain JSON."""
-        facts = {"kind": "folder", "projector_grid": self.projector_grid, "projector": self._projector}
+        facts = {
+            "kind": "folder",
+            "projector_grid": self.projector_grid,
+            "projector": self._projector,
+        }
         facts |= {"pattern_bits": self._bits, "camera_bits": self.bits, "exposures": self.exposures}
         return facts | {"channels": self.channels}
 
@@ -218,7 +236,10 @@ class FolderRig:
         """Write both files of the list, and make the folder of the photographs."""
         table, path = self.folder / "shots.csv", self.folder / "shots.json"
         if self._saved < len(self._shots) or not (path.exists() and table.exists()):
-            with replace_file(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            with (
+                replace_file(table) as temporary,
+                temporary.open("w", newline="", encoding="utf-8") as file,
+            ):
                 rows = [(s.number, s.pattern, f"{s.seconds:.6g}", s.save_as) for s in self.shots]
                 csv.writer(file).writerows([("number", "project", "seconds", "save as"), *rows])
             shots = [{"codes": digest, "seconds": seconds} for (digest, seconds), _ in self._shots]
@@ -242,8 +263,8 @@ def enlarge(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
 def read_photograph(name: str, path: Path, channels: int, seconds: float | None) -> np.ndarray:
     """The codes of a file for a rig of so many channels, exposed for `seconds` as far as its EXIF says.
 
-    One channel of a colour photograph is the green one: a mean of channels with different response curves
-    would follow none. AcquisitionError begins with `name`.
+    One channel of a colour photograph is the green one: a mean of channels with different response
+    curves would follow none. AcquisitionError begins with `name`.
     """
     try:
         raw = path.suffix.lower() in RAW
@@ -251,7 +272,9 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     except (FileError, MemoryLimitError) as error:
         raise AcquisitionError(f"{name} cannot be used: {error}") from error
     if exposed and seconds is not None and abs(exposed / seconds - 1.0) > _ROUNDING:
-        raise AcquisitionError(f"{name} was exposed for {exposed:.4g} s by its EXIF, not {seconds:.4g} s")
+        raise AcquisitionError(
+            f"{name} was exposed for {exposed:.4g} s by its EXIF, not {seconds:.4g} s"
+        )
     if codes.dtype.kind == "f" and np.mean(codes > _FULL) > _DEFECTS:
         text = "full scale of float photographs is 1: divide all by the largest value of the camera"
         raise AcquisitionError(f"{name} reaches {codes.max():.4g}; {text}")
@@ -269,7 +292,8 @@ def _develop(path: Path) -> tuple[np.ndarray, float]:
             codes = raw.postprocess(
                 gamma=(1, 1),
                 no_auto_bright=True,
-                adjust_maximum_thr=0.0,  # else full scale follows the brightest pixel of each photograph
+                # else full scale follows the brightest pixel of each photograph
+                adjust_maximum_thr=0.0,
                 user_wb=[1.0, 1.0, 1.0, 1.0],
                 output_color=rawpy.ColorSpace.raw,
                 output_bps=16,

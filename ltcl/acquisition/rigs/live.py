@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`LiveRig`: a camera on a cable photographs what a display shows.
 
-Frames are compared by the means of square cells, about 64 along the shorter side. Before the first photograph
-is measured:
+Frames are compared by the means of square cells, about 64 along the shorter side. Before the first
+photograph is measured:
 
     exposure    at most 1/15 s, halved until white saturates less than a hundredth of the cells
     noise       the largest change of a cell between frames of the same picture, black and white
-    dimming     a strip of white, then all white: no cell may get darker, as by a fast automatic exposure
-    latency     from a flash until all but a hundredth of the cells show it, to a tenth of the contrast
-    drift       of the mean, right after a flash and at rest, by a slow automatic exposure or white balance
+    dimming     a strip of white, then all white: no cell may get darker, as by a fast automatic
+    exposure latency     from a flash until all but a hundredth of the cells show it, to a tenth of
+    the contrast drift       of the mean, right after a flash and at rest, by a slow automatic
+    exposure or white balance
 
-Then two frames in a row must be the same but for noise, none half-changed (torn). Where codes or exposure
-changed and the frame did not, or both changed, it may be an old one: a flash, blocks at random, is shown in
-between and must be seen to come and to go. Photographs of the same codes and seconds must be as bright.
-Projectors show colours one after the other: an exposure of n + f periods, 0 < f < 1, catches up to
-3 f / (n + f) more or less of one. So exposures are offered only within 2 % of a whole number of periods.
+Then two frames in a row must be the same but for noise, none half-changed (torn). Where codes or
+exposure changed and the frame did not, or both changed, it may be an old one: a flash, blocks at
+random, is shown in between and must be seen to come and to go. Photographs of the same codes and
+seconds must be as bright. Projectors show colours one after the other: an exposure of n + f
+periods, 0 < f < 1, catches up to 3 f / (n + f) more or less of one. So exposures are offered only
+within 2 % of a whole number of periods.
 """
 
 from __future__ import annotations
@@ -35,16 +37,24 @@ _log = logging.getLogger(__name__)
 _ACROSS = 64  # cells
 _USUAL, _TRIALS = 1 / 15, 6  # seconds of the longest exposure that is tried; exposures that are
 _FRAMES, _FLASHES = 6, 4  # of the same picture; to white, and as many to black
-_ARRIVED, _OUTLIERS = 0.1, 0.01  # difference from a flash, of white; share of cells that may differ more
+_ARRIVED, _OUTLIERS = (
+    0.1,
+    0.01,
+)  # difference from a flash, of white; share of cells that may differ more
 _SAFETY = 1.5  # over the largest noise that was seen in some ten thousand differences
 _STEP = 1 / 255  # a code of the coarsest camera: changes below are none
 _VISIBLE = 4.0  # times the noise: what must be seen
 _FLICKER, _BRIGHT = 0.1, 0.98  # of full scale: more noise than that; here a pixel may hold no more
 _DIM = 0.1  # of full scale: brightness is compared relative to that at least
 _MARGIN = 0.02  # seconds to wait beyond the slowest flash
-_TRIES, _TWINS = 6, 3  # frames before refusal; frames without any difference that a camera may repeat
+_TRIES, _TWINS = (
+    6,
+    3,
+)  # frames before refusal; frames without any difference that a camera may repeat
 _FRACTION = 0.02  # of an exposure, which is no whole period
-_PERIODS = sorted(count << k for count in (1, 3) for k in range(20))  # of an exposure: 1, 2, 3, 4, 6, 8, 12
+_PERIODS = sorted(
+    count << k for count in (1, 3) for k in range(20)
+)  # of an exposure: 1, 2, 3, 4, 6, 8, 12
 
 
 class Frame(NamedTuple):
@@ -68,19 +78,26 @@ class Survey(NamedTuple):
 class LiveRig(Closing):
     """A camera and a display; `survey` is what their tests measured, None before the first photograph.
 
-    A camera is `OpenCVCamera`, `GPhoto2Camera`, or any with `channels`, 1 or 3; `stream`, whether frames come
-    by themselves and may wait in a queue; `expose(seconds)`; and `frame()`, uint8, uint16 or float, (H, W) or
-    (H, W, 3). Optional: `exposures`, seconds, ascending (else any within `limits`, else 1e-4 to 30); `bits`
-    of uint16 (else 16); `describe()`, a dict of plain JSON; `close()`. A display is `Display`, or any with
-    `grid`, `period` and `show(codes)`.
+    A camera is `OpenCVCamera`, `GPhoto2Camera`, or any with `channels`, 1 or 3; `stream`, whether
+    frames come by themselves and may wait in a queue; `expose(seconds)`; and `frame()`, uint8,
+    uint16 or float, (H, W) or (H, W, 3). Optional: `exposures`, seconds, ascending (else any within
+    `limits`, else 1e-4 to 30); `bits` of uint16 (else 16); `describe()`, a dict of plain JSON;
+    `close()`. A display is `Display`, or any with `grid`, `period` and `show(codes)`.
 
-    `period` is that of the projector's pictures, whose multiples are offered as `exposures`: seconds, as the
-    "display" says, or None for steady light (LCD, LCoS). `drift` is the largest relative difference of
-    brightness between identical shots. Within `patience` seconds everything is at rest.
+    `period` is that of the projector's pictures, whose multiples are offered as `exposures`:
+    seconds, as the "display" says, or None for steady light (LCD, LCoS). `drift` is the largest
+    relative difference of brightness between identical shots. Within `patience` seconds everything
+    is at rest.
     """
 
     def __init__(
-        self, camera: Any, display: Any, *, period: Any = "display", drift: float = 0.02, patience: float = 1
+        self,
+        camera: Any,
+        display: Any,
+        *,
+        period: Any = "display",
+        drift: float = 0.02,
+        patience: float = 1,
     ) -> None:
         require_members("camera", camera, "channels", "stream", "expose", "frame")
         require_members("display", display, "grid", "period", "show")
@@ -89,8 +106,12 @@ class LiveRig(Closing):
         self.bits = getattr(camera, "bits", None)
         self.exposures = as_exposures("camera.exposures", getattr(camera, "exposures", None))
         if period == "display" and (period := display.period) is None:
-            _log.warning("the display has no known period: exposures are not checked for whole periods")
-        self._period = None if period is None else checks.number("period", period, above=0.0, most=1.0)
+            _log.warning(
+                "the display has no known period: exposures are not checked for whole periods"
+            )
+        self._period = (
+            None if period is None else checks.number("period", period, above=0.0, most=1.0)
+        )
         if self._period is not None:
             least, most = getattr(camera, "limits", (rig.SHORTEST, rig.LONGEST))
             times = [n * self._period for n in _PERIODS]
@@ -99,7 +120,9 @@ class LiveRig(Closing):
             pairs = zip(offered, nearest, strict=True)
             self.exposures = tuple(t for t, whole in pairs if abs(t - whole) <= _FRACTION * t)
             if not self.exposures:
-                raise InputError(f"period is {self._period:.4g} s; it must divide an exposure of the camera")
+                raise InputError(
+                    f"period is {self._period:.4g} s; it must divide an exposure of the camera"
+                )
         self._drift = checks.number("drift", drift, above=0.0, below=1.0)
         self._patience = checks.number("patience", patience, above=0.0, most=60.0)
         self._camera, self._display = camera, display
@@ -117,7 +140,8 @@ class LiveRig(Closing):
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         """The camera's frame under `codes`, (h, w) or (h, w, 3) in [0, 1].
 
-        AcquisitionError where the camera is gone, adapts, drifts, or shows old or half-changed frames.
+        AcquisitionError where the camera is gone, adapts, drifts, or shows old or half-changed
+        frames.
         """
         codes, seconds = as_shot(self, codes, seconds)
         try:
@@ -128,7 +152,9 @@ class LiveRig(Closing):
             before = self._brightness.setdefault(shot_key(codes, seconds), mean)
             if (drift := _drift(mean, before, _DIM)) > self._drift:
                 text = f"brightness deviates by {drift:.1%} from an earlier one of the same codes and seconds"
-                raise AcquisitionError(f"{text}, drift={self._drift:g}: camera, lamp or room light drifts")
+                raise AcquisitionError(
+                    f"{text}, drift={self._drift:g}: camera, lamp or room light drifts"
+                )
         except AcquisitionError as error:
             raise AcquisitionError(f"photograph {self._count + 1}: {error}") from error
         self._count += 1
@@ -143,9 +169,16 @@ class LiveRig(Closing):
     def describe(self) -> dict[str, Any]:
         """The rig as plain JSON."""
         ends = (self._camera, self._display)
-        camera, display = (getattr(e, "describe", lambda e=e: {"kind": type(e).__name__})() for e in ends)
+        camera, display = (
+            getattr(e, "describe", lambda e=e: {"kind": type(e).__name__})() for e in ends
+        )
         facts = {"kind": "live", "projector_grid": self.projector_grid, "channels": self.channels}
-        facts |= {"camera": camera, "display": display, "period": self._period, "exposures": self.exposures}
+        facts |= {
+            "camera": camera,
+            "display": display,
+            "period": self._period,
+            "exposures": self.exposures,
+        }
         return facts | {"survey": self.survey and self.survey._asdict()}
 
     def close(self) -> None:
@@ -180,18 +213,22 @@ class LiveRig(Closing):
             second = self._frame()
             twins = twins + 1 if np.array_equal(first.codes, second.codes) else 0
             changed = _change(first, second)
-            if changed <= survey.tolerance and not 0 < twins <= _TWINS:  # the same frame once more, perhaps
+            if (
+                changed <= survey.tolerance and not 0 < twins <= _TWINS
+            ):  # the same frame once more, perhaps
                 return second
             first = second
-        text = f"frames still change by {changed:.1%} of full scale, {survey.tolerance:.1%} is noise"
+        text = (
+            f"frames still change by {changed:.1%} of full scale, {survey.tolerance:.1%} is noise"
+        )
         raise AcquisitionError(f"{text}: half-changed frames, flicker, or something moves")
 
     def _after_flash(self, codes: np.ndarray, frame: Frame, survey: Survey) -> Frame:
         """A frame that looks the same before and after a flash, which looks different.
 
-        Frames come in the order of what was shown, and only `codes` twice. Where that fails, latency has
-        grown, and from now on `patience` passes before each frame. In an exposure too short to see a flash,
-        or where all is saturated, nothing can be compared.
+        Frames come in the order of what was shown, and only `codes` twice. Where that fails,
+        latency has grown, and from now on `patience` passes before each frame. In an exposure too
+        short to see a flash, or where all is saturated, nothing can be compared.
         """
         h, w = self.projector_grid
         light = survey.contrast * min(1.0, self._seconds / survey.seconds)
@@ -206,11 +243,15 @@ class LiveRig(Closing):
             if not is_visible or (is_seen and _change(frame, before) <= survey.tolerance):
                 return frame
             self._latency = max(self._latency, self._patience)
-        raise AcquisitionError(f"the frame is stale: in {_TRIES} trials no flash of the display is seen")
+        raise AcquisitionError(
+            f"the frame is stale: in {_TRIES} trials no flash of the display is seen"
+        )
 
     def _show(self, codes: Any) -> None:
         """Show codes, or one code everywhere."""
-        self._display.show(codes if np.ndim(codes) else np.full(self.projector_grid, codes, np.float32))
+        self._display.show(
+            codes if np.ndim(codes) else np.full(self.projector_grid, codes, np.float32)
+        )
         self._changed = time.monotonic()
 
     def _expose(self, seconds: float) -> None:
@@ -251,17 +292,23 @@ class LiveRig(Closing):
             if np.mean(self._still(1.0) > _BRIGHT) <= _OUTLIERS:
                 break
         else:
-            raise AcquisitionError(f"white is saturated at {seconds:.4g} s; reduce aperture or gain")
+            raise AcquisitionError(
+                f"white is saturated at {seconds:.4g} s; reduce aperture or gain"
+            )
         dark, lit = self._still(0.0, _FRAMES), self._still(1.0, _FRAMES)
         noise = max(float(np.abs(np.diff(frames, axis=0)).max()) for frames in (dark, lit))
         if noise > _FLICKER:
             text = f"frames of the same picture differ by {noise:.1%} of full scale"
-            raise AcquisitionError(f"{text}: something flickers or moves, or the display's period is wrong")
+            raise AcquisitionError(
+                f"{text}: something flickers or moves, or the display's period is wrong"
+            )
         black, white = dark[-1], lit[-1]
         contrast = float((white - black).max())
         if contrast < _VISIBLE * max(noise, _STEP):
             text = f"white is {contrast:.2%} of full scale above black, noise {noise:.2%}, at {seconds:.4g} s"
-            raise AcquisitionError(f"the camera does not see the display: {text}; open the aperture, or aim")
+            raise AcquisitionError(
+                f"the camera does not see the display: {text}; open the aperture, or aim"
+            )
         tolerance = _SAFETY * (noise + _STEP)
         h, w = self.projector_grid
         strip = np.broadcast_to(np.arange(w) < max(1, w // 4), (h, w)).astype(np.float32)
@@ -276,8 +323,12 @@ class LiveRig(Closing):
         self._wait_for(1.0, white, accuracy)
         mean = self._frame().cells.mean(axis=(0, 1))  # the frame before may have begun too early
         if (drift := _drift(mean, lit.mean(axis=(0, 1, 2)), _STEP)) > self._drift:
-            text = f"the camera drifts by {drift:.1%} between identical shots, drift={self._drift:g}"
-            raise AcquisitionError(f"{text}: switch off automatic exposure, white balance, flickering lamps")
+            text = (
+                f"the camera drifts by {drift:.1%} between identical shots, drift={self._drift:g}"
+            )
+            raise AcquisitionError(
+                f"{text}: switch off automatic exposure, white balance, flickering lamps"
+            )
         return Survey(latency, seconds, tolerance, contrast, drift)
 
     def _wait_for(self, code: float, after: np.ndarray, tolerance: float) -> float:
@@ -288,14 +339,20 @@ class LiveRig(Closing):
             if np.mean(np.abs(frame.cells - after) > tolerance) <= _OUTLIERS:
                 return max(frame.waited, 0.0)
             if frame.waited > self._patience + self._seconds:
-                raise AcquisitionError(f"no flash of the display is seen within {frame.waited:.2g} s")
+                raise AcquisitionError(
+                    f"no flash of the display is seen within {frame.waited:.2g} s"
+                )
 
 
 def _cells(image: np.ndarray) -> np.ndarray:
     """Means over square cells: (H, W) or (H, W, c) -> (a, b, c), float32."""
     h, w = image.shape[:2]
     side = max(1, min(h, w) // _ACROSS)
-    small = image if side == 1 else cv2.resize(image, (w // side, h // side), interpolation=cv2.INTER_AREA)
+    small = (
+        image
+        if side == 1
+        else cv2.resize(image, (w // side, h // side), interpolation=cv2.INTER_AREA)
+    )
     return np.ascontiguousarray(small.reshape(*small.shape[:2], -1), np.float32)
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`VirtualRig`: photographs of a scene whose light transport T is known; `SimulatedRig`: their sensor.
 
-Codes x (h, w[, 3]) in [0, 1], N = h w projector pixels, channels c and d, projector curve g with light b at
-code 0, ambient light a (M,), and C (H W, M): what camera pixels see of the M pixels of T.
+Codes x (h, w[, 3]) in [0, 1], N = h w projector pixels, channels c and d, projector curve g with
+light b at code 0, ambient light a (M,), and C (H W, M): what camera pixels see of the M pixels of
+T.
 
     p_d = b + (1 - b) g_d(x_d)              light of the projector
     q_c = sum_d mixing[c, d] p_d            light that channel c of T answers to, (N,)
@@ -12,7 +13,8 @@ code 0, ambient light a (M,), and C (H W, M): what camera pixels see of the M pi
     c   = o + (1 - o) f(min(n, 1))          offset o and camera curve f, where n < 0 as -f(-n)
     code = round(c (2^bits - 1))            in [0, 2^bits - 1]; or c itself of a float camera
 
-The unit of light is that of T: rows that sum to 1 give 1 per second under white. The only blur is that of C.
+The unit of light is that of T: rows that sum to 1 give 1 per second under white. The only blur is
+that of C.
 """
 
 from __future__ import annotations
@@ -27,19 +29,26 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks, layout
+from ltcl import checks
 from ltcl.acquisition.rig import as_codes, as_exposures, fingerprint, shot_key
 from ltcl.errors import InputError
 from ltcl.images import from_srgb, to_srgb
+from ltcl.transport import frames as layout
 
 Curve = Callable[[np.ndarray], np.ndarray]
 Place = Callable[[np.ndarray, np.ndarray], tuple[Any, Any]]
-_G, _M = 1.2, 0.25**1.2  # film: c = (1 + m^g) l^g / (l^g + m^g), a logistic in log l (Hurter and Driffield)
+_G, _M = (
+    1.2,
+    0.25**1.2,
+)  # film: c = (1 + m^g) l^g / (l^g + m^g), a logistic in log l (Hurter and Driffield)
 # Light to code of a camera, and code to light of a projector, by name; 0 to 0 and 1 to 1.
 CURVES: dict[str, tuple[Curve, Curve]] = {
     "linear": (np.array, np.array),
     "srgb": (to_srgb, from_srgb),
-    "film": (lambda x: (1 + _M) * x**_G / (x**_G + _M), lambda c: (_M * c / (1 + _M - c)) ** (1 / _G)),
+    "film": (
+        lambda x: (1 + _M) * x**_G / (x**_G + _M),
+        lambda c: (_M * c / (1 + _M - c)) ** (1 / _G),
+    ),
     "gamma2.2": (lambda light: light ** (1 / 2.2), lambda code: code**2.2),
 }
 
@@ -48,10 +57,11 @@ CURVES: dict[str, tuple[Curve, Curve]] = {
 class Sensor:
     """Camera and projector of a simulated rig.
 
-    `response` and `projector_response` are "linear", "srgb", "gamma2.2" or "film", or three of these. `bits`
-    8 gives uint8, 9 to 16 uint16, "float" float32. `black` is the offset of the codes, of full scale,
-    `projector_black` the light at code 0, of full white. `gain` are electrons at full scale, None for no
-    photon noise; `read`, of full scale, the deviation of the read noise; `exposures` seconds, None for any.
+    `response` and `projector_response` are "linear", "srgb", "gamma2.2" or "film", or three of
+    these. `bits` 8 gives uint8, 9 to 16 uint16, "float" float32. `black` is the offset of the
+    codes, of full scale, `projector_black` the light at code 0, of full white. `gain` are electrons
+    at full scale, None for no photon noise; `read`, of full scale, the deviation of the read noise;
+    `exposures` seconds, None for any.
     """
 
     response: Any = "srgb"
@@ -77,13 +87,16 @@ class Sensor:
 class SimulatedRig:
     """A projector and a camera whose light comes from `_radiance(codes)` of a subclass.
 
-    Noise depends on seed, codes, seconds and the number of equal shots before, so that a run can resume.
+    Noise depends on seed, codes, seconds and the number of equal shots before, so that a run can
+    resume.
     """
 
     sensitivity = 1.0
     _radiance: Callable[[np.ndarray], np.ndarray]
 
-    def __init__(self, projector_grid: tuple[int, int], channels: int, sensor: dict[str, Any]) -> None:
+    def __init__(
+        self, projector_grid: tuple[int, int], channels: int, sensor: dict[str, Any]
+    ) -> None:
         self.sensor = Sensor(**sensor)
         self.projector_grid, self.channels = projector_grid, channels
         self.exposures = as_exposures("exposures", self.sensor.exposures)
@@ -100,14 +113,18 @@ class SimulatedRig:
         checks.number("seconds", seconds, above=0.0)  # any, also where a camera would offer others
         value = np.maximum(self.sensitivity * seconds * self.radiance(codes), 0.0)
         noise, sensor = self._noise(codes, seconds), self.sensor
-        if sensor.gain is not None:  # far beyond saturation nothing changes; Poisson draws end at about 2^63
+        if (
+            sensor.gain is not None
+        ):  # far beyond saturation nothing changes; Poisson draws end at about 2^63
             value = noise.poisson(sensor.gain * np.minimum(value, 1e6)) / sensor.gain
         value = value + noise.normal(0.0, sensor.read, value.shape)
         code = sensor.black + (1.0 - sensor.black) * _apply(self._camera, 0, np.minimum(value, 1.0))
         if self.bits is None:
             return code.astype(np.float32)
         largest = (1 << self.bits) - 1
-        return np.rint(np.clip(code, 0.0, 1.0) * largest).astype(np.uint8 if largest == 255 else np.uint16)
+        return np.rint(np.clip(code, 0.0, 1.0) * largest).astype(
+            np.uint8 if largest == 255 else np.uint16
+        )
 
     def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
         """Skip the noise of a photograph that was taken in an earlier session."""
@@ -162,7 +179,8 @@ class VirtualRig(SimulatedRig):
 
     Parameters
     ----------
-    T : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3, or a Transport, with its mixing
+    T : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3, or a Transport, with its
+    mixing
     grid, camera_grid : (h, w), (H, W)
         Of the projector, N = h w; of the photographs, needed where that is another.
     camera_map, mixing : (H W, M) matrix, (3, 3), optional
@@ -192,7 +210,9 @@ class VirtualRig(SimulatedRig):
         **sensor: Any,
     ) -> None:
         if getattr(T, "blocks", None) is not None:
-            raise InputError("T has blocks between colours; it must have one matrix a channel, and a mixing")
+            raise InputError(
+                "T has blocks between colours; it must have one matrix a channel, and a mixing"
+            )
         matrices = layout.matrices(getattr(T, "matrices", T), "T")
         self._T = [A.astype(np.float32) if A.dtype.kind in "iub" else A for A in matrices]
         rows, columns = self._T[0].shape
@@ -201,8 +221,12 @@ class VirtualRig(SimulatedRig):
         (pixels, width), self._map = (maps[0].shape, maps[0]) if maps else ((rows, rows), None)
         if len(maps) > 1 or width != rows:
             shape = f"{len(maps)} x {(pixels, width)}"
-            raise InputError(f"camera_map has shape {shape}; it must be 1 x (H W, {rows}), the rows of T")
-        self.camera_grid = checks.grid("camera_grid", grid if camera_grid is None else camera_grid, pixels)
+            raise InputError(
+                f"camera_map has shape {shape}; it must be 1 x (H W, {rows}), the rows of T"
+            )
+        self.camera_grid = checks.grid(
+            "camera_grid", grid if camera_grid is None else camera_grid, pixels
+        )
         mixing = getattr(T, "mixing", None) if mixing is None else mixing
         self._mixing = None if mixing is None else layout.mixing(mixing, self.channels, None)
         a = checks.finite("ambient", checks.real("ambient", ambient)).astype(np.float64)
@@ -214,13 +238,19 @@ class VirtualRig(SimulatedRig):
         mapped = None if self._map is None else fingerprint(self._map)
         digests = {"transport": fingerprint(*self._T), "ambient": fingerprint(self.ambient)}
         self._facts = {"kind": "virtual", "digests": digests | {"camera_map": mapped}}
-        self._facts |= {"camera_grid": self.camera_grid, "ambient": self.ambient.mean(axis=0).tolist()}
+        self._facts |= {
+            "camera_grid": self.camera_grid,
+            "ambient": self.ambient.mean(axis=0).tolist(),
+        }
         self._facts["mixing"] = None if self._mixing is None else self._mixing.tolist()
 
     def _radiance(self, codes: np.ndarray) -> np.ndarray:
         p = self._light(codes)
         q = (p if self._mixing is None else p @ self._mixing.T).reshape(-1, self.channels)
-        L = np.stack([T @ q[:, c].astype(T.dtype) for c, T in enumerate(self._T)], axis=-1) + self.ambient
+        L = (
+            np.stack([T @ q[:, c].astype(T.dtype) for c, T in enumerate(self._T)], axis=-1)
+            + self.ambient
+        )
         L = L if self._map is None else self._map @ L
         return L.reshape(self.camera_grid if self.channels == 1 else (*self.camera_grid, 3))
 
@@ -230,9 +260,10 @@ def camera_map(
 ) -> scipy.sparse.csr_array:
     """C for `VirtualRig`: the part of the rays through camera pixel m that end in projector pixel n.
 
-    C is (H W, h w), float64. place(u, v) gives column and row of the projector (x, y) that the ray through
-    column u and row v of the camera hits, arrays of one shape, centres of pixels at integers; NaN or a place
-    outside the grid for nothing lit. Of `points` rays a side, entries are good to about 1 / points^1.5.
+    C is (H W, h w), float64. place(u, v) gives column and row of the projector (x, y) that the ray
+    through column u and row v of the camera hits, arrays of one shape, centres of pixels at
+    integers; NaN or a place outside the grid for nothing lit. Of `points` rays a side, entries are
+    good to about 1 / points^1.5.
 
     >>> camera_map(lambda u, v: (2 * u + 0.5, v), (1, 2), (1, 4)).toarray()  # twice as coarse
     array([[0.5, 0.5, 0. , 0. ],
@@ -246,7 +277,9 @@ def camera_map(
     for dv, du in itertools.product(offsets, offsets):
         x, y, _ = np.broadcast_arrays(*place(u + du, v + dv), u)
         column, row = np.floor(x + 0.5).ravel(), np.floor(y + 0.5).ravel()
-        hit = np.flatnonzero((column >= 0) & (column < w) & (row >= 0) & (row < h))  # NaN is nowhere
+        hit = np.flatnonzero(
+            (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        )  # NaN is nowhere
         n = (row[hit] * w + column[hit]).astype(np.int64)
         C = C + scipy.sparse.csr_array((np.ones(len(hit)), (hit, n)), shape=C.shape)
     return scipy.sparse.csr_array(C / k**2)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Columns of T, batch by batch: patterns, decoding, thresholds, and rows that add up to white.
 
-A batch is a block of columns of the store: pixels that follow each other. Its photographs depend on nothing
-but the calibration, so that a scan which was stopped goes on with the next block.
+A batch is a block of columns of the store: pixels that follow each other. Its photographs depend on
+nothing but the calibration, so that a scan which was stopped goes on with the next block.
 """
 
 from __future__ import annotations
@@ -23,18 +23,23 @@ from ltcl.store import BlockStore
 
 _KNOWN = 1e-3 * UNKNOWN  # variances from there on are of unknown values
 _TILE = 4  # sides of tiles, from one to the next
-_RUN = 8  # columns that share light that only their sum shows (16: errors of bounces 1.25 times as forecast)
+# columns that share light that only their sum shows (16: errors of bounces 1.25 times as forecast)
+_RUN = 8
 SUMS = "scanned.sums"
 """Extra array (channels, N) of a store: row sums of T by its columns, before they were made to add up."""
 
 
 def scan(
-    pictures: Pictures, code: Code, store: BlockStore, sigmas: float, progress: Callable[[int], None]
+    pictures: Pictures,
+    code: Code,
+    store: BlockStore,
+    sigmas: float,
+    progress: Callable[[int], None],
 ) -> None:
     """Photograph, decode and commit every block of columns that is not in the store.
 
-    `sigmas` is that of `significant`. `progress` is called with the number of patterns of earlier runs, then
-    with 1 for each.
+    `sigmas` is that of `significant`. `progress` is called with the number of patterns of earlier
+    runs, then with 1 for each.
     """
     missing = sorted({block for _, block in store.missing()})
     spans = [store.layout.span(block, "columns") for block in range(store.layout.blocks("columns"))]
@@ -52,7 +57,9 @@ def scan(
     for block in missing:
         batch = pictures.take(patterns(block), progress)
         for c in range(pictures.channels):
-            value, variance = np.stack([(image.value[c], image.variance[c]) for image in batch], axis=1)
+            value, variance = np.stack(
+                [(image.value[c], image.variance[c]) for image in batch], axis=1
+            )
             x, v = code.decode(value, variance, pictures.ambient[c])
             start, stop = spans[block]
             x, v = x[: stop - start], v[: stop - start]
@@ -69,9 +76,10 @@ def scan(
 class Pixels:
     """Batches of `size` pixels, one at a time, and all of them at once, which is brighter.
 
-    Without that, T p deviates by 1.5 % in place of 0.6 (`bench/acquire.py`, 16 x 16 pixels and 8 bits). Of B
-    pictures x_j and that of all, G, of variances v_j and g, less the same ambient light of variance a, the
-    rest r = sum_j x_j - G has the variance R = sum_j v_j + g + (B - 1)^2 a. The best columns are
+    Without that, T p deviates by 1.5 % in place of 0.6 (`bench/acquire.py`, 16 x 16 pixels and 8
+    bits). Of B pictures x_j and that of all, G, of variances v_j and g, less the same ambient light
+    of variance a, the rest r = sum_j x_j - G has the variance R = sum_j v_j + g + (B - 1)^2 a. The
+    best columns are
 
         x_j - (v_j + (B - 1) a) r / R,    of variance v_j + a - (v_j + (B - 1) a)^2 / R
 
@@ -118,10 +126,10 @@ class Hadamard:
     """Batches of `size` = n = 2^k - 1 pixels, under S-matrices; InputError of another size.
 
     With H the Sylvester matrix of order n + 1, S = (1 - H) / 2 without the first row and column has
-    (n + 1) / 2 pixels on in every row; its inverse is 2 / (n + 1) (2 S^T - 1). Each column has the variance
-    4 / (n + 1)^2 (V + a), of V = sum_k v_k and the ambient light's a: better than one pixel at a time where
-    noise does not depend on the light, worse where it is that of photons. Two columns have the correlation
-    (a - V / n) / (V + a): errors nearly cancel in the sum of all.
+    (n + 1) / 2 pixels on in every row; its inverse is 2 / (n + 1) (2 S^T - 1). Each column has the
+    variance 4 / (n + 1)^2 (V + a), of V = sum_k v_k and the ambient light's a: better than one
+    pixel at a time where noise does not depend on the light, worse where it is that of photons. Two
+    columns have the correlation (a - V / n) / (V + a): errors nearly cancel in the sum of all.
 
     >>> Hadamard(3).patterns(3).astype(int).tolist()
     [[1, 0, 1], [0, 1, 1], [1, 1, 0]]
@@ -186,15 +194,16 @@ def significant(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Entries (k, M) of k columns, and which are light, not noise of the sensor: sums are tested.
 
-    An entry more than `sigmas` standard deviations from 0 counts, or one of unknown variance. Of the others,
-    all entries of a tile of 4 x 4 pixels count where their sum is, then of 16 x 16, and so on to the whole
-    grid (h, w); then the same over all columns: without, bounces 2 and 3 deviate by two to three times their
-    forecast (`bench/acquire.py`). Both signs are treated alike: no bias. 0 keeps everything. `correlation`
-    (M,) is that of errors of two columns of one variance: far light of S-matrices, which is significant only
-    in the sum of a batch, is lost without it (7 % of the light in a colour of 32 x 32 pixels and 8 bits).
+    An entry more than `sigmas` standard deviations from 0 counts, or one of unknown variance. Of
+    the others, all entries of a tile of 4 x 4 pixels count where their sum is, then of 16 x 16, and
+    so on to the whole grid (h, w); then the same over all columns: without, bounces 2 and 3 deviate
+    by two to three times their forecast (`bench/acquire.py`). Both signs are treated alike: no
+    bias. 0 keeps everything. `correlation` (M,) is that of errors of two columns of one variance:
+    far light of S-matrices, which is significant only in the sum of a batch, is lost without it (7
+    % of the light in a colour of 32 x 32 pixels and 8 bits).
 
-    Entries that count in sums over all columns only become the mean of `_RUN` neighbouring columns: what
-    tells these apart is noise. Of S-matrices in colours it is 0.4 % of T p.
+    Entries that count in sums over all columns only become the mean of `_RUN` neighbouring columns:
+    what tells these apart is noise. Of S-matrices in colours it is 0.4 % of T p.
     """
     if checks.number("sigmas", sigmas, least=0.0) == 0.0:
         return value, np.ones(value.shape, bool)
@@ -208,13 +217,16 @@ def significant(
                 for x in (value, variance, np.ones_like(value))
             )
             noise *= 1.0 + correlation * np.maximum(terms - 1.0, 0.0)
-            total, noise = (tiles.sum(np.moveaxis(x.reshape(-1, *grid), 0, -1)) for x in (light, noise))
+            total, noise = (
+                tiles.sum(np.moveaxis(x.reshape(-1, *grid), 0, -1)) for x in (light, noise)
+            )
             far = tiles.enlarged((total**2 > sigmas**2 * noise).astype(np.float32)) > 0
             keep |= np.moveaxis(far, -1, 0).reshape(-1, value.shape[1])
     together = keep & ~own
     starts = np.arange(0, len(value), _RUN)
     light, terms = (
-        np.add.reduceat(np.where(together, x, 0.0), starts, axis=0) for x in (value, np.ones_like(value))
+        np.add.reduceat(np.where(together, x, 0.0), starts, axis=0)
+        for x in (value, np.ones_like(value))
     )
     mean = np.repeat(light / np.maximum(terms, 1.0), _RUN, axis=0)[: len(value)]
     return np.where(together, mean, value), keep
@@ -224,14 +236,19 @@ def variances(store: BlockStore, channel: int) -> Iterator[tuple[np.ndarray, ...
     """Rows, columns, entries of T and their variances, of all columns in a store that are known."""
     for block in range(store.layout.blocks("columns")):
         C, V = store.block(channel, block)
-        j = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr)) + store.layout.span(block, "columns")[0]
+        j = (
+            np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
+            + store.layout.span(block, "columns")[0]
+        )
         yield tuple(x[np.isfinite(V)] for x in (C.indices, j, C.data, V))
 
 
 def sums(store: BlockStore, channel: int) -> np.ndarray:
     """Row sums (M,) of the columns in a store, float64."""
     blocks = range(store.layout.blocks("columns"))
-    return np.sum([store.block(channel, b).matrix.sum(axis=0, dtype=np.float64) for b in blocks], axis=0)
+    return np.sum(
+        [store.block(channel, b).matrix.sum(axis=0, dtype=np.float64) for b in blocks], axis=0
+    )
 
 
 def deviation(sums: np.ndarray, white: Picture) -> float:
@@ -246,14 +263,16 @@ def balance(
 ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Rows of T (rows, N) and the variance (nnz,) of their entries, which add up to white (rows,).
 
-    White is photographed many times, while N columns add up whatever is wrong with each: what thresholds
-    dropped, and an error of the ambient light. Of a row with entries x_j of variance v_j and white w of
-    variance u the best estimate, for independent errors, is
+    White is photographed many times, while N columns add up whatever is wrong with each: what
+    thresholds dropped, and an error of the ambient light. Of a row with entries x_j of variance v_j
+    and white w of variance u the best estimate, for independent errors, is
 
-        x_j + v_j r / (V + u),    of variance v_j - v_j^2 / (V + u),    r = w - sum_j x_j,    V = sum_j v_j
+        x_j + v_j r / (V + u),    of variance v_j - v_j^2 / (V + u),    r = w - sum_j x_j,    V =
+        sum_j v_j
 
-    Entries that were dropped count in V, each with the median v_j of its row; their part of r goes to the
-    others. Rows stay as they are where white is not known, or an entry of theirs is not (NaN).
+    Entries that were dropped count in V, each with the median v_j of its row; their part of r goes
+    to the others. Rows stay as they are where white is not known, or an entry of theirs is not
+    (NaN).
 
     >>> T = scipy.sparse.csr_array([[0.5, 0.1]])
     >>> rows, v = balance(T, np.array([3.0, 1.0]), Picture(np.array([0.7]), np.array([1.0])))
@@ -267,7 +286,9 @@ def balance(
     total = stored + dropped + white.variance
     known = np.isfinite(total) & white.known & (stored > 0)
     stored, total = np.where(known, stored, 1.0), np.where(known, total, np.inf)
-    move = np.where(known, (white.value - matrix.sum(axis=1)) * (1.0 + dropped / stored) / total, 0.0)
+    move = np.where(
+        known, (white.value - matrix.sum(axis=1)) * (1.0 + dropped / stored) / total, 0.0
+    )
     spread = np.nan_to_num(variance)  # unknown ones are in rows that stay
     values = matrix.data + spread * np.repeat(move, each)
     rows = scipy.sparse.csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)

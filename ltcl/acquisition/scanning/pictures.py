@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What patterns of pixels, on or off, show on the pixels of the scan: columns of T, or sums of columns.
 
-Every photograph goes the same way: exposures merged to radiance, on the projector's pixels, averaged over the
-blocks of the scan, less the ambient light, in units of the light that all channels of the projector send.
-Before a batch is kept, its photographs are compared in units of the noise (`agreement`):
+Every photograph goes the same way: exposures merged to radiance, on the projector's pixels,
+averaged over the blocks of the scan, less the ambient light, in units of the light that all
+channels of the projector send. Before a batch is kept, its photographs are compared in units of the
+noise (`agreement`):
 
     exposures     of one pattern show the same light
     patterns      no picture of a batch shows the pattern of another (all that one exposure allows)
@@ -27,8 +28,8 @@ from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.session import acquisition_error
 from ltcl.errors import AcquisitionError
-from ltcl.noise import Noise
 from ltcl.store import BlockStore
+from ltcl.transport.noise import Noise
 
 UNKNOWN = np.float32(1e12)
 """The variance of a value of which nothing is known."""
@@ -63,8 +64,9 @@ class _Shot(NamedTuple):
 class Seen:
     """What a calibration shows of the pixels of the scan: M = N = h w of its `grid`, in 1 or 3 `channels`.
 
-    `white` is the picture of row sums of T, `ambient` (channels, M) the variance of the ambient light, which
-    is subtracted from each picture; the camera sees the pixels `seen` (M,), with `sharpness` (None: exactly).
+    `white` is the picture of row sums of T, `ambient` (channels, M) the variance of the ambient
+    light, which is subtracted from each picture; the camera sees the pixels `seen` (M,), with
+    `sharpness` (None: exactly).
     """
 
     def __init__(self, calibration: Calibration, side: int = 1) -> None:
@@ -73,7 +75,10 @@ class Seen:
         self.grid = self.blocks.grid
         self.seen = self.blocks.sum(calibration.resampling.seen.astype(np.float32)).ravel() > 0
         self.sharpness = calibration.sharpness and calibration.sharpness.of_blocks(side)
-        self.white, self._dark = self._on_grid(calibration.white), self._on_grid(calibration.ambient)
+        self.white, self._dark = (
+            self._on_grid(calibration.white),
+            self._on_grid(calibration.ambient),
+        )
         self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0)
 
     @classmethod
@@ -122,7 +127,9 @@ class Pictures(Seen):
             shots = [(codes, t) for codes in batch for t in times]
             self.shots.prepare([*shots, (anchor.marked(batch), times[0])])
 
-    def take(self, patterns: Iterable[np.ndarray], progress: Callable[[int], None]) -> list[Picture]:
+    def take(
+        self, patterns: Iterable[np.ndarray], progress: Callable[[int], None]
+    ) -> list[Picture]:
         """A picture under each pattern (h, w) of the scan, on where it is not 0; `progress(1)` after each.
 
         AcquisitionError where photographs deviate from what is known of them.
@@ -136,7 +143,9 @@ class Pictures(Seen):
             if self._deviation(shot) is not None:
                 suspects = [shot, *(self._photograph(c, times) for c in batch[k + 1 : k + 2])]
                 found = [(s.numbers, d) for s in suspects if (d := self._deviation(s)) is not None]
-                texts = [deviation.describe(numbers, self.shots.name) for numbers, deviation in found]
+                texts = [
+                    deviation.describe(numbers, self.shots.name) for numbers, deviation in found
+                ]
                 text = self._rearranged(suspects) if len(texts) == 2 else None
                 raise AcquisitionError(f"{text or '; '.join(texts)}; {ADVICE}")
             light = self._merge(shot)
@@ -187,10 +196,14 @@ class Pictures(Seen):
             return True
 
         every = list(range(len(images)))
-        missing = [names[k] for k in every[: len(every) // 2] if agree([*every[:k], None, *every[k:-1]])]
+        missing = [
+            names[k] for k in every[: len(every) // 2] if agree([*every[:k], None, *every[k:-1]])
+        ]
         if missing:
             return f"{' or '.join(missing)} is missing, and the next ones have moved up by one"
-        orders = ((a, b, [{a: b, b: a}.get(k, k) for k in every]) for a, b in combinations(every, 2))
+        orders = (
+            (a, b, [{a: b, b: a}.get(k, k) for k in every]) for a, b in combinations(every, 2)
+        )
         pairs = [f"{names[a]} and {names[b]}" for a, b, order in orders if agree(order)]
         return f"{', or '.join(pairs[:2])} are exchanged" if pairs else None
 
@@ -199,8 +212,9 @@ class Pictures(Seen):
     ) -> None:
         """Raise AcquisitionError about a picture a that shows the pattern of another one of its batch, b.
 
-        Relative to white, it is four times as bright where b alone is lit as where a alone is, beyond the
-        noise. As it may show a mirror, b must show another pattern too, or the same light as a.
+        Relative to white, it is four times as bright where b alone is lit as where a alone is,
+        beyond the noise. As it may show a mirror, b must show another pattern too, or the same
+        light as a.
         """
         w, noise = np.sum(self.white, axis=1)
         clear = w > _CLEAR * np.sqrt(noise)
@@ -214,7 +228,11 @@ class Pictures(Seen):
         pixels = np.maximum(count, 1.0)
         of_b, of_a = (masks * value) @ others / pixels
         noise = np.sum((masks * variance) @ others / pixels**2, axis=0)
-        shows = (count > 0).all(axis=0) & (of_b > _RATIO * of_a) & (of_b - of_a > _SIGMAS * np.sqrt(noise))
+        shows = (
+            (count > 0).all(axis=0)
+            & (of_b > _RATIO * of_a)
+            & (of_b - of_a > _SIGMAS * np.sqrt(noise))
+        )
         for a, b in np.argwhere(shows):
             both = known[a] & known[b]
             z2 = (value[a] - value[b]) ** 2 / (variance[a] + variance[b] + (_MODEL * value[b]) ** 2)
@@ -225,14 +243,17 @@ class Pictures(Seen):
     def _check_anchor(self, blocks: _Shot, shots: Sequence[_Shot]) -> None:
         """Raise AcquisitionError if the pattern of blocks is not what it was in the calibration.
 
-        It names the photographs of the batch (with `anchor.compact` images) that show it first, or just not.
+        It names the photographs of the batch (with `anchor.compact` images) that show it first, or
+        just not.
         """
         known, (image,), (seconds,) = self.calibration, blocks.images, blocks.seconds
         if known.anchor is None or known.anchor.deviation(image, seconds, self._sensor) is None:
             return
         shots = [*shots, blocks._replace(images=[anchor.compact(self._merge(blocks))])]
         *shifts, moved = (
-            anchor.shift_of(shot.codes, shot.images[0], known.white, known.ambient, known.resampling)
+            anchor.shift_of(
+                shot.codes, shot.images[0], known.white, known.ambient, known.resampling
+            )
             for shot in shots
         )
         first = anchor.first_moved(shifts, moved)
@@ -247,12 +268,14 @@ class Pictures(Seen):
 class Log:
     """Pictures in the order in which an adaptive scan asks for them, a batch in each block of a store.
 
-    What it asks for next depends on nothing but the pictures before. So a scan that was stopped is run again
-    from its start with the pictures of the log, to the bit the same, until it asks for a new one. `done`
-    counts those that were asked for.
+    What it asks for next depends on nothing but the pictures before. So a scan that was stopped is
+    run again from its start with the pictures of the log, to the bit the same, until it asks for a
+    new one. `done` counts those that were asked for.
     """
 
-    def __init__(self, store: BlockStore, pictures: Pictures, progress: Callable[[int], None]) -> None:
+    def __init__(
+        self, store: BlockStore, pictures: Pictures, progress: Callable[[int], None]
+    ) -> None:
         self._store, self._pictures, self._progress = store, pictures, progress
         self._batches = self.done = 0
 
@@ -279,8 +302,12 @@ class Log:
         pictures = self._pictures.take(patterns, self._count)
         places = tuple(np.indices((len(pictures), pixels)).reshape(2, -1))
         for c in range(self._pictures.channels):
-            value, variance = np.concatenate([(p.value[c], p.variance[c]) for p in pictures], axis=1)
-            self._store.write(c, number, scipy.sparse.csr_array((value, places), shape=shape), variance)
+            value, variance = np.concatenate(
+                [(p.value[c], p.variance[c]) for p in pictures], axis=1
+            )
+            self._store.write(
+                c, number, scipy.sparse.csr_array((value, places), shape=shape), variance
+            )
         return pictures
 
     def _is_written(self, number: int) -> bool:

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs, time, disk space and errors of a scan, before its first photograph.
 
-For N pixels with direct light d, indirect light g of all pixels together and ambient light a (radiance), an
-entry of T off its diagonal is about l = g / N. A photograph of radiance L and t seconds has the variance
-V(L) = variance(L t) / t^2 of the noise model; several are merged as 1 / V = sum_k 1 / V_k. Entries have
+For N pixels with direct light d, indirect light g of all pixels together and ambient light a
+(radiance), an entry of T off its diagonal is about l = g / N. A photograph of radiance L and t
+seconds has the variance V(L) = variance(L t) / t^2 of the noise model; several are merged as 1 / V
+= sum_k 1 / V_k. Entries have
 
     pixel      V(l + a);  V(d + a) on the diagonal
     hadamard   2 / m V(m l + a) in batches of n pixels, m = (n + 1) / 2 of them lit at a time;
                2 / m (V(d + m l + a) + V(m l + a)) / 2 in the batch of the camera pixel's own light
 
-A picture T p of random light p in [0, 1] sums a row up, which is corrected to the sum that white shows. Of
-the variances v of a row e^2 = (sum v - sum v^2 / sum v) / 3 / (d + g)^2 is left, relative to T p. A scan by
-cells has about K = 3 log4 N of them with V(g / K + a) for all of p, and half its threshold is spread.
+A picture T p of random light p in [0, 1] sums a row up, which is corrected to the sum that white
+shows. Of the variances v of a row e^2 = (sum v - sum v^2 / sum v) / 3 / (d + g)^2 is left, relative
+to T p. A scan by cells has about K = 3 log4 N of them with V(g / K + a) for all of p, and half its
+threshold is spread.
 """
 
 from __future__ import annotations
@@ -51,8 +53,9 @@ class Light:
 class Plan:
     """Of one strategy, on a `grid` (h, w).
 
-    `patterns` of the scan (of an adaptive one at most); `photographs`, those of the `calibration` included;
-    `seconds` of all, with overhead; bytes on `disk` at most; relative `error` of T p by noise, 1 at most.
+    `patterns` of the scan (of an adaptive one at most); `photographs`, those of the `calibration`
+    included; `seconds` of all, with overhead; bytes on `disk` at most; relative `error` of T p by
+    noise, 1 at most.
     """
 
     strategy: str
@@ -85,17 +88,22 @@ def plans(
 ) -> dict[str, Plan]:
     """A plan for every strategy.
 
-    Each pattern is photographed at all `exposures` (seconds, ascending), each batch of patterns ends with one
-    more photograph (`acquisition.anchor`), and each takes `overhead` seconds besides. `noise` and `light` are
-    guessed before the calibration, then `measured`; it takes `calibration` photographs, by default as
-    `acquisition.calibrate` expects. The others are as in `ltcl.acquire`.
+    Each pattern is photographed at all `exposures` (seconds, ascending), each batch of patterns
+    ends with one more photograph (`acquisition.anchor`), and each takes `overhead` seconds besides.
+    `noise` and `light` are guessed before the calibration, then `measured`; it takes `calibration`
+    photographs, by default as `acquisition.calibrate` expects. The others are as in `ltcl.acquire`.
 
     >>> strategies = plans((64, 64), (0.5, 8.0))
     >>> strategies["pixel"].patterns, strategies["adaptive"].patterns < 1000
     (4160, True)
     """
     noise, light = noise or NoiseModel(), light or Light()
-    d, g, white, times = light.direct, light.indirect, light.direct + light.indirect, np.array(exposures)
+    d, g, white, times = (
+        light.direct,
+        light.indirect,
+        light.direct + light.indirect,
+        np.array(exposures),
+    )
     before = photographs(grid, channels=channels) if calibration is None else calibration
 
     def variance(radiance: float) -> float:
@@ -124,10 +132,16 @@ def plans(
                 own = (other + 2.0 / m * variance(d + m * g / n)) / 2
             total = bright * own + (n - bright) * other
             square = (total - (bright * own**2 + (n - bright) * other**2) / total) / 3.0
-        error = math.hypot(math.sqrt(max(square, 0.0)) / white, _SYSTEMATIC) if math.isfinite(square) else 1.0
+        error = (
+            math.hypot(math.sqrt(max(square, 0.0)) / white, _SYSTEMATIC)
+            if math.isfinite(square)
+            else 1.0
+        )
         batches = -(-(patterns if name == "adaptive" else n) // size)
         count = before + len(times) * patterns + batches
-        seconds = before * math.sqrt(times[0] * times[-1]) + patterns * times.sum() + batches * times[0]
+        seconds = (
+            before * math.sqrt(times[0] * times[-1]) + patterns * times.sum() + batches * times[0]
+        )
         seconds, disk = float(seconds + count * overhead), channels * _BYTES * entries
         result[name] = Plan(name, pixels, patterns, before, count, seconds, disk, min(error, 1.0))
     return result
@@ -136,7 +150,11 @@ def plans(
 def measured(calibration: Calibration) -> Light:
     """The light of a measured scene; which part of it is indirect is taken as a quarter."""
     white, dark = (light.value[light.valid] for light in (calibration.white, calibration.ambient))
-    lit = float(np.median(white[white > 0.1 * white.max(initial=0.0)])) if white.size else Light().direct
+    lit = (
+        float(np.median(white[white > 0.1 * white.max(initial=0.0)]))
+        if white.size
+        else Light().direct
+    )
     ambient = max(float(np.median(dark)), 0.0) if dark.size else 0.0
     return Light((1.0 - _INDIRECT) * lit, _INDIRECT * lit, ambient)
 

@@ -24,16 +24,20 @@ class Report:
 
     Attributes
     ----------
-    patterns, photographs : of the scan, without those of the calibration and of the blocks after each batch
+    patterns, photographs : of the scan, without those of the calibration and of the blocks after
+    each batch
     exposures : seconds
     coverage, doubtful, masked : parts of the projector's pixels
         Seen by the camera; too dark next to bright ones, and so masked; without a first bounce.
     saturated : part of the camera's pixels that saturate in all exposures under white
-    sharpness, blur : of light at a pixel, the part that is its own; relative error of a picture of noise
+    sharpness, blur : of light at a pixel, the part that is its own; relative error of a picture of
+    noise
         By `acquisition.geometry.sharpness`; NaN of an aligned camera.
     entries, unknown : stored, of all channels; part of them without a valid photograph, which are 0
-    noise_direct, noise_sum : median relative standard deviation of the first bounce, and of row sums
-    sum_deviation : relative deviation (rms) of sums of measured columns from white; NaN of an adaptive scan
+    noise_direct, noise_sum : median relative standard deviation of the first bounce, and of row
+    sums
+    sum_deviation : relative deviation (rms) of sums of measured columns from white; NaN of an
+    adaptive scan
 
     Examples
     --------
@@ -99,7 +103,9 @@ class Report:
             unknown=unknown / max(entries, 1),
             noise_direct=_noise(variance, F, F > 0),
             noise_sum=_noise(white.variance, white.value, white.known & (white.value > 0)),
-            sum_deviation=columns.deviation(scan.extra(columns.SUMS), white) if measured else math.nan,
+            sum_deviation=columns.deviation(scan.extra(columns.SUMS), white)
+            if measured
+            else math.nan,
         )
 
     def to_json(self) -> str:

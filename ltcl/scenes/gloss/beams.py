@@ -2,21 +2,21 @@
 """Exchange of light fields between patches: G of A = K G (eq. 4), found by rays, reciprocal and lossless.
 
 A beam is a patch and a bin of directions over it (`brdf`); beam i M + m of N patches and M
-bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x projected
-solid angle) shared by two beams is the same from both ends:
+bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x
+projected solid angle) shared by two beams is the same from both ends:
 
     G = diag(1 / e) E,    E = E^T,    e_a = area pi / M    (here without the pi)
 
-Every beam sends `rays` rays, spread over patch and bin alike, so E is found twice, from each end. The mean
-of both is reciprocal but makes or loses a little light, so E is scaled as Sinkhorn scales matrices: with
-l_a the etendue of a's rays that met nothing, or what is black,
+Every beam sends `rays` rays, spread over patch and bin alike, so E is found twice, from each end.
+The mean of both is reciprocal but makes or loses a little light, so E is scaled as Sinkhorn scales
+matrices: with l_a the etendue of a's rays that met nothing, or what is black,
 
     d_a (sum_b E_ab d_b + l_a) = e_a
 
 Rows of G then sum to 1 - d l / e, in a closed room to 1.
 
-Known limit: row sums are exact to rounding, as no light may be made. Where the scaling has not settled in
-the last round, because rays are few, it is reciprocity that is off by what is left.
+Known limit: row sums are exact to rounding, as no light may be made. Where the scaling has not
+settled in the last round, because rays are few, it is reciprocity that is off by what is left.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def exchange(
 ) -> scipy.sparse.csr_array:
     """Light that beams get from beams, (N M, N M), N = n * n * len(walls): incoming = G outgoing radiance.
 
-    M `directions` are a square number, `rays` are followed from each beam past boxes (B, 2, 3) along the
-    axes, from places that `seed` decides. InputError: a number is out of range. MemoryLimitError: so many
-    rays do not fit in the memory of the host.
+    M `directions` are a square number, `rays` are followed from each beam past boxes (B, 2, 3)
+    along the axes, from places that `seed` decides. InputError: a number is out of range.
+    MemoryLimitError: so many rays do not fit in the memory of the host.
 
     >>> from ltcl.scenes.builders import WALLS
     >>> G = exchange(WALLS, 2, directions=16, rays=16)
@@ -82,7 +82,9 @@ def _places(patches: int, k: int, rays: int, generator: np.random.Generator) -> 
 
     One set of low discrepancy, shifted for each beam (Cranley and Patterson 1976).
     """
-    sobol = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(int(np.ceil(np.log2(rays))))[:rays]
+    sobol = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(int(np.ceil(np.log2(rays))))[
+        :rays
+    ]
     places = (sobol + generator.random((patches, k * k, 1, 4))) % 1.0
     row, column = np.arange(k * k) % k, np.arange(k * k) // k
     places[..., 2:] = (places[..., 2:] + np.stack([column, row], axis=1)[:, None, :]) / k
@@ -90,19 +92,28 @@ def _places(patches: int, k: int, rays: int, generator: np.random.Generator) -> 
 
 
 def _met(
-    walls: Sequence[Wall], n: int, patches: Patches, some: np.ndarray, places: np.ndarray, blocks: Any
+    walls: Sequence[Wall],
+    n: int,
+    patches: Patches,
+    some: np.ndarray,
+    places: np.ndarray,
+    blocks: Any,
 ) -> scipy.sparse.csr_array:
     """How many rays of each beam of `some` patches end in each beam, (N M, N M)."""
     _, bins, rays, _ = places.shape
     k, axes = int(np.sqrt(bins)), patches.frames
     u, v = places[..., :1] - 0.5, places[..., 1:2] - 0.5
-    right, down, centre = (getattr(patches, edge)[some, None, None] for edge in ("right", "down", "centre"))
+    right, down, centre = (
+        getattr(patches, edge)[some, None, None] for edge in ("right", "down", "centre")
+    )
     origins = (centre + u * right + v * down).reshape(-1, 3)
     vectors = brdf.from_square(places[..., 2:]).reshape(len(some), -1, 3) @ axes[some]
     vectors = vectors.reshape(-1, 3)
     hits = cast(walls, origins, vectors, blocks)
     good = np.flatnonzero(hits.wall >= 0)
-    row, column = (np.minimum((place[good] * n).astype(np.intp), n - 1) for place in (hits.v, hits.u))
+    row, column = (
+        np.minimum((place[good] * n).astype(np.intp), n - 1) for place in (hits.v, hits.u)
+    )
     there = row * (n * len(walls)) + hits.wall[good] * n + column
     back = np.einsum("rij,rj->ri", axes[there], -vectors[good])
     sent = some[good // (bins * rays)] * bins + good // rays % bins

@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Glossy reflection that keeps all light and obeys reciprocity, exactly, in bins of directions.
 
-A direction (x, y, z), z along the normal, is known by its shadow (x, y) on the unit disk, and equal areas
-of the disk are equal projected solid angles (Nusselt). The concentric map of Shirley and Chiu, "A low
-distortion map between disk and square", J. Graphics Tools 2(3), 1997, turns the disk into the unit square
-and keeps ratios of areas; k x k cells of the square are then M = k^2 bins of pi / M projected steradian
-each. Bin number: column * k + row, columns along x. So irradiance is pi times the mean radiance of the bins.
+A direction (x, y, z), z along the normal, is known by its shadow (x, y) on the unit disk, and equal
+areas of the disk are equal projected solid angles (Nusselt). The concentric map of Shirley and
+Chiu, "A low distortion map between disk and square", J. Graphics Tools 2(3), 1997, turns the disk
+into the unit square and keeps ratios of areas; k x k cells of the square are then M = k^2 bins of
+pi / M projected steradian each. Bin number: column * k + row, columns along x. So irradiance is pi
+times the mean radiance of the bins.
 
     pi f(u, v) = albedo ((1 - gloss) + gloss s(u) p(u, v) s(v)),    p = (h . normal)^exponent
 
 with h halfway between the directions u and v: a matte part and the lobe of Blinn, "Models of light
-reflection for computer synthesized pictures", SIGGRAPH 1977. Any lobe as it stands sends more light to some
-sides than to others; the scale s sets that right: each row of s p s must have the mean 1 over the bins, the
-symmetric Sinkhorn scaling of a positive matrix, which always exists. Then f(u, v) = f(v, u), and exactly the
-share `albedo` of light from any side comes back. Between bins s follows from the same condition,
-s(u) = 1 / mean_m p(u, m) s(m), so single directions (camera, projector) see a lobe as sharp as it is.
+reflection for computer synthesized pictures", SIGGRAPH 1977. Any lobe as it stands sends more light
+to some sides than to others; the scale s sets that right: each row of s p s must have the mean 1
+over the bins, the symmetric Sinkhorn scaling of a positive matrix, which always exists. Then f(u,
+v) = f(v, u), and exactly the share `albedo` of light from any side comes back. Between bins s
+follows from the same condition, s(u) = 1 / mean_m p(u, m) s(m), so single directions (camera,
+projector) see a lobe as sharp as it is.
 
-Known limit: light between bins is spread over a whole bin; lobes much narrower than one are refused.
+Known limit: light between bins is spread over a whole bin; lobes much narrower than one are
+refused.
 """
 
 from __future__ import annotations
@@ -68,7 +71,9 @@ def bins(vectors: np.ndarray, k: int) -> np.ndarray:
     x, y = vectors[..., 0], vectors[..., 1]
     steep = np.abs(x) <= np.abs(y)
     radius = np.hypot(x, y) * np.sign(np.where(steep, y, x))
-    slope = np.divide(np.where(steep, x, y), np.where(steep, y, x), out=np.zeros_like(x), where=radius != 0)
+    slope = np.divide(
+        np.where(steep, x, y), np.where(steep, y, x), out=np.zeros_like(x), where=radius != 0
+    )
     other = radius * np.arctan(slope) * 4 / np.pi
     column, row = (
         np.clip(((place + 1) / 2 * k).astype(np.intp), 0, k - 1)
@@ -81,8 +86,8 @@ def bins(vectors: np.ndarray, k: int) -> np.ndarray:
 class Lobe:
     """The part s p s of a material, between k x k bins and any other directions; mean 1 over the bins.
 
-    `places` (M, points, 3) are the directions over which means of bins are taken, `scale` (M,) is s in the
-    bins, and `between` (M, M) is symmetric, with the mean 1 in every row and column.
+    `places` (M, points, 3) are the directions over which means of bins are taken, `scale` (M,) is s
+    in the bins, and `between` (M, M) is symmetric, with the mean 1 in every row and column.
     """
 
     exponent: float
@@ -108,7 +113,10 @@ def lobe(exponent: float, k: int) -> Lobe:
     """The lobe of an exponent over k x k bins; InputError: not above 0, or too sharp for the bins to show.
 
     >>> shine = lobe(20, k=4)
-    >>> bool(np.allclose(shine.between.mean(axis=0), 1)), bool((shine.between == shine.between.T).all())
+    >>> (
+    ...     bool(np.allclose(shine.between.mean(axis=0), 1)),
+    ...     bool((shine.between == shine.between.T).all()),
+    ... )
     (True, True)
     """
     exponent = checks.number("exponent", exponent, above=0.0)
@@ -118,7 +126,9 @@ def lobe(exponent: float, k: int) -> Lobe:
             "which cannot show a sharper lobe; raise directions"
         )
     place = ((np.arange(k)[:, None] + (np.arange(_POINTS) + 0.5) / _POINTS) / k).ravel()
-    square = np.stack(np.meshgrid(place, place, indexing="ij"), axis=-1)  # spread evenly over each bin
+    square = np.stack(
+        np.meshgrid(place, place, indexing="ij"), axis=-1
+    )  # spread evenly over each bin
     cells = square.reshape(k, _POINTS, k, _POINTS, 2).swapaxes(1, 2)
     places = from_square(cells.reshape(k * k, _POINTS**2, 2))
     means = np.stack([_bin_means(own, places, exponent).mean(axis=0) for own in places])

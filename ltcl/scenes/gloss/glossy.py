@@ -3,16 +3,17 @@
 
     S = (I - A)^-1,    A = K G (eq. 4),    T = P F Q + P A F Q + P A^2 F Q + ...    (eq. 29)
 
-A light field gives each of N patches M + 1 values. Leaving a patch: radiance into M bins of directions
-(`brdf`), and last the radiance towards the camera. Arriving: radiance from the M bins,
-and last the irradiance from the projector. G (`beams`) carries light between bins; K
-(`brdf`) reflects, block by block; F is K too, as it meets the projector's light. So P and Q only
-pick and place the last values: camera and projector have the exact direction they see a patch from, not that
-of the nearest bin, and what P picks is a final gather over the light that arrives. Only between patches is
-light spread over bins.
+A light field gives each of N patches M + 1 values. Leaving a patch: radiance into M bins of
+directions (`brdf`), and last the radiance towards the camera. Arriving: radiance from the M bins,
+and last the irradiance from the projector. G (`beams`) carries light between bins; K (`brdf`)
+reflects, block by block; F is K too, as it meets the projector's light. So P and Q only pick and
+place the last values: camera and projector have the exact direction they see a patch from, not that
+of the nearest bin, and what P picks is a final gather over the light that arrives. Only between
+patches is light spread over bins.
 
-A white matte patch under unit light shows 1, as in the diffuse `Scene`. Rows of A sum to at most the albedo,
-so with m the largest albedo all bounces after A^k F Q are at most max(A^k F Q) m / (1 - m); sums stop there.
+A white matte patch under unit light shows 1, as in the diffuse `Scene`. Rows of A sum to at most
+the albedo, so with m the largest albedo all bounces after A^k F Q are at most max(A^k F Q) m / (1 -
+m); sums stop there.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ltcl import checks, layout
+from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.scenes.gloss import beams, brdf
 from ltcl.scenes.patches import cut
@@ -33,6 +34,7 @@ from ltcl.scenes.rays import Sight, sight
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Block, Wall, point, spread_albedo, vector
+from ltcl.transport import frames as layout
 
 _COLUMNS = 64  # of T computed together
 _TAIL = 1e-8  # of a white patch: all bounces left out together
@@ -45,7 +47,8 @@ class GlossyScene(Scene):
     Attributes
     ----------
     matte : Scene
-        The same room without gloss: grid, walls, albedo, viewer, and form factors found by the same rays.
+        The same room without gloss: grid, walls, albedo, viewer, and form factors found by the same
+        rays.
     G : csr_array, (N (M + 1), N (M + 1)), float64
         Light that arrives, for light that leaves. No colour.
     white : bsr_array, (N (M + 1), N (M + 1)), float64
@@ -58,7 +61,9 @@ class GlossyScene(Scene):
     Examples
     --------
     >>> from ltcl.scenes import dihedral, glossy
-    >>> scene = glossy(dihedral(2), 2, albedo=0.5, gloss=0.3, projector=(2, 1.5, 0.6), directions=16)
+    >>> scene = glossy(
+    ...     dihedral(2), 2, albedo=0.5, gloss=0.3, projector=(2, 1.5, 0.6), directions=16
+    ... )
     >>> light = scene.K @ (scene.Q @ np.ones(8))  # F Q l_in
     >>> first_bounce = scene.P @ (scene.A @ light)
     >>> bool(np.allclose(first_bounce, scene.bounces(np.ones(scene.grid), 1)[1].ravel()))
@@ -85,7 +90,8 @@ class GlossyScene(Scene):
         """Reflection: what leaves for what arrives, bsr_array; a tuple of three in colour. F is the same."""
         structure = self.white.indices, self.white.indptr
         parts = tuple(
-            scipy.sparse.bsr_array((self.white.data * r[:, None, None], *structure)) for r in self.albedo
+            scipy.sparse.bsr_array((self.white.data * r[:, None, None], *structure))
+            for r in self.albedo
         )
         return parts[0] if self.channels == 1 else parts
 
@@ -122,7 +128,9 @@ class GlossyScene(Scene):
         light = np.eye(patches)
         slices = [slice(start, start + _COLUMNS) for start in range(0, patches, _COLUMNS)]
         return tuple(
-            np.concatenate([sum(self._pictures(albedo, light[:, columns])) for columns in slices], axis=1)
+            np.concatenate(
+                [sum(self._pictures(albedo, light[:, columns])) for columns in slices], axis=1
+            )
             for albedo in self.albedo
         )
 
@@ -155,7 +163,8 @@ class GlossyScene(Scene):
         count = checks.count("count", count, least=0)
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
         series = [
-            self._pictures(albedo, light, count) for albedo, light in zip(self.albedo, columns, strict=True)
+            self._pictures(albedo, light, count)
+            for albedo, light in zip(self.albedo, columns, strict=True)
         ]
         return np.stack([shape.pack(list(parts), self.grid) for parts in zip(*series, strict=True)])
 
@@ -166,7 +175,8 @@ class GlossyScene(Scene):
         most, blocks = albedo.max(), self.white.data
         arriving, bounce = self.Q @ light.astype(np.float64), 0
         while True:
-            # K arriving, as products of dense blocks, which are much faster than those of `bsr_array`.
+            # K arriving, as products of dense blocks, which are much faster than those of
+            # `bsr_array`.
             leaving = blocks @ arriving.reshape(len(blocks), blocks.shape[1], -1)
             leaving *= albedo[:, None, None]
             leaving = leaving.reshape(arriving.shape)
@@ -196,8 +206,8 @@ def glossy(
     Parameters
     ----------
     room : Scene or sequence of Wall
-        The walls and blocks of a scene, or any walls. The faces of a block reflect where they are among the
-        walls, as in ``box(1, sides=3, occluder=Block(..., albedo=0.5))``.
+        The walls and blocks of a scene, or any walls. The faces of a block reflect where they are
+        among the walls, as in ``box(1, sides=3, occluder=Block(..., albedo=0.5))``.
     n : int
         Patches along each side of a wall.
     albedo : array_like in [0, 1)
@@ -231,8 +241,9 @@ def glossy(
 
     Notes
     -----
-    Errors of the rays fall with `rays`, those of the bins with `directions`. For gloss 0 bins do not matter:
-    then this is the diffuse scene, with form factors found by rays (about 2 % off at 64 x 64).
+    Errors of the rays fall with `rays`, those of the bins with `directions`. For gloss 0 bins do
+    not matter: then this is the diffuse scene, with form factors found by rays (about 2 % off at 64
+    x 64).
 
     Examples
     --------
@@ -256,7 +267,9 @@ def glossy(
     lights = sight("projector", projector, walls, patches, boxes)
     sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, boxes)
     exchange = beams.exchange(walls, n, directions, rays, boxes, seed)
-    entries = exchange.tocoo()  # with an empty last slot: no patch gets what others send to the camera
+    entries = (
+        exchange.tocoo()
+    )  # with an empty last slot: no patch gets what others send to the camera
     places = tuple(index + index // (slots - 1) for index in (entries.row, entries.col))
     form_factors, grid = _form_factors(exchange, patches.area), (n, n * len(walls))
     matte = name, grid, form_factors, albedos, patches.area, walls, viewer, blocks
@@ -325,6 +338,8 @@ def _reflectance(
         blocks[here, :-1, :-1] = (1 - share + share * lobe.between) / bins
         blocks[seen, -1, :-1] = (1 - share + share * lobe.towards(sees.towards[seen])) / bins
         blocks[lit, :-1, -1] = 1 - share + share * lobe.towards(lights.towards[lit])
-        blocks[both, -1, -1] = 1 - share + share * lobe.direct(lights.towards[both], sees.towards[both])
+        blocks[both, -1, -1] = (
+            1 - share + share * lobe.direct(lights.towards[both], sees.towards[both])
+        )
     places = np.arange(len(wall))
     return scipy.sparse.bsr_array((blocks, places, np.arange(len(wall) + 1)))

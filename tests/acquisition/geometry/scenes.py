@@ -27,7 +27,9 @@ def homography(camera: Grid, grid: Grid) -> Place:
     return place
 
 
-def turned(grid: Grid, size: float, turn: float, shift: tuple[float, float] = (0, 0), wide: float = 1.25):
+def turned(
+    grid: Grid, size: float, turn: float, shift: tuple[float, float] = (0, 0), wide: float = 1.25
+):
     """Places of a camera of `size` pixels to one of the projector's, turned and shifted; its grid."""
     (h, w), (H, W) = grid, (int(wide * size * n) for n in grid)
 
@@ -44,7 +46,9 @@ def places(place: Place, camera: Grid) -> tuple[np.ndarray, np.ndarray]:
     return place(u, v)
 
 
-def photographs(place: Place, camera: Grid, grid: Grid, noise: float, random: Any, indirect: float = 0.0):
+def photographs(
+    place: Place, camera: Grid, grid: Grid, noise: float, random: Any, indirect: float = 0.0
+):
     """Of Gray code: albedo 0.6, an even part `indirect` of all light, and noise."""
     C = camera_map(place, camera, grid, points=6)
     for codes in GrayCode(grid).patterns():

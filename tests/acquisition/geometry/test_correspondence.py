@@ -21,7 +21,8 @@ random = np.random.default_rng()
     ("camera", "grid", "noise", "limit"),
     [
         ((180, 230), (96, 128), 0.01, 0.08),  # whole numbers deviate by 0.41
-        # Projector pixels as large as camera pixels, and half as large: of a camera pixel a tenth at most.
+        # Projector pixels as large as camera pixels, and half as large: of a camera pixel a tenth
+        # at most.
         ((180, 230), (180, 230), 0.003, 0.03),
         ((180, 230), (300, 400), 0.003, 0.05),
         ((6, 162), (1, 40), 0.001, 0.25),
@@ -39,7 +40,12 @@ def test_known_maps_to_a_fraction_of_a_pixel(camera, grid, noise, limit):
 
 @pytest.mark.parametrize(
     ("size", "turn", "shift"),
-    [(4.0, 0.0, (-0.5, -0.9)), (3.7, -0.08, (0.9, -0.7)), (3.1, 0.0, (0.6, 0.2)), (3.3, 0.1, (-0.2, 0.8))],
+    [
+        (4.0, 0.0, (-0.5, -0.9)),
+        (3.7, -0.08, (0.9, -0.7)),
+        (3.1, 0.0, (0.6, 0.2)),
+        (3.3, 0.1, (-0.2, 0.8)),
+    ],
 )
 def test_places_and_light_are_known_up_to_the_rim(size, turn, shift) -> None:
     place, camera = turned(GRID, size, turn, shift)
@@ -83,7 +89,14 @@ def test_folds_and_occluders(place: Any, response: str, limit: float) -> None:
     """Valid pixels are right, and the light of single projector pixels survives."""
     C = camera_map(place, CAMERA, GRID)
     rig = VirtualRig(
-        corner(), GRID, camera_grid=CAMERA, camera_map=C, bits=12, seed=4, ambient=0.01, response=response
+        corner(),
+        GRID,
+        camera_grid=CAMERA,
+        camera_map=C,
+        bits=12,
+        seed=4,
+        ambient=0.01,
+        response=response,
     )
     shots = Shots(rig)
     images = [shots.photograph(codes, 0.5) for codes in GrayCode(GRID).patterns()]

@@ -28,7 +28,9 @@ def test_its_own_patterns_decode_exactly_also_in_colour(grid, levels):
     images = [p if levels is None else (20 + levels * p).astype(np.uint8) for p in code.patterns()]
     assert len(images) == code.count
     for pictures in (images, [np.stack([image, image // 2, image], axis=-1) for image in images]):
-        for axis, exact in zip(code.decode(pictures), np.mgrid[: grid[0], : grid[1]][::-1], strict=True):
+        for axis, exact in zip(
+            code.decode(pictures), np.mgrid[: grid[0], : grid[1]][::-1], strict=True
+        ):
             np.testing.assert_array_equal(axis.value, exact)
             np.testing.assert_array_equal(axis.width, 1)
 
@@ -72,7 +74,9 @@ def test_pixels_that_no_stripe_lights_are_not_valid():
     ("grid", "noise", "indirect", "least"),
     [((64, 96), 0.003, 0.0, 0.99), ((64, 96), 0.03, 0.0, 0.97), ((64, 64), 0.001, 0.9, 0.99)],
 )
-def test_hardly_a_pixel_is_wrong_with_noise_and_with_light_from_elsewhere(grid, noise, indirect, least):
+def test_hardly_a_pixel_is_wrong_with_noise_and_with_light_from_elsewhere(
+    grid, noise, indirect, least
+):
     """Direct light is 0.6 of full scale; of indirect light bits are certain up to nearly twice as much."""
     place, camera = homography((150, 200), grid), (150, 200)
     images = list(photographs(place, camera, grid, noise, random, indirect))
@@ -108,9 +112,15 @@ def test_tall_pictures_are_decoded_as_their_parts() -> None:
     ("spoil", "message"),
     [
         (lambda images: images[:-1], "photographs are 13; they must be 14"),
-        (lambda images: [*images[:3], images[3][:-1], *images[4:]], "photographs[3] has shape (7, 8)"),
+        (
+            lambda images: [*images[:3], images[3][:-1], *images[4:]],
+            "photographs[3] has shape (7, 8)",
+        ),
         (lambda images: [*images[:3], None, *images[4:]], "photographs[3] is None"),
-        (lambda images: [*images[:3], images[3] * np.nan, *images[4:]], "photographs[3] has 64 NaN"),
+        (
+            lambda images: [*images[:3], images[3] * np.nan, *images[4:]],
+            "photographs[3] has 64 NaN",
+        ),
         (lambda images: [0 * image for image in images], "photographs[12]"),
         (lambda images: [*images[:12], images[13], images[12]], "photographs[12]"),
         (lambda images: [image[:, :0] for image in images], "photographs[0] has shape (8, 0)"),

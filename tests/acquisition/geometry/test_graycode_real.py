@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs of a real projector and camera: ../shared/data/graycode-real.
 
-42 photographs, 1280 x 1024, of Gray code for 1024 x 768 in OpenCV's order, and the authors' calibration.
-The authors count a step of the code as two projector pixels.
+42 photographs, 1280 x 1024, of Gray code for 1024 x 768 in OpenCV's order, and the authors'
+calibration. The authors count a step of the code as two projector pixels.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def test_the_board_is_a_plane(points):
     """But for distortion of the two lenses, a homography takes one picture of a plane to the other."""
     camera, projector = points
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
-    distance = np.linalg.norm(cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1)
+    distance = np.linalg.norm(
+        cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1
+    )
     assert np.median(distance) < 0.15
     assert np.sqrt(np.mean(distance**2)) < 0.25
     assert np.mean(distance > 1.0) < 0.001
@@ -67,8 +69,13 @@ def test_the_board_is_a_plane(points):
 def test_the_calibration_of_the_authors_agrees(shared_data, points):
     """Points triangulated by it fall back on the pixels they came from, within its own residual of 0.86."""
     path = shared_data / "graycode-real" / "calibration_result.xml"
-    file, names = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ), ("cam_int", "cam_dist", "proj_int")
-    K, D, P, E, R, t = (file.getNode(name).mat() for name in (*names, "proj_dist", "roration", "translation"))
+    file, names = (
+        cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ),
+        ("cam_int", "cam_dist", "proj_int"),
+    )
+    K, D, P, E, R, t = (
+        file.getNode(name).mat() for name in (*names, "proj_dist", "roration", "translation")
+    )
     camera, projector = points[0][::20], STEP * points[1][::20].astype(np.float64)
     lenses = ((camera, K, D), (projector, P, E))
     rays = [cv2.undistortPoints(points[:, None], k, d)[:, 0].T for points, k, d in lenses]

@@ -92,15 +92,27 @@ def test_bad_pictures_and_maps_are_refused():
 @pytest.mark.parametrize("turn", [0.0, 0.1, 0.8])
 @pytest.mark.parametrize(
     ("size", "missing", "limit"),
-    [(1.6, 0, 0.04), (2.0, 0, 0.015), (3.0, 0, 0.005), (4.0, 0, 0.005), (3.0, 0.1, 0.02), (3.0, 0.3, 0.02)],
+    [
+        (1.6, 0, 0.04),
+        (2.0, 0, 0.015),
+        (3.0, 0, 0.005),
+        (4.0, 0, 0.005),
+        (3.0, 0.1, 0.02),
+        (3.0, 0.3, 0.02),
+    ],
 )
 def test_smaller_camera_pixels_separate_noise_pixel_by_pixel(size, missing, limit, turn):
     """Also without a part of them, whatever these show."""
     place, camera = turned(WALL, size * np.hypot(1, turn), turn, wide=1.32)
     valid = random.random(camera) >= missing
     x, y = places(place, camera)
-    inside = (np.abs(x - (WALL[1] - 1) / 2) < WALL[1] / 2) & (np.abs(y - (WALL[0] - 1) / 2) < WALL[0] / 2)
-    C, R = camera_map(place, camera, WALL, points=24), Resampling.of(known(x, y, WALL, inside & valid))
+    inside = (np.abs(x - (WALL[1] - 1) / 2) < WALL[1] / 2) & (
+        np.abs(y - (WALL[0] - 1) / 2) < WALL[0] / 2
+    )
+    C, R = (
+        camera_map(place, camera, WALL, points=24),
+        Resampling.of(known(x, y, WALL, inside & valid)),
+    )
     assert R.seen.mean() > (0.98 if missing else 0.999)
     assert R.coverage[R.seen].min() > (0.1 if missing else 0.5)
     for p in random.random((3, *WALL)):

@@ -138,4 +138,6 @@ def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_pat
     scale = (white @ exact) / (white @ white)
     assert (scale * white > 0.5 * exact).all()
     rows = np.asarray(T @ np.eye(len(rho), dtype=np.float32).reshape(-1, *GRID))
-    assert scale * rows.min() > -0.013 * exact.max()  # errors of the map at bright walls: up to 0.012
+    assert (
+        scale * rows.min() > -0.013 * exact.max()
+    )  # errors of the map at bright walls: up to 0.012

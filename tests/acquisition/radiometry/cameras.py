@@ -39,7 +39,9 @@ class Camera:
     def codes(self, light: np.ndarray) -> np.ndarray:
         """Of linear values without noise, in [0, 1]; odd below 0."""
         encode = CURVES[self.curve][0]
-        return self.black + (1 - self.black) * np.copysign(encode(np.minimum(np.abs(light), 1.0)), light)
+        return self.black + (1 - self.black) * np.copysign(
+            encode(np.minimum(np.abs(light), 1.0)), light
+        )
 
     def light(self, codes: np.ndarray) -> np.ndarray:
         """The exact response."""
@@ -52,7 +54,9 @@ class Camera:
         if not self.levels:
             return codes
         codes = np.clip(codes, 0, 1)
-        return np.rint(codes * (self.levels - 1)).astype(np.uint8 if self.levels == 256 else np.uint16)
+        return np.rint(codes * (self.levels - 1)).astype(
+            np.uint8 if self.levels == 256 else np.uint16
+        )
 
     @property
     def response(self) -> Response:

@@ -20,8 +20,8 @@ STEPS, REPEATS = 40, 8000
 def test_merged_radiance_is_unbiased_and_its_variance_true(curve, levels):
     """At every brightness, from near the noise to all but the shortest exposure saturated.
 
-    A mean of 8000 has the standard error 0.011 of the noise of one: four and a half are allowed. In 8 bits
-    the read noise is half a code, so that it dithers them.
+    A mean of 8000 has the standard error 0.011 of the noise of one: four and a half are allowed. In
+    8 bits the read noise is half a code, so that it dithers them.
     """
     camera = Camera(curve, levels, read=0.002 if levels == 256 else 0.001, black=0.02)
     light = np.repeat(np.geomspace(2.5e-3, 6.0, STEPS), REPEATS).reshape(STEPS, REPEATS)
@@ -63,14 +63,21 @@ def test_the_mean_of_repeated_photographs_and_its_variance(shots):
     """Tabulated weights are good to a thousandth."""
     merged = merge([np.array([[shot, 1.0]]) for shot in shots], [0.5] * len(shots))
     np.testing.assert_allclose(merged.value, [[0.8, 0.0]], rtol=1e-6)
-    np.testing.assert_allclose(merged.variance[0, 0], NoiseModel().variance(0.4) * 4 / len(shots), rtol=1e-3)
+    np.testing.assert_allclose(
+        merged.variance[0, 0], NoiseModel().variance(0.4) * 4 / len(shots), rtol=1e-3
+    )
     assert merged.valid.tolist() == [[True, False]]
 
 
 def test_each_channel_has_its_own_response():
-    cameras = [Camera(curve, 65536, electrons=1e9, read=0.0) for curve in ("srgb", "gamma2.2", "film")]
+    cameras = [
+        Camera(curve, 65536, electrons=1e9, read=0.0) for curve in ("srgb", "gamma2.2", "film")
+    ]
     response = Response(np.concatenate([camera.response.values for camera in cameras]))
-    shots = [np.stack([camera.shoot(corner(32), t, random) for camera in cameras], axis=-1) for t in (0.5, 1)]
+    shots = [
+        np.stack([camera.shoot(corner(32), t, random) for camera in cameras], axis=-1)
+        for t in (0.5, 1)
+    ]
     merged = merge(shots, [0.5, 1.0], response, NoiseModel(1e9, 1e-5))
     ratio = merged.value / corner(32)[..., None]
     np.testing.assert_allclose(ratio[merged.valid], 1.0, rtol=4e-3)
@@ -82,14 +89,21 @@ def test_any_size(shape):
     shots = [np.rint(65535 * light * t).astype(np.uint16) for t in (0.25, 1.0)]
     merged = merge(shots, [0.25, 1.0])
     assert merged.value.shape == merged.variance.shape == merged.valid.shape == shape
-    assert (merged.value.dtype, merged.variance.dtype, merged.valid.dtype) == (np.float32, np.float32, bool)
+    assert (merged.value.dtype, merged.variance.dtype, merged.valid.dtype) == (
+        np.float32,
+        np.float32,
+        bool,
+    )
     np.testing.assert_allclose(merged.value, light, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"response": Response(np.linspace([0.0] * 3, [1.0] * 3, 5, axis=1))}, "response has 3 channels"),
+        (
+            {"response": Response(np.linspace([0.0] * 3, [1.0] * 3, 5, axis=1))},
+            "response has 3 channels",
+        ),
         ({"black": np.zeros((4, 4))}, r"black has shape \(4, 4\)"),
         ({"black": np.nan}, "black"),
         ({"levels": 1}, "levels is 1"),
@@ -106,7 +120,9 @@ def test_a_few_noisy_pixels_among_saturated_ones_are_in_order(pixels, light, noi
     """Three in 100000 are refused by chance."""
     for _ in range(200):
         shots = np.ones((2, 200))
-        shots[:, :pixels] = light * np.array([[1.0], [ratio]]) + random.normal(0, noise, (2, pixels))
+        shots[:, :pixels] = light * np.array([[1.0], [ratio]]) + random.normal(
+            0, noise, (2, pixels)
+        )
         codes = np.rint(np.clip(shots, 0, 1) * 255).astype(np.uint8).reshape(2, 10, 20)
         assert merge(list(codes), [1.0, ratio]).value.shape == (10, 20)
 
@@ -120,12 +136,17 @@ def test_a_dark_picture_is_as_dark_at_any_exposure(black, lit, hot):
     stuck = random.random(light.shape) < hot
     for ratio in (1.5, 60.0):
         shots = [np.where(stuck, 11469, camera.shoot(light, t, random)) for t in (1.0, ratio)]
-        assert merge([shot.astype(np.uint16) for shot in shots], [1.0, ratio], levels=16384).valid.any()
+        assert merge(
+            [shot.astype(np.uint16) for shot in shots], [1.0, ratio], levels=16384
+        ).valid.any()
 
 
 @pytest.mark.parametrize("order", [[0, 1, 3, 2, 4, 5], [0, 1, 2, 2, 4, 5], [0, 2, 3, 4, 5, 1]])
 def test_photographs_in_the_wrong_order_are_named(order):
-    shots, later = [Camera().shoot(corner(), t, random) for t in SECONDS], 5 if order[-1] == 1 else 3
+    shots, later = (
+        [Camera().shoot(corner(), t, random) for t in SECONDS],
+        5 if order[-1] == 1 else 3,
+    )
     with pytest.raises(InputError, match=rf"images\[{later}\] .* images\[{later - 1}\]"):
         merge([shots[k] for k in order], SECONDS)
 

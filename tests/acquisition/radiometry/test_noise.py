@@ -17,7 +17,9 @@ random = np.random.default_rng()
 
 def test_the_variance_is_photons_reading_and_rounding():
     model, light = NoiseModel(1000.0, 0.01, levels=11), np.array([-0.1, 0.0, 0.5])
-    np.testing.assert_allclose(model.variance(light, 2.0), light.clip(0) / 1000 + 1e-4 + 2.0**2 * 0.1**2 / 12)
+    np.testing.assert_allclose(
+        model.variance(light, 2.0), light.clip(0) / 1000 + 1e-4 + 2.0**2 * 0.1**2 / 12
+    )
     np.testing.assert_allclose(NoiseModel(1000.0, 0.01).variance(0.5), 6e-4)
 
 
@@ -36,15 +38,22 @@ def test_photon_transfer_estimates_electrons_and_read_noise(curve, levels, read)
 
 
 @pytest.mark.parametrize("black", [0.0, 0.004, 0.01])
-@pytest.mark.parametrize(("read", "electrons"), [(0.0005, 10000.0), (0.003, 2000.0), (0.01, 1000.0)])
-def test_read_noise_is_estimated_where_black_is_clipped_or_rounded_to_one_code(black, read, electrons):
+@pytest.mark.parametrize(
+    ("read", "electrons"), [(0.0005, 10000.0), (0.003, 2000.0), (0.01, 1000.0)]
+)
+def test_read_noise_is_estimated_where_black_is_clipped_or_rounded_to_one_code(
+    black, read, electrons
+):
     """Eight bits: 0.13, 0.77 and 2.6 codes of it, with black at 0, 1.02 and 2.55 codes.
 
-    Rounding of 0.13 codes next to the border of two codes makes electrons 16 % too many (measured, 20 seeds).
+    Rounding of 0.13 codes next to the border of two codes makes electrons 16 % too many (measured,
+    20 seeds).
     """
     camera = Camera("linear", 256, electrons, read, black)
     ramp = np.broadcast_to(np.linspace(0, 1, 64) ** 2.2 * 0.6, (64, 64))
-    bursts = [[camera.shoot(light, 1.0, random) for _ in range(6)] for light in (ramp, 0 * ramp, 0 * ramp)]
+    bursts = [
+        [camera.shoot(light, 1.0, random) for _ in range(6)] for light in (ramp, 0 * ramp, 0 * ramp)
+    ]
     model = estimate(bursts, response=camera.response, levels=256)
     assert model.electrons == pytest.approx(electrons, rel=0.24)
     assert abs(model.read - read) < max(0.5 * read, 0.29 / 255)  # what rounding alone adds
@@ -66,7 +75,8 @@ def test_pixels_that_are_clipped_at_either_end_do_not_count(levels):
         np.geomspace(1e-3, 8, 9600).reshape(80, 120),
     )
     bursts = [
-        [camera.shoot(light * t, 1.0, random).clip(0, None) for _ in range(6)] for t in (0.05, 0.3, 0.0)
+        [camera.shoot(light * t, 1.0, random).clip(0, None) for _ in range(6)]
+        for t in (0.05, 0.3, 0.0)
     ]
     model = estimate(bursts, levels=levels or None)
     assert model.electrons == pytest.approx(10000.0, rel=0.03)
@@ -96,7 +106,13 @@ def test_bursts_without_noise_are_refused(bursts, part):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("electrons", 0.0), ("read", -1.0), ("saturation", 1.5), ("saturation", -1e-3), ("levels", -1)],
+    [
+        ("electrons", 0.0),
+        ("read", -1.0),
+        ("saturation", 1.5),
+        ("saturation", -1e-3),
+        ("levels", -1),
+    ],
 )
 def test_bad_models_are_refused(name, value):
     with pytest.raises(InputError, match=name):
@@ -127,7 +143,8 @@ def test_the_projectors_light_is_the_difference():
     ambient, light = 0.05 * corner(100), 0.5 * corner(100)[::-1]
     black = black_level(shots(ambient, 0.02), SECONDS, LINE, MODEL)
     pictures = [
-        merge(shots(seen, 0.02), SECONDS, noise=MODEL, black=black) for seen in (ambient, ambient + light)
+        merge(shots(seen, 0.02), SECONDS, noise=MODEL, black=black)
+        for seen in (ambient, ambient + light)
     ]
     lit = pictures[1] - pictures[0]
     z = (lit.value - light) / np.sqrt(lit.variance)

@@ -21,7 +21,9 @@ def ramp(decode, sigma: float, scale: float = 1.0) -> list[Radiance]:
     ambient, share = 0.05 * corner(64), scale * corner(64)[::-1]
     ones = np.ones(share.shape)
     clean = [ambient + decode(c) * share for c in CODES]
-    return [Radiance(L + random.normal(0, sigma, ones.shape), sigma**2 * ones, ones > 0) for L in clean]
+    return [
+        Radiance(L + random.normal(0, sigma, ones.shape), sigma**2 * ones, ones > 0) for L in clean
+    ]
 
 
 @pytest.mark.parametrize("curves", [["linear"], ["gamma2.2"], ["srgb", "linear", "film"]])
@@ -31,7 +33,8 @@ def test_the_projectors_curve_is_estimated_of_each_channel(curves):
     ramps[0][5].valid[:8], ramps[0][5].value[:8] = False, 0.0  # which must not count
     response = projector_response(CODES, ramps)
     light, same = (
-        np.stack([decode(codes) for decode in ds], axis=-1) for ds in (decodes, [np.array] * len(curves))
+        np.stack([decode(codes) for decode in ds], axis=-1)
+        for ds in (decodes, [np.array] * len(curves))
     )
     np.testing.assert_allclose(response.linear(same), light, atol=2e-3)
     np.testing.assert_allclose(response.linear(response.codes(same)), same, atol=1e-5)
@@ -51,7 +54,9 @@ def test_a_colour_that_the_channel_does_not_light_does_not_decide():
     valid = np.full((4, 4, 3), True)
     light, variance, _ = np.broadcast_arrays([-2e-4, 0.3, 0.6], [1e-12, 3e-5, 6e-5], valid)
     pictures = [Radiance(c * light, variance, valid) for c in CODES]
-    np.testing.assert_allclose(projector_response(CODES, [pictures]).linear(CODES), CODES, atol=0.01)
+    np.testing.assert_allclose(
+        projector_response(CODES, [pictures]).linear(CODES), CODES, atol=0.01
+    )
 
 
 FLAT = Radiance(np.full((2, 2), 0.1), np.full((2, 2), 1e-6), np.full((2, 2), True))
@@ -73,7 +78,9 @@ def test_pictures_without_a_response_are_refused(codes, pictures, message):
 
 
 M = np.array([[1.0, 0.3, 0.02], [0.1, 1.0, 0.2], [0.01, 0.15, 1.0]])
-WALL = np.stack([corner(64), 0.5 * corner(64)[::-1], 0.8 * corner(64).T], axis=-1)  # T in each channel
+WALL = np.stack(
+    [corner(64), 0.5 * corner(64)[::-1], 0.8 * corner(64).T], axis=-1
+)  # T in each channel
 BLACK = Radiance(np.zeros(WALL.shape), np.zeros(WALL.shape), np.full(WALL.shape, True))
 
 
@@ -107,7 +114,10 @@ def test_mixings_are_refused_from_a_condition_number_of_a_million():
 
 def test_pictures_without_a_mixing_are_refused():
     good = lit(1e-3)
-    dark, unknown = replace(good[0], value=0 * WALL), replace(good[0], valid=np.zeros(WALL.shape, bool))
+    dark, unknown = (
+        replace(good[0], value=0 * WALL),
+        replace(good[0], valid=np.zeros(WALL.shape, bool)),
+    )
     grey = replace(good[0], value=WALL[..., 0])
     for pictures, message in (
         (good[:2], "lit holds 2"),

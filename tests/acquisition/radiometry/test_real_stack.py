@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Seven real photographs of a room, 2 s to 1/4000 s by their EXIF: ../shared/data/hdr-stack-real.
 
-EXIF rounds: 1/30 stands for 1/32 and 1/125 for 1/128, as the steps of a shutter are powers of two. The two
-shortest photographs show little but a lamp, on less than a fiftieth of the pixels, whose light is not the
-same in all of them.
+EXIF rounds: 1/30 stands for 1/32 and 1/125 for 1/128, as the steps of a shutter are powers of two.
+The two shortest photographs show little but a lamp, on less than a fiftieth of the pixels, whose
+light is not the same in all of them.
 """
 
 from __future__ import annotations

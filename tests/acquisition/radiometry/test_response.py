@@ -18,8 +18,12 @@ random = np.random.default_rng()
 def test_a_table_is_linear_between_and_beyond_its_codes():
     response = Response(np.array([[-0.1, 0.3, 1.0]]))
     codes = np.array([-0.5, 0.0, 0.25, 0.5, 0.75, 1.0, 1.5])
-    np.testing.assert_allclose(response.linear(codes), [-0.5, -0.1, 0.1, 0.3, 0.65, 1.0, 1.7], rtol=1e-6)
-    np.testing.assert_allclose(response.derivative(codes), [0.8, 0.8, 0.8, 1.4, 1.4, 1.4, 1.4], rtol=1e-6)
+    np.testing.assert_allclose(
+        response.linear(codes), [-0.5, -0.1, 0.1, 0.3, 0.65, 1.0, 1.7], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        response.derivative(codes), [0.8, 0.8, 0.8, 1.4, 1.4, 1.4, 1.4], rtol=1e-6
+    )
     np.testing.assert_allclose(Response.identity().linear(codes), codes, rtol=1e-6)
 
 
@@ -27,7 +31,9 @@ def test_channels_have_their_own_tables():
     response = Response(np.stack([np.linspace(0, 1, 4097) ** power for power in (1, 2, 3)]))
     codes = random.random((5, 7, 3))
     np.testing.assert_allclose(response.linear(codes), codes ** [1, 2, 3], atol=1e-6)
-    np.testing.assert_allclose(response.derivative(codes), [1, 2, 3] * codes ** [0, 1, 2], atol=1e-3)
+    np.testing.assert_allclose(
+        response.derivative(codes), [1, 2, 3] * codes ** [0, 1, 2], atol=1e-3
+    )
     np.testing.assert_allclose(response.codes(response.linear(codes)), codes, atol=1e-3)
     with pytest.raises(InputError, match=r"image has shape \(5, 7\)"):
         response.linear(np.zeros((5, 7)))
@@ -79,7 +85,10 @@ def test_few_exposures_suffice_in_any_order(seconds):
 
 def test_channels_have_curves_of_their_own_and_moving_objects_do_not_count():
     cameras = [Camera("srgb"), Camera("gamma2.2"), Camera("film")]
-    shots = [np.stack([camera.shoot(corner(), t, random) for camera in cameras], axis=-1) for t in SECONDS]
+    shots = [
+        np.stack([camera.shoot(corner(), t, random) for camera in cameras], axis=-1)
+        for t in SECONDS
+    ]
     shots[2][60:90, 60:120] = 200  # somebody walked by
     for camera, values in zip(cameras, calibrate(shots, SECONDS).values, strict=True):
         assert error(Response(values), camera) < 0.005

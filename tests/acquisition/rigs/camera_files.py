@@ -22,7 +22,9 @@ def write(path: Path, codes: np.ndarray, seconds: float | None = None) -> None:
     exif[271] = "ltcl"  # Pillow saves none without a main tag
     if seconds is not None:
         exif.get_ifd(0x8769)[33434] = IFDRational(round(seconds * 10**6), 10**6)
-        exif[0x8769] = 0  # its place, which Pillow fills in; without it a TIFF would lack the inner tags
+        exif[0x8769] = (
+            0  # its place, which Pillow fills in; without it a TIFF would lack the inner tags
+        )
     Image.fromarray(codes).save(path, exif=exif, quality=100, subsampling=0)
 
 
@@ -45,7 +47,11 @@ def write_dng(path: Path, raw: np.ndarray, seconds: float, **sides: int) -> None
         50708: "ltcl test",
         50714: 256,
         50717: 4095,
-        50728: (IFDRational(1, 2), IFDRational(1), IFDRational(1, 3)),  # white balance, must not be applied
+        50728: (
+            IFDRational(1, 2),
+            IFDRational(1),
+            IFDRational(1, 3),
+        ),  # white balance, must not be applied
     }
     directory = ImageFileDirectory_v2()
     for tag, value in tags.items():

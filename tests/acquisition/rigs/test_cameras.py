@@ -27,7 +27,12 @@ class Capture:
     """In place of `cv2.VideoCapture`: properties that can be set, are stuck, or missing (-1)."""
 
     def __init__(self, backend: str = "V4L2", stuck: Any = None, limits: Any = (-20, 1e9)) -> None:
-        self.values = {AUTO: 3.0 if backend == "V4L2" else 1.0, WHITE: 1.0, EXPOSURE: 100.0, **SIDES}
+        self.values = {
+            AUTO: 3.0 if backend == "V4L2" else 1.0,
+            WHITE: 1.0,
+            EXPOSURE: 100.0,
+            **SIDES,
+        }
         self.stuck, self.limits, self.open = stuck or {}, limits, True
         self.image: np.ndarray | None = PICTURE[..., ::-1]
         self.isOpened, self.getBackendName = lambda: self.open, lambda: backend
@@ -68,15 +73,36 @@ def test_automatics_are_off_and_exposures_in_the_units_of_v4l2(capture: Open) ->
 @pytest.mark.parametrize(
     ("driver", "arguments", "seconds", "error", "message"),
     [
-        ({"stuck": {AUTO: 3.0}}, {}, 0.01, AcquisitionError, "automatic exposure of 0 .*3 read back"),
-        ({"stuck": {WHITE: 3.0}}, {}, 0.01, AcquisitionError, "automatic white balance of 0 .*3 read back"),
+        (
+            {"stuck": {AUTO: 3.0}},
+            {},
+            0.01,
+            AcquisitionError,
+            "automatic exposure of 0 .*3 read back",
+        ),
+        (
+            {"stuck": {WHITE: 3.0}},
+            {},
+            0.01,
+            AcquisitionError,
+            "automatic white balance of 0 .*3 read back",
+        ),
         ({"stuck": {EXPOSURE: 100.0}}, {}, 0.5, AcquisitionError, r"exposure 0\.5 s .* 0\.01 s"),
-        ({"stuck": SIDES}, {"size": (720, 1280)}, 0.01, AcquisitionError, r"\(480, 640\); .*\(720, 1280\)"),
+        (
+            {"stuck": SIDES},
+            {"size": (720, 1280)},
+            0.01,
+            AcquisitionError,
+            r"\(480, 640\); .*\(720, 1280\)",
+        ),
         ({}, {}, 1 / 6000, AcquisitionError, r"exposure 0\.0001667 s .* 0\.0002 s"),
         ({}, {"seconds": 0.02}, 0.04, InputError, r"seconds is 0\.04; .* 0\.02"),
         ({"backend": "AVFOUNDATION"}, {}, 0.02, InputError, "seconds is None; .*AVFOUNDATION"),
         ({}, {"source": 1.5}, 0.01, InputTypeError, r"source is 1\.5"),
-        *(({}, {name: 0.0}, 0.01, InputError, f"{name} is 0.0") for name in ("channels", "seconds", "size")),
+        *(
+            ({}, {name: 0.0}, 0.01, InputError, f"{name} is 0.0")
+            for name in ("channels", "seconds", "size")
+        ),
     ],
 )
 def test_what_a_camera_does_not_do_is_refused(
@@ -122,10 +148,25 @@ class Body:
 
     def __init__(self, folder: Path) -> None:
         self.settings = {"shutterspeed": "1/60", "autoexposuremode": "Manual", "iso": "100"}
-        self.choices = ["bulb", "Time", "", "0", "1/0", "-1", "auto", '30"', "1s", "1/4", "1/60", "10/1250"]
+        self.choices = [
+            "bulb",
+            "Time",
+            "",
+            "0",
+            "1/0",
+            "-1",
+            "auto",
+            '30"',
+            "1s",
+            "1/4",
+            "1/60",
+            "10/1250",
+        ]
         self.connected, self.obedient, self.exif = True, True, 1 / 60
         self.path = folder / "IMG_0001.JPG"
-        self.file_get = lambda *place: SimpleNamespace(save=lambda path: shutil.copy(self.path, path))
+        self.file_get = lambda *place: SimpleNamespace(
+            save=lambda path: shutil.copy(self.path, path)
+        )
         self.file_delete = lambda *place: self.path.unlink()
 
     def init(self) -> None:

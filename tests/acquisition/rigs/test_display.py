@@ -120,7 +120,9 @@ def test_patterns_are_shown_in_the_order_of_the_list(scan: FolderRig, advance: A
 
 def test_a_folder_of_pictures_is_shown_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for number in (10, 9, 100):
-        images.write(tmp_path / f"frame_{number}.png", np.full((1, 1), number / 255), encoding="linear")
+        images.write(
+            tmp_path / f"frame_{number}.png", np.full((1, 1), number / 255), encoding="linear"
+        )
     (tmp_path / "notes.txt").write_text("none")
     shown = []
     assert show(tmp_path, 0, 0.01, lambda *_: shown.append(screen().max())) == 3
@@ -130,13 +132,22 @@ def test_a_folder_of_pictures_is_shown_in_the_order_of_their_numbers(tmp_path: P
 def test_one_picture_is_shown_alone_with_the_blocks_of_a_scan(tmp_path: Path) -> None:
     codes, shown = random.integers(0, 256, (2, 3)), []
     for suffix in (".png", ".exr"):  # as 'ltcl compensate' leaves them
-        images.write((path := tmp_path / "pattern").with_suffix(suffix), codes / 255, encoding="linear")
-    assert show(path.with_suffix(".png"), 0, 0.01, lambda *_: shown.append((screen(), blocks(codes)))) == 1
+        images.write(
+            (path := tmp_path / "pattern").with_suffix(suffix), codes / 255, encoding="linear"
+        )
+    assert (
+        show(path.with_suffix(".png"), 0, 0.01, lambda *_: shown.append((screen(), blocks(codes))))
+        == 1
+    )
     np.testing.assert_array_equal(*shown[0])
 
 
-@pytest.mark.parametrize(("name", "value"), [("advance", "mouse"), ("advance", 0.0), ("display", 9)])
-def test_folders_and_displays_that_cannot_be_used_are_named(scan: FolderRig, name: str, value: Any) -> None:
+@pytest.mark.parametrize(
+    ("name", "value"), [("advance", "mouse"), ("advance", 0.0), ("display", 9)]
+)
+def test_folders_and_displays_that_cannot_be_used_are_named(
+    scan: FolderRig, name: str, value: Any
+) -> None:
     with pytest.raises(InputError, match=f"(index|advance) is {value!r}"):
         show(**{"folder": scan.folder, name: value})
     (begun := scan.folder / "begun").mkdir()

@@ -42,7 +42,9 @@ def put(folder: Path, number: int = 1) -> Path:
 
 
 def write(path: Path, seconds: float = 1 / 30) -> None:
-    save, codes = (camera_files.write, COLOUR) if path.suffix != ".dng" else (camera_files.write_dng, RAW)
+    save, codes = (
+        (camera_files.write, COLOUR) if path.suffix != ".dng" else (camera_files.write_dng, RAW)
+    )
     save(path, codes, seconds)
 
 
@@ -62,7 +64,9 @@ def test_a_round_trip_gives_what_the_scene_gives(tmp_path: Path, channels: int, 
     T = [random.random((20, 12)) / 12 for _ in range(channels)]
     scene, direct = (Shots(VirtualRig(T, GRID, camera_grid=(4, 5), bits=12)) for _ in range(2))
     shape = GRID if channels == 1 else (*GRID, 3)
-    patterns = [(random.integers(0, 2**bits, shape) / (2**bits - 1)).astype(np.float32) for _ in range(4)]
+    patterns = [
+        (random.integers(0, 2**bits, shape) / (2**bits - 1)).astype(np.float32) for _ in range(4)
+    ]
     shots = [(x, s) for x in patterns for s in (0.5, 2.0)] + [(patterns[0], 0.5)]
     options: dict[str, Any] = {"channels": channels, "pattern_bits": bits, "camera_bits": 12}
     Shots(FolderRig(tmp_path, GRID, **options)).prepare(shots)
@@ -73,7 +77,10 @@ def test_a_round_trip_gives_what_the_scene_gives(tmp_path: Path, channels: int, 
         images.write(tmp_path / f"{line['save as']}.tif", image / 65535, encoding="linear", bits=16)
 
     again = Shots(FolderRig(tmp_path, GRID, **options))
-    for x, seconds in shots:  # the last is a repeat: another photograph of the same, with other noise
+    for (
+        x,
+        seconds,
+    ) in shots:  # the last is a repeat: another photograph of the same, with other noise
         np.testing.assert_array_equal(again.photograph(x, seconds), direct.photograph(x, seconds))
     assert (again.levels, again.name(9)) == (4096, "photograph 9 (photo_000009.tif)")
     assert again.describe()["rig"]["kind"] == "folder"
@@ -84,10 +91,14 @@ def test_patterns_at_the_projectors_own_resolution(tmp_path: Path) -> None:
     rig, codes = FolderRig(tmp_path, GRID, projector=(20, 31)), np.arange(12).reshape(GRID) / 11
     rig.prepare([(codes, 0.5)])
     expected = np.pad(np.kron(np.rint(codes * 255), np.ones((6, 6))), [(1, 1), (3, 4)])
-    np.testing.assert_array_equal(images.read_codes(tmp_path / "patterns/pattern_000001.png"), expected)
+    np.testing.assert_array_equal(
+        images.read_codes(tmp_path / "patterns/pattern_000001.png"), expected
+    )
     put(tmp_path)
     np.testing.assert_array_equal(rig.photograph(codes, 0.5), GREY)
-    with pytest.raises(PhotographMissing, match="photograph 2 "):  # what is projected is not the same
+    with pytest.raises(
+        PhotographMissing, match="photograph 2 "
+    ):  # what is projected is not the same
         FolderRig(tmp_path, GRID).photograph(codes, 0.5)
 
 
@@ -97,10 +108,17 @@ def test_the_first_that_is_missing_is_the_next_step(tmp_path: Path, name: str) -
     rig = prepared(tmp_path)
     (tmp_path / name).write_text("notes")
     for shot in (SHOTS[0], SHOTS[2]):
-        with pytest.raises(PhotographMissing, match=r"photograph 1 .*pattern_000001.*0\.5 s") as error:
+        with pytest.raises(
+            PhotographMissing, match=r"photograph 1 .*pattern_000001.*0\.5 s"
+        ) as error:
             rig.photograph(*shot)
         assert (error.value.number, error.value.missing) == (1, 5)
-        assert error.value.shot == (1, "patterns/pattern_000001.png", 0.5, "photographs/photo_000001")
+        assert error.value.shot == (
+            1,
+            "patterns/pattern_000001.png",
+            0.5,
+            "photographs/photo_000001",
+        )
     put(tmp_path)
     np.testing.assert_array_equal(rig.photograph(*SHOTS[0]), GREY)
     assert rig.missing() == (2, 3, 4, 5)
@@ -119,10 +137,16 @@ def test_preparing_twice_changes_nothing_and_a_second_batch_counts_on(tmp_path: 
     put(tmp_path)
     rig.photograph(*SHOTS[0])
     with pytest.raises(InputError):
-        rig.prepare([SHOTS[0], SHOTS[0], (WHITE, 0.0)])  # the second and a third photograph of the same
+        rig.prepare(
+            [SHOTS[0], SHOTS[0], (WHITE, 0.0)]
+        )  # the second and a third photograph of the same
     with pytest.raises(PhotographMissing) as error:
         rig.photograph(HALF, 1.0)  # nobody announced it
-    assert (error.value.number, error.value.missing, len(FolderRig(tmp_path, GRID).shots)) == (2, 6, 7)
+    assert (error.value.number, error.value.missing, len(FolderRig(tmp_path, GRID).shots)) == (
+        2,
+        6,
+        7,
+    )
 
 
 @pytest.mark.parametrize("other", ["PHOTO_000001.PNG", "photo_1.png"])
@@ -138,7 +162,12 @@ def test_two_files_for_one_number_are_refused(tmp_path: Path, other: str) -> Non
 
 
 BROKEN = ["", "[]", "[" * 100_000, "\x00\x01", '{"format": "ltcl shooting list 9", "shots": []}']
-WRONG = [7, None, [{"codes": "0"}], *([{"codes": "0", "seconds": seconds}] for seconds in (-1, np.inf))]
+WRONG = [
+    7,
+    None,
+    [{"codes": "0"}],
+    *([{"codes": "0", "seconds": seconds}] for seconds in (-1, np.inf)),
+]
 LISTS = [json.dumps({"format": "ltcl shooting list 1", "shots": shots}) for shots in WRONG]
 
 
@@ -158,7 +187,10 @@ def test_the_cameras_own_files_are_taken(tmp_path: Path) -> None:
     for k, path in enumerate(paths):
         camera_files.write(path, GREY + 4 - k)
     put(tmp_path, 2)
-    for files, message in [(paths[1:], "holds 3 .* 4 "), ([*paths[1:], __file__], r"test_folder\.py: ")]:
+    for files, message in [
+        (paths[1:], "holds 3 .* 4 "),
+        ([*paths[1:], __file__], r"test_folder\.py: "),
+    ]:
         with pytest.raises(InputError, match=message):
             rig.take(files)
     assert rig.missing() == (1, 3, 4, 5)
@@ -192,7 +224,9 @@ def test_impossible_rigs_are_refused(tmp_path: Path, change: dict[str, Any], par
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3)])
-@pytest.mark.parametrize("kind", [".png 8", ".tif 8", ".bmp 8", ".png 16", ".tif 16", ".tif 32", ".exr 32"])
+@pytest.mark.parametrize(
+    "kind", [".png 8", ".tif 8", ".bmp 8", ".png 16", ".tif 16", ".tif 32", ".exr 32"]
+)
 def test_codes_are_not_changed(tmp_path: Path, kind: str, shape: tuple[int, ...]) -> None:
     suffix, bits = kind.split()
     codes = random.integers(0, 1 << min(int(bits), 16), shape)
@@ -201,7 +235,9 @@ def test_codes_are_not_changed(tmp_path: Path, kind: str, shape: tuple[int, ...]
     expected = light if bits == "32" else codes
     np.testing.assert_array_equal(photograph(tmp_path), expected)
     (tmp_path / "shots.json").unlink()
-    np.testing.assert_array_equal(photograph(tmp_path, 1), expected if codes.ndim == 2 else expected[..., 1])
+    np.testing.assert_array_equal(
+        photograph(tmp_path, 1), expected if codes.ndim == 2 else expected[..., 1]
+    )
 
 
 def test_floats_above_full_scale_are_refused(tmp_path: Path) -> None:
@@ -245,7 +281,9 @@ def test_damage_gives_one_line_or_a_photograph(tmp_path: Path, suffix: str) -> N
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_raw_is_linear_keeps_its_black_and_depends_on_nothing_else(tmp_path: Path, scale: float) -> None:
+def test_raw_is_linear_keeps_its_black_and_depends_on_nothing_else(
+    tmp_path: Path, scale: float
+) -> None:
     raw = np.rint(RAW * scale).astype(np.uint16)
     expected = np.array([1000, 2000, 3000]) * scale * 65535 / 4095  # no gain but that of full scale
     for _ in range(2):
@@ -256,7 +294,9 @@ def test_raw_is_linear_keeps_its_black_and_depends_on_nothing_else(tmp_path: Pat
         raw[10:14, 10:14] = 4000
 
 
-def test_raw_without_rawpy_and_of_a_size_beyond_memory_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
+def test_raw_without_rawpy_and_of_a_size_beyond_memory_is_refused(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
     camera_files.write_dng(place(tmp_path, ".dng"), RAW, 1 / 30, w=40_000, h=40_000)
     for message in (r"^photograph 1 \(photo_000001\.dng\) cannot be used: ", r"ltcl\[camera\]"):
         with pytest.raises(AcquisitionError, match=message):
@@ -269,8 +309,15 @@ LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))  # of a camera with an offset
 
 def scan(folder: Path, store: Path, progress: Any = None) -> np.ndarray:
     """T, (32, 32) float64."""
-    options: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel", "frames": 2, "response": LINE}
-    T = acquire(FolderRig(folder, (4, 8)), **options, exposures=[0.5, 8.0], store=store, progress=progress)
+    options: dict[str, Any] = {
+        "geometry": "aligned",
+        "strategy": "pixel",
+        "frames": 2,
+        "response": LINE,
+    }
+    T = acquire(
+        FolderRig(folder, (4, 8)), **options, exposures=[0.5, 8.0], store=store, progress=progress
+    )
     return T.matrices[0].tocsr().toarray().astype(np.float64)
 
 

@@ -58,14 +58,16 @@ class Watcher:
     """A streaming camera with a rolling shutter and a queue of three frames.
 
     Row r of the frame that arrives at time t shows what was on the screen at
-    t - latency(t) - readout (1 - r / H), but nothing older than the frame before: when the latency grows,
-    frames hang.
+    t - latency(t) - readout (1 - r / H), but nothing older than the frame before: when the latency
+    grows, frames hang.
     """
 
     channels, stream, readout, queue = 1, True, 0.02, 3
     exposures: tuple[float, ...] | None = None
 
-    def __init__(self, screen: Screen, rig: VirtualRig, latency: float = 0.08, **options: Any) -> None:
+    def __init__(
+        self, screen: Screen, rig: VirtualRig, latency: float = 0.08, **options: Any
+    ) -> None:
         self.screen, self.rig = screen, rig
         self.latency: Callable[[float], float] = lambda _: latency
         self.gain: Callable[[float, np.ndarray], float] = lambda moment, codes: 1.0
@@ -118,19 +120,27 @@ def single(row: int, column: int, code: float = 1.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("kind", "latency"), [(Watcher, 0.08), (Still, 0.3)])
-def test_photographs_are_those_of_what_is_shown(screen: Screen, kind: type[Watcher], latency: float) -> None:
+def test_photographs_are_those_of_what_is_shown(
+    screen: Screen, kind: type[Watcher], latency: float
+) -> None:
     """Also of a single pixel of one code, a change below what the camera's noise is taken for."""
     rig, truth = LiveRig(kind(screen, scene(**LINEAR), latency=latency), screen), scene(**LINEAR)
     shots = [(codes, seconds) for codes in patterns(6) for seconds in (SECONDS, 1 / 60)]
     shots += [(single(k % 3, k, 4 / 255), SECONDS) for k in range(8)]
-    shots += [(patterns(1)[0], seconds) for seconds in (256 / 60, 1 / 60, 256 / 60)] + [(0 * WHITE, 1 / 60)]
+    shots += [(patterns(1)[0], seconds) for seconds in (256 / 60, 1 / 60, 256 / 60)] + [
+        (0 * WHITE, 1 / 60)
+    ]
     for codes, seconds in shots:
-        np.testing.assert_array_equal(rig.photograph(codes, seconds), truth.photograph(codes, seconds))
+        np.testing.assert_array_equal(
+            rig.photograph(codes, seconds), truth.photograph(codes, seconds)
+        )
 
 
 @pytest.mark.parametrize("readout", [0.0, 0.03])
 @pytest.mark.parametrize("later", [0.25, 0.4, 0.8, None])
-def test_latency_that_grows_spoils_no_photograph(screen: Screen, readout: float, later: float | None) -> None:
+def test_latency_that_grows_spoils_no_photograph(
+    screen: Screen, readout: float, later: float | None
+) -> None:
     """To tenfold, also back again, or in bursts of a random length: what was shown before may come late."""
     camera, truth = Watcher(screen, scene(**LINEAR), latency=0.08, readout=readout), scene(**LINEAR)
     rig, burst = LiveRig(camera, screen), [0.0]
@@ -140,16 +150,27 @@ def test_latency_that_grows_spoils_no_photograph(screen: Screen, readout: float,
         burst[0] = random.uniform(0, 0.4) if random.random() < 0.1 else max(0.0, burst[0] - FRAME)
         return 0.05 + burst[0]
 
-    shots = [*patterns(3), 0 * WHITE, WHITE, *(single(1, k, 2 / 255) for k in range(4)), *patterns(3)]
+    shots = [
+        *patterns(3),
+        0 * WHITE,
+        WHITE,
+        *(single(1, k, 2 / 255) for k in range(4)),
+        *patterns(3),
+    ]
     for number, codes in enumerate(shots):
         camera.latency = latency if later is None else lambda _, n=number: 0.05 if n == 5 else later
-        np.testing.assert_array_equal(rig.photograph(codes, SECONDS), truth.photograph(codes, SECONDS))
+        np.testing.assert_array_equal(
+            rig.photograph(codes, SECONDS), truth.photograph(codes, SECONDS)
+        )
 
 
 def test_noise_is_no_change(screen: Screen) -> None:
     """48 pixels: means of identical frames differ by 0.2 % of full scale, 2 % of what is dim."""
     options = {"gain": 3000.0, "read": 0.01, "response": "linear", "black": 0.06}
-    rig, truth = LiveRig(Watcher(screen, scene(**options)), screen, drift=0.06), scene(**(options | CLEAN))
+    rig, truth = (
+        LiveRig(Watcher(screen, scene(**options)), screen, drift=0.06),
+        scene(**(options | CLEAN)),
+    )
     for codes in [*patterns(4), 0 * WHITE, single(1, 1)] * 4:
         image, expected = rig.photograph(codes, SECONDS), truth.photograph(codes, SECONDS)
         assert np.abs(image.astype(float) - expected).mean() < 5
@@ -174,10 +195,14 @@ def test_a_camera_that_freezes_is_named_stale(camera: Any) -> None:
         rig.photograph(second, SECONDS)
     camera.latency = lambda _: 0.08
     camera.gain = lambda moment, _: 1.0 - 0.3 * (round(moment / FRAME) % 2)
-    with pytest.raises(AcquisitionError, match=r"^photograph 2: frames still change by \d.*% of full scale"):
+    with pytest.raises(
+        AcquisitionError, match=r"^photograph 2: frames still change by \d.*% of full scale"
+    ):
         rig.photograph(first, SECONDS)
     camera.gain = lambda *_: 1.0
-    np.testing.assert_array_equal(rig.photograph(second, SECONDS), scene(**CLEAN).photograph(second, SECONDS))
+    np.testing.assert_array_equal(
+        rig.photograph(second, SECONDS), scene(**CLEAN).photograph(second, SECONDS)
+    )
 
 
 def automatic(speed: float) -> Any:
@@ -247,9 +272,14 @@ def test_exposures_are_multiples_of_the_period(screen: Screen, camera: Any) -> N
         rig.photograph(WHITE, 1 / 50)
     assert camera.frames == 0  # refused before anything is shown
     camera.exposures = tuple(np.geomspace(1 / 4000, 8, 200))
-    offered, begins = LiveRig(camera, screen, period=1 / 60).exposures or (), np.linspace(0, 1, 3001)
+    offered, begins = (
+        LiveRig(camera, screen, period=1 / 60).exposures or (),
+        np.linspace(0, 1, 3001),
+    )
     for seconds in camera.exposures:
-        early, late = (np.floor(t) / 3 + np.minimum(t % 1, 1 / 3) for t in (begins, begins + 60 * seconds))
+        early, late = (
+            np.floor(t) / 3 + np.minimum(t % 1, 1 / 3) for t in (begins, begins + 60 * seconds)
+        )
         ripple = np.ptp(late - early) / np.mean(late - early)
         assert ripple < 0.061 if seconds in offered else ripple > 0.039
     camera.exposures = (0.001, 0.02)

@@ -19,7 +19,13 @@ mi = pytest.importorskip("mitsuba", reason='mitsuba is not installed: pip instal
 random = np.random.default_rng(0)
 GRID = (4, 6)
 FAST: dict[str, Any] = {"samples": 16}
-CLEAN: dict[str, Any] = {"gain": None, "read": 0.0, "black": 0.0, "bits": "float", "response": "linear"}
+CLEAN: dict[str, Any] = {
+    "gain": None,
+    "read": 0.0,
+    "black": 0.0,
+    "bits": "float",
+    "response": "linear",
+}
 LINEAR: dict[str, Any] = {**FAST, "projector_response": "linear", "sensitivity": 1.0}
 ALBEDO, DISTANCE = 0.5, 2.0
 
@@ -48,7 +54,9 @@ def on_the_wall(light: np.ndarray) -> np.ndarray:
 
 
 def rig(scene: Any = None, **change: Any) -> MitsubaRig:
-    return MitsubaRig(wall() if scene is None else scene, GRID, **{"camera_grid": GRID, **LINEAR, **change})
+    return MitsubaRig(
+        wall() if scene is None else scene, GRID, **{"camera_grid": GRID, **LINEAR, **change}
+    )
 
 
 def test_a_wall_shows_the_pattern_pixel_by_pixel(tmp_path: Path) -> None:
@@ -72,7 +80,13 @@ def test_white_is_at_half_of_the_range() -> None:
 def test_one_bounce_is_that_of_quadrature() -> None:
     """White light on the left wall of a right angle, x = -z; the right wall shows its first bounce."""
     n, albedo = 8, 0.6
-    options: dict[str, Any] = {"albedo": albedo, "depth": 3, "channels": 1, **LINEAR, "samples": 16384}
+    options: dict[str, Any] = {
+        "albedo": albedo,
+        "depth": 3,
+        "channels": 1,
+        **LINEAR,
+        "samples": 16384,
+    }
     codes = np.zeros((n, n))
     codes[:, : n // 2] = 1.0
     image = MitsubaRig("dihedral", (n, n), **options).radiance(codes)
@@ -85,7 +99,9 @@ def test_one_bounce_is_that_of_quadrature() -> None:
     far = np.linalg.norm(away, axis=1)
     # A plane across the axis at distance 1 gets the irradiance pi everywhere.
     L = albedo * (-far / away[:, 2]) ** 3 * (-away @ normal / far) / far**2
-    tangent = 1.02 * np.sqrt(0.5) / (3.0 - np.sqrt(0.5))  # of half the frame, around the outer edges
+    tangent = (
+        1.02 * np.sqrt(0.5) / (3.0 - np.sqrt(0.5))
+    )  # of half the frame, around the outer edges
     across = (2 * (np.arange(n * 4) + 0.5) / (n * 4) - 1) * tangent  # 4 x 4 rays in each pixel
     tx, ty = np.meshgrid(across, -across)
     k = 3.0 / (1 + tx)  # where they meet the right wall, x = z
@@ -96,7 +112,10 @@ def test_one_bounce_is_that_of_quadrature() -> None:
     expected = bounced.reshape(n, 4, n // 2, 4).mean(axis=(1, 3))
 
     assert image[:, : n // 2].sum() > 10 * image[:, n // 2 :].sum()  # left is left
-    inner = (slice(2, 6), slice(1, 3))  # away from the seam, where quadrature is poor, and from edges
+    inner = (
+        slice(2, 6),
+        slice(1, 3),
+    )  # away from the seam, where quadrature is poor, and from edges
     np.testing.assert_allclose(image[:, n // 2 :][inner], expected[inner], rtol=0.08)
     assert image[:, n // 2 :][inner].mean() == pytest.approx(expected[inner].mean(), rel=0.02)
 
@@ -105,7 +124,9 @@ def test_one_bounce_is_that_of_quadrature() -> None:
 def test_all_walls_of_a_scene_are_lit_and_seen(name: str, walls: int) -> None:
     colours = np.arange(3 * walls).reshape(walls, 3) % 5 / 5 + 0.1  # no two walls have the same hue
     grid, options = (24, 32), {"albedo": colours, "depth": 2, **LINEAR}
-    views = [MitsubaRig(name, grid, baseline=x, **options).radiance(np.ones(grid)) for x in (0.0, 1.0)]
+    views = [
+        MitsubaRig(name, grid, baseline=x, **options).radiance(np.ones(grid)) for x in (0.0, 1.0)
+    ]
     lit, hues = views[0].max(axis=-1) > 0, colours / np.linalg.norm(colours, axis=1, keepdims=True)
     assert 0.3 < lit.mean() < 1  # walls fill the frame, with black around
     nearest = [np.argmax(view[view.max(axis=-1) > 0] @ hues.T, axis=1) for view in views]
@@ -121,7 +142,11 @@ def test_it_is_a_rig_that_leaves_the_variant_of_others(monkeypatch: pytest.Monke
     assert (image.shape, shots.levels, shots.camera_grid) == ((5, 7, 3), 4096, (5, 7))
     assert mi.variant() == "scalar_spectral"
     facts = shots.describe()["rig"]
-    assert (facts["kind"], facts["scene"], facts["variant"]) == ("mitsuba", "trihedral", "scalar_rgb")
+    assert (facts["kind"], facts["scene"], facts["variant"]) == (
+        "mitsuba",
+        "trihedral",
+        "scalar_rgb",
+    )
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(AcquisitionError, match=r"mitsuba.*ltcl\[rig\]"):
         MitsubaRig("box", GRID)
@@ -140,9 +165,16 @@ ELSEWHERE = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "hei
         ({"scene": {"type": "scene"}}, InputError, "scene has 0 projectors"),
         ({"scene": {"type": "projector"}}, InputError, "scene .* one sensor"),
         ({"sensor": ELSEWHERE}, InputError, "scene shows no light"),
-        ({"scene": {"type": "scene"}, "albedo": 0.5}, InputError, "albedo is of dihedral, trihedral, box"),
+        (
+            {"scene": {"type": "scene"}, "albedo": 0.5},
+            InputError,
+            "albedo is of dihedral, trihedral, box",
+        ),
         ({"albedo": 1.0}, InputError, "albedo .* 1 to 1"),
-        *(({name: -9.0}, InputError, f"{name} is -9") for name in ("baseline", "channels", "sensitivity")),
+        *(
+            ({name: -9.0}, InputError, f"{name} is -9")
+            for name in ("baseline", "channels", "sensitivity")
+        ),
     ],
 )
 def test_bad_scenes_and_arguments_are_named(

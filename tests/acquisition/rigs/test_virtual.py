@@ -18,7 +18,13 @@ from ltcl.images import from_srgb, to_srgb
 
 random = np.random.default_rng(0)
 GRID, N, PIXELS = (3, 4), 12, 40_000
-CLEAN: dict[str, Any] = {"gain": None, "read": 0.0, "black": 0.0, "bits": "float", "response": "linear"}
+CLEAN: dict[str, Any] = {
+    "gain": None,
+    "read": 0.0,
+    "black": 0.0,
+    "bits": "float",
+    "response": "linear",
+}
 M = np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.2, 0.8]])
 KINDS = [np.asarray, scipy.sparse.csr_array, scipy.sparse.coo_array, np.float32, aslinearoperator]
 
@@ -29,19 +35,37 @@ def matrix(rows: int = N) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_grey_photographs_follow_the_equations(kind: Any) -> None:
-    T, C, x, ambient = matrix(20), random.random((30, 20)), random.random(GRID), random.random(20) / 10
-    settings = {**CLEAN, "black": 0.03, "projector_black": 0.02, "sensitivity": 0.09, "ambient": ambient}
+    T, C, x, ambient = (
+        matrix(20),
+        random.random((30, 20)),
+        random.random(GRID),
+        random.random(20) / 10,
+    )
+    settings = {
+        **CLEAN,
+        "black": 0.03,
+        "projector_black": 0.02,
+        "sensitivity": 0.09,
+        "ambient": ambient,
+    }
     rig = VirtualRig(kind(T), GRID, **settings, camera_grid=(5, 6), camera_map=C)
     L = C @ (T @ (0.02 + 0.98 * from_srgb(x).ravel()) + ambient)
     np.testing.assert_allclose(rig.radiance(x).ravel(), L, rtol=1e-5)
-    np.testing.assert_allclose(rig.photograph(x, 0.75).ravel(), 0.03 + 0.97 * 0.09 * 0.75 * L, rtol=1e-5)
+    np.testing.assert_allclose(
+        rig.photograph(x, 0.75).ravel(), 0.03 + 0.97 * 0.09 * 0.75 * L, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("as_transport", [False, True])
 def test_colour_photographs_follow_the_equations(as_transport: bool) -> None:
     T, x = [matrix() + np.eye(N) / 2 for _ in range(3)], random.random((*GRID, 3))
     curves, ambient = ["linear", "srgb", "gamma2.2"], [0.1, 0.2, 0.3]
-    options: dict[str, Any] = {**CLEAN, "response": curves, "projector_response": curves, "ambient": ambient}
+    options: dict[str, Any] = {
+        **CLEAN,
+        "response": curves,
+        "projector_response": curves,
+        "ambient": ambient,
+    }
     known: Any = ltcl.Transport(T, grid=GRID, mixing=M) if as_transport else T
     rig = VirtualRig(known, GRID, mixing=None if as_transport else M, **options)
     r, g, b = x.reshape(N, 3).T
@@ -50,7 +74,9 @@ def test_colour_photographs_follow_the_equations(as_transport: bool) -> None:
     expected = np.minimum(np.stack([L[:, 0], to_srgb(L[:, 1]), L[:, 2] ** (1 / 2.2)], axis=-1), 1)
     np.testing.assert_allclose(rig.photograph(x, 1.0).reshape(N, 3), expected, rtol=1e-5)
     grey = random.random(GRID)
-    np.testing.assert_array_equal(rig.radiance(grey), rig.radiance(np.repeat(grey[..., None], 3, axis=-1)))
+    np.testing.assert_array_equal(
+        rig.radiance(grey), rig.radiance(np.repeat(grey[..., None], 3, axis=-1))
+    )
 
 
 @pytest.mark.parametrize("name", ["linear", "srgb", "gamma2.2", "film"])
@@ -59,7 +85,9 @@ def test_a_projector_undoes_a_camera_of_the_same_name(name: str) -> None:
     rig = VirtualRig(np.eye(400), (20, 20), **{**CLEAN, "response": name}, projector_response=name)
     np.testing.assert_allclose(rig.photograph(x, 1.0), x, atol=1e-6)
     if name == "film":  # a logistic in log light
-        camera = VirtualRig(np.eye(400), (20, 20), **{**CLEAN, "response": name}, projector_response="linear")
+        camera = VirtualRig(
+            np.eye(400), (20, 20), **{**CLEAN, "response": name}, projector_response="linear"
+        )
         expected = (1 + 0.25**1.2) / (1 + (0.25 / np.maximum(x, 1e-9)) ** 1.2)
         np.testing.assert_allclose(camera.photograph(x, 1.0), expected, atol=1e-6)
 
@@ -67,7 +95,9 @@ def test_a_projector_undoes_a_camera_of_the_same_name(name: str) -> None:
 def exposed(value: float, **settings: Any) -> np.ndarray:
     """40 000 pixels under the same light."""
     grid = (200, PIXELS // 200)
-    rig = VirtualRig(scipy.sparse.eye_array(PIXELS).tocsr(), grid, **{**CLEAN, **settings}, ambient=value)
+    rig = VirtualRig(
+        scipy.sparse.eye_array(PIXELS).tocsr(), grid, **{**CLEAN, **settings}, ambient=value
+    )
     return rig.photograph(np.zeros(grid), 1.0).astype(np.float64)
 
 
@@ -114,9 +144,17 @@ def test_a_resumed_run_sees_the_same_noise() -> None:
 def test_noise_differs_with_codes_seconds_repeat_and_seed() -> None:
     x, settings = np.full((100, 10), 0.5), {**CLEAN, "read": 0.01, "black": 0.2}
     rig, seeded = (VirtualRig(np.eye(1000), (100, 10), **settings, seed=seed) for seed in (1, 2))
-    shots = [(rig, x, 0.01), (rig, x, 0.01), (rig, x, 0.02), (rig, x + 1e-5, 0.01), (seeded, x, 0.01)]
+    shots = [
+        (rig, x, 0.01),
+        (rig, x, 0.01),
+        (rig, x, 0.02),
+        (rig, x + 1e-5, 0.01),
+        (seeded, x, 0.01),
+    ]
     noise = np.array([rig.photograph(codes, seconds).ravel() for rig, codes, seconds in shots])
-    assert np.abs(np.corrcoef(noise) - np.eye(len(shots))).max() < 0.15  # 4.7 deviations of 1 / sqrt(1000)
+    assert (
+        np.abs(np.corrcoef(noise) - np.eye(len(shots))).max() < 0.15
+    )  # 4.7 deviations of 1 / sqrt(1000)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +165,10 @@ def test_noise_differs_with_codes_seconds_repeat_and_seed() -> None:
         ({"camera_grid": (2, 5)}, "camera_grid is 2 x 5"),
         ({"camera_map": np.ones((12, 7))}, r"camera_map has shape .*\(12, 7\)"),
         ({"ambient": [0.1, 0.2, 0.3]}, r"ambient has shape \(3,\)"),
-        *(({name: -1}, f"{name} is (as low as )?-1") for name in ("ambient", "sensitivity", "read", "bits")),
+        *(
+            ({name: -1}, f"{name} is (as low as )?-1")
+            for name in ("ambient", "sensitivity", "read", "bits")
+        ),
         ({"response": "sRGB"}, "response is 'sRGB'; .* linear, srgb, film, gamma2.2"),
     ],
 )
@@ -144,7 +185,9 @@ def test_areas_of_a_shifted_and_scaled_camera_are_exact_where_rays_divide_them()
         low, n = start + size * (np.arange(count)[:, None] - 0.5), np.arange(3)
         return np.clip(np.minimum(low + size, n + 0.5) - np.maximum(low, n - 0.5), 0, None) / size
 
-    np.testing.assert_allclose(C, np.kron(overlaps(-0.25, 0.75, 4), overlaps(0.125, 0.5, 6)), atol=1e-12)
+    np.testing.assert_allclose(
+        C, np.kron(overlaps(-0.25, 0.75, 4), overlaps(0.125, 0.5, 6)), atol=1e-12
+    )
 
 
 def test_rays_outside_the_grid_and_nowhere_see_nothing() -> None:

@@ -11,7 +11,13 @@ import numpy as np
 import ltcl
 from ltcl.acquisition import VirtualRig
 
-CLEAN: dict[str, Any] = {"gain": None, "read": 0.0, "bits": "float", "response": "linear", "black": 0.0}
+CLEAN: dict[str, Any] = {
+    "gain": None,
+    "read": 0.0,
+    "bits": "float",
+    "response": "linear",
+    "black": 0.0,
+}
 
 
 @cache

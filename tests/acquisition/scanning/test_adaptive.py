@@ -14,7 +14,7 @@ import ltcl
 from ltcl.acquisition.scanning import adaptive
 from ltcl.acquisition.scanning.adaptive import Cells
 from ltcl.acquisition.scanning.pictures import Picture
-from ltcl.transport import from_arrays
+from ltcl.transport.transport import from_arrays
 
 random = np.random.default_rng(0)
 GRIDS = [(1, 1), (1, 6), (7, 1), (4, 4), (5, 7), (8, 8)]
@@ -66,13 +66,17 @@ def flat(grid: tuple[int, int], channels: int) -> np.ndarray:
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("grid", GRIDS)
-def test_light_that_is_flat_in_cells_is_measured_exactly(grid: tuple[int, int], channels: int) -> None:
+def test_light_that_is_flat_in_cells_is_measured_exactly(
+    grid: tuple[int, int], channels: int
+) -> None:
     T = flat(grid, channels)
     np.testing.assert_allclose(dense(scan(Known(T, grid))), T, atol=1e-9)
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-def test_a_threshold_of_nothing_measures_every_entry_by_patterns_that_differ(grid: tuple[int, int]) -> None:
+def test_a_threshold_of_nothing_measures_every_entry_by_patterns_that_differ(
+    grid: tuple[int, int],
+) -> None:
     """So that the noise of a virtual rig is the same in a run that was stopped."""
     n = grid[0] * grid[1]
     known = Known(0.1 + random.random((1, n, n)), grid)
@@ -102,10 +106,14 @@ def test_cells_at_which_no_pixel_is_active_twice_are_lit_together() -> None:
 @pytest.mark.parametrize(("grid", "channels"), [((1, 7), 1), ((5, 7), 1), ((5, 7), 3), ((8, 8), 1)])
 def test_the_core_as_a_transport(device: Any, grid: tuple[int, int], channels: int) -> None:
     n = grid[0] * grid[1]
-    core = scan(Known(flat(grid, channels) + 0.02 * random.random((channels, n, n)), grid), threshold=0.03)
+    core = scan(
+        Known(flat(grid, channels) + 0.02 * random.random((channels, n, n)), grid), threshold=0.03
+    )
     C, mixing = dense(core), np.eye(3) + 0.1 if channels == 3 else np.eye(1)
     T = from_arrays(adaptive.arrays(core, mixing if channels == 3 else None), device=device)
-    np.testing.assert_allclose(np.atleast_2d(T.first_bounce), np.diagonal(C, axis1=1, axis2=2), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.atleast_2d(T.first_bounce), np.diagonal(C, axis1=1, axis2=2), rtol=1e-6
+    )
     x = random.random((n, channels))
     expected = np.einsum("cij,cd,jd->ic", C, mixing, x)
     shown = np.asarray(T @ x.reshape(*grid, channels).squeeze())

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs that are mixed up in a scan are refused with their batch, and named; then the scan goes on.
 
-Each pattern is photographed at three exposures, or at one, where pictures are compared with their patterns.
+Each pattern is photographed at three exposures, or at one, where pictures are compared with their
+patterns.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def in_order(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Photographs of a scan with nothing wrong: shots, how many before the scan, the files that are left."""
 
     @cache
-    def acquired(strategy: str, exposures: tuple[float, ...]) -> tuple[list[Any], int, dict[str, str]]:
+    def acquired(
+        strategy: str, exposures: tuple[float, ...]
+    ) -> tuple[list[Any], int, dict[str, str]]:
         (rig, settings), shots, counts = set_up(strategy), [], []
         path, real = tmp_path_factory.mktemp("whole") / "T.zarr", rig.photograph
 
@@ -41,7 +44,10 @@ def in_order(tmp_path_factory: pytest.TempPathFactory) -> Any:
             return real(codes, seconds)
 
         rig.photograph = photograph
-        settings |= {"exposures": exposures, "progress": lambda *step: counts.append((rig.count, *step))}
+        settings |= {
+            "exposures": exposures,
+            "progress": lambda *step: counts.append((rig.count, *step)),
+        }
         acquire(rig, store=path, **settings)
         return shots, next(count for count, step, *_ in counts if step == "scan"), contents(path)
 
@@ -53,7 +59,9 @@ WRONG: dict[str, Callable[[np.ndarray, int, int], np.ndarray]] = {
         np.isin(order, (start + n, start + 2 * n)), 2 * start + 3 * n - order, order
     ),
     "late": lambda order, start, n: np.concatenate([order[:start], order[start - 1 : -1]]),
-    "missing": lambda order, start, n: np.concatenate([order[:start], order[start + 1 :], order[-1:]]),
+    "missing": lambda order, start, n: np.concatenate(
+        [order[:start], order[start + 1 :], order[-1:]]
+    ),
     "repeated": lambda order, start, n: np.where(order == start + 2 * n, start + n, order),
 }
 """Which photograph of a scan is taken in place of each; n are of a pattern, from `start` on of batch 1."""
@@ -66,7 +74,11 @@ def test_refused_and_put_right(
     tmp_path: Path, in_order: Any, strategy: str, wrong: str, exposures: tuple[float, ...]
 ) -> None:
     """In the second batch; the first one stays, and then the scan ends as if nothing had been."""
-    (shots, calibrated, files), n, path = in_order(strategy, exposures), len(exposures), tmp_path / "T.zarr"
+    (shots, calibrated, files), n, path = (
+        in_order(strategy, exposures),
+        len(exposures),
+        tmp_path / "T.zarr",
+    )
     first, second = BATCH[strategy]
     start = first * n + 1  # after the pattern of blocks
     order = WRONG[wrong](np.arange(len(shots) - calibrated), start, n)
@@ -92,8 +104,13 @@ def test_refused_and_put_right(
 @pytest.mark.parametrize(("strategy", "after"), [("pixel", 9), ("hadamard", 9), ("adaptive", 10)])
 def test_where_the_camera_moved(strategy: str, after: int) -> None:
     """By half a pixel between two patterns: photographs of each agree, and those of the blocks do not."""
-    views = [camera_map(lambda u, v, x=x: ((u - x) / 3, (v - 3) / 3), (30, 56), (8, 16)) for x in (4, 4.5)]
-    first, moved = (Unplugged(corner(), (8, 16), camera_grid=(30, 56), camera_map=view) for view in views)
+    views = [
+        camera_map(lambda u, v, x=x: ((u - x) / 3, (v - 3) / 3), (30, 56), (8, 16))
+        for x in (4, 4.5)
+    ]
+    first, moved = (
+        Unplugged(corner(), (8, 16), camera_grid=(30, 56), camera_map=view) for view in views
+    )
     real, starts = first.photograph, []
 
     def photograph(codes: Any, seconds: float) -> np.ndarray:

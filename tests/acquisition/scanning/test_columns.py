@@ -50,7 +50,9 @@ def test_errors_of_columns_nearly_cancel_in_the_sum_of_an_s_matrix() -> None:
     A = code.patterns(31).astype(float)
     C = np.linalg.inv(A.T @ np.linalg.inv(np.diag(v[:, 0]) + a) @ A)
     np.testing.assert_allclose(code.correlation(v, a), C[0, 1] / C[0, 0], rtol=1e-9)
-    far = np.tile(np.repeat([[0.015], [0.035]], [24, 7], axis=0), M)  # 13 deviations in the sum of all
+    far = np.tile(
+        np.repeat([[0.015], [0.035]], [24, 7], axis=0), M
+    )  # 13 deviations in the sum of all
     value, keep = significant(far, np.ones((31, M)), GRID, correlation=np.full(M, -1 / 31))
     assert keep.all()
     assert not lit(far).any()  # 2.4, if columns were independent
@@ -73,7 +75,9 @@ def test_other_sizes_are_refused(size: float) -> None:
 def test_a_weak_block_is_significant_though_no_entry_stands_out() -> None:
     value, block = 0.3 * random.standard_normal((200, M)), np.zeros(GRID, bool)
     block[4:12, 8:16] = True
-    value = np.clip(value + block.ravel(), -2.9, 2.9)  # below three standard deviations, all of them
+    value = np.clip(
+        value + block.ravel(), -2.9, 2.9
+    )  # below three standard deviations, all of them
     keep = lit(value)
     assert keep[:, block.ravel()].mean() > 0.999
     assert np.sum(value[keep]) == pytest.approx(np.sum(value), rel=0.05)
@@ -125,5 +129,7 @@ def test_the_part_of_dropped_entries_goes_to_the_others() -> None:
     w, u = np.array([1.5]), np.array([0.05])
     rows, variance = balance(scipy.sparse.csr_array(x), v, Picture(w, u))
     whole = x + 0.3 * np.array([[0.3, 0.1, 0.2, 0.2]]) / 0.85
-    np.testing.assert_allclose(rows.data, whole[0, :2] + whole[0, 2:].sum() * v / v.sum(), rtol=1e-12)
+    np.testing.assert_allclose(
+        rows.data, whole[0, :2] + whole[0, 2:].sum() * v / v.sum(), rtol=1e-12
+    )
     np.testing.assert_allclose(variance, v - v**2 / 0.85, rtol=1e-12)

@@ -33,7 +33,9 @@ def rms(values: Any, axis: Any = None) -> Any:
 
 
 @pytest.fixture(scope="session", params=["pixel", "hadamard", "adaptive"])
-def scans(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Any]:
+def scans(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[Path], Any]:
     """Stores and transports (8, N, N) of eight scans of a corner; every entry is measured."""
     paths = [tmp_path_factory.mktemp("scan") / "T.zarr" for _ in range(8)]
     options = {"strategy": request.param, "response": LINE, "sigmas": 0.0, "threshold": 1e-6}
@@ -66,4 +68,6 @@ def test_noise_in_a_report_is_that_of_many_scans(scans: Any) -> None:
     both = {"noise_direct": stack.diagonal(axis1=1, axis2=2), "noise_sum": stack.sum(axis=2)}
     for name, values in both.items():
         spread = np.median(values.std(axis=0, ddof=1) / values.mean(axis=0))
-        assert np.median([getattr(report, name) for report in reports]) == pytest.approx(spread, rel=0.25)
+        assert np.median([getattr(report, name) for report in reports]) == pytest.approx(
+            spread, rel=0.25
+        )

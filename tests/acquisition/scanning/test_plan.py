@@ -38,13 +38,17 @@ def test_errors_are_those_of_decoded_photographs(strategy: str, code: Any, camer
         x[0] += own
         L = code.patterns(code.size).astype(float) @ x
         values = [(t, (L + 0.05) * t) for t in (0.5, 8.0)]
-        spread = 1.0 / np.sum([(y < noise.saturation) * t**2 / noise.variance(y) for t, y in values], axis=0)
+        spread = 1.0 / np.sum(
+            [(y < noise.saturation) * t**2 / noise.variance(y) for t, y in values], axis=0
+        )
         y = L + random.standard_normal(L.shape) * np.sqrt(spread)
         error = code.decode(y, spread, np.zeros(2000))[0][: code.size] - x
         v[: code.size if own else None] = np.mean(np.square(error))
     errors = random.standard_normal((20000, 256)) * np.sqrt(v)
     errors -= errors.sum(axis=1, keepdims=True) * v / v.sum()
-    relative = np.std(np.sum(errors * random.random((20000, 256)), axis=1)) / 0.35  # (d + g) / 2 on average
+    relative = (
+        np.std(np.sum(errors * random.random((20000, 256)), axis=1)) / 0.35
+    )  # (d + g) / 2 on average
     plan = plans(GRID, (0.5, 8.0), noise, Light(0.5, 0.2, 0.05))[strategy]
     assert plan.error == pytest.approx(np.hypot(relative, 0.002), rel=0.06)
 
@@ -54,12 +58,20 @@ def test_errors_are_those_of_decoded_photographs(strategy: str, code: Any, camer
     [
         ("photons", GRID, (1.0,), 0.0, "pixel"),
         ("reading", GRID, (1.0,), 0.0, "hadamard"),
-        ("photons", GRID, (0.5, 1.0), 0.3, "hadamard"),  # of the ambient light only shot noise is left
+        (
+            "photons",
+            GRID,
+            (0.5, 1.0),
+            0.3,
+            "hadamard",
+        ),  # of the ambient light only shot noise is left
         ("both", (16, 32), (0.5, 8.0), 0.01, "adaptive"),
         ("both", (64, 64), (0.5, 8.0), 0.01, "adaptive"),
     ],
 )
-def test_auto_weighs_the_noise(camera: str, grid: Any, exposures: Any, ambient: float, strategy: str) -> None:
+def test_auto_weighs_the_noise(
+    camera: str, grid: Any, exposures: Any, ambient: float, strategy: str
+) -> None:
     assert choose(plans(grid, exposures, CAMERAS[camera], Light(0.5, 0.2, ambient)))[0] == strategy
 
 
@@ -67,7 +79,9 @@ def test_auto_takes_what_gives_the_better_picture() -> None:
     """T p of a dihedral, scanned in all three ways: none is far better than the one that auto takes."""
     error = {}
     for strategy in ("pixel", "hadamard", "adaptive", "auto"):
-        T = ltcl.acquire(rig(gain=1000.0, read=0.003, ambient=0.3), geometry="aligned", strategy=strategy)
+        T = ltcl.acquire(
+            rig(gain=1000.0, read=0.003, ambient=0.3), geometry="aligned", strategy=strategy
+        )
         error[strategy] = relative_error(dense(T), corner(), T.grid)
     assert error["auto"] <= 1.5 * min(error.values())
 
@@ -91,7 +105,9 @@ def test_time_disk_and_saturation() -> None:
     strategies = plans(GRID, (0.5, 8.0), block=4, overhead=0.25)
     pixel, block = strategies["pixel"], strategies["block"]
     assert pixel.photographs - block.photographs == 2 * (260 - 18) + 4 - 2
-    assert pixel.seconds - block.seconds == pytest.approx((260 - 18) * (8.5 + 2 * 0.25) + 2 * (0.5 + 0.25))
+    assert pixel.seconds - block.seconds == pytest.approx(
+        (260 - 18) * (8.5 + 2 * 0.25) + 2 * (0.5 + 0.25)
+    )
     assert (block.grid, pixel.disk) == ((4, 4), 2 * 12 * 256**2)
     saturated = plans(GRID, (8.0,), NoiseModel(), Light(direct=0.5))
     assert saturated["pixel"].error == saturated["hadamard"].error == 1.0  # no signal

@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Radiometric compensation: the projector pattern that makes the scene look as desired (section 8.2)."""
+
+from __future__ import annotations
+
+from ltcl.tasks.compensation.compensate import RTOL, Compensation, compensate
+
+__all__ = ["RTOL", "Compensation", "compensate"]

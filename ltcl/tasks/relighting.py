@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Relighting: the picture of the scene under any projector pattern, l_out = T l_in (eq. 3)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ltcl.transport.transport import Transport, require
+
+
+def relight(T: Transport, pattern: Any) -> np.ndarray:
+    """The picture the camera sees under `pattern`; the same as ``T @ pattern``.
+
+    `pattern` is linear projector light, (h, w), (h, w, 3), frames of these, or (N,). The picture is
+    float32, on the camera's grid, in colour where T or the pattern is. Another size or NaN raise
+    InputError.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> print(ltcl.relight(T, numpy.array([[1.0, 1.0]])))
+    [[0.6 0.6]]
+    """
+    return require(T, square=False) @ pattern

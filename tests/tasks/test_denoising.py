@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl.denoise` against the truth, on the five scenes, and what it keeps and refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import ltcl
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.transport.noise import Noise
+from tests.transport.noise.measured import SCENES, measure, noise_of, truth
+
+random = np.random.default_rng()
+
+# Noise of the median first bounce and its photons; then the most that is left of errors of entries,
+# pictures and bounces of scenes of 8 pixels a side, diffuse and glossy.
+CASES = [
+    ((1e-4, 0.0), (0.65, 0.9), (0.95, 1.0)),
+    ((1e-3, 1.0), (0.45, 0.8), (0.6, 1.0)),
+    ((1e-2, 1.0), (0.2, 0.5), (0.35, 0.8)),
+]
+
+
+def relative(
+    errors: Callable[[ltcl.Transport], np.ndarray], T: ltcl.Transport, D: ltcl.Transport
+) -> float:
+    return float(np.linalg.norm(errors(D)) / np.linalg.norm(errors(T)))
+
+
+def off_diagonal(T: ltcl.Transport) -> np.ndarray:
+    return T.to_numpy() * (1.0 - np.eye(T.shape[0]))
+
+
+@pytest.mark.parametrize(("noise", "diffuse", "glossy"), CASES)
+@pytest.mark.parametrize("scene", SCENES)
+def test_entries_pictures_and_bounces_come_nearer_to_the_truth(
+    scene: str,
+    noise: tuple[float, float],
+    diffuse: tuple[float, float],
+    glossy: tuple[float, float],
+) -> None:
+    exact = truth(scene, 8)
+    T = measure(exact, noise_of(exact, *noise), seed=int(random.integers(1000)))
+    D = ltcl.denoise(T)
+    entries, light = glossy if scene == "glossy" else diffuse
+    patterns = random.integers(0, 2, (10, *T.grid)).astype(np.float32)
+    picture = exact @ patterns[0]
+
+    def bounces(some: ltcl.Transport) -> np.ndarray:
+        return ltcl.separate(some, picture, 3, method="direct").bounces
+
+    assert relative(lambda some: off_diagonal(some) - off_diagonal(exact), T, D) < entries
+    assert relative(lambda some: some @ patterns - exact @ patterns, T, D) < light
+    assert relative(lambda some: bounces(some) - bounces(exact), T, D) < light
+    assert np.array_equal(D.first_bounce, T.first_bounce)
+    assert D.to_numpy().min() >= 0.0
+
+
+@pytest.mark.parametrize(("c", "most", "share"), [(0.6, 0.6, 1.2), (0.9, 1.15, 0.85)])
+def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(
+    c: float, most: float, share: float
+) -> None:
+    """Of a path tracer: pictures are known better than entries say, and stay so."""
+    exact = truth("corner", 12)
+    known = dataclasses.replace(noise_of(exact, 1e-3), neighbours=c)
+    E = np.sqrt(known.variance(exact.to_numpy())) * random.standard_normal(exact.shape)
+    E = known.filtered(np.ascontiguousarray(E.T), exact.grid).T * (1.0 - np.eye(len(E)))
+    T, independent = (
+        ltcl.Transport(exact.to_numpy() + E, exact.grid, noise=noise)
+        for noise in (known, dataclasses.replace(known, neighbours=0.0))
+    )
+    white = np.ones(T.grid)
+    left = [
+        relative(lambda some: (some @ white) - (exact @ white), T, ltcl.denoise(X))
+        for X in (T, independent)
+    ]
+    assert left[0] < min(most, share * left[1])
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_reciprocity_is_restored_where_the_scene_has_it_and_left_out_where_not(scene: str) -> None:
+    exact = truth(scene, 8)
+    D = ltcl.denoise(measure(exact, noise_of(exact, 1e-3), seed=1))
+    assert (D.reciprocity_defect < 0.01) == (scene != "glossy")
+    if scene == "glossy":
+        assert 0.5 < D.reciprocity_defect / exact.reciprocity_defect < 2.0
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_few_photons_an_entry_do_not_move_light_between_reciprocal_pairs(seed: int) -> None:
+    """As of a path tracer, whose columns have few paths each: logarithms of dim entries would have a bias."""
+    exact = truth("corner", 8)
+    E, x, white = exact.to_numpy(), np.arange(8 * 16) % 16 / 16, np.ones(exact.grid)
+    light = float(E[~np.eye(len(E), dtype=bool)].mean())
+    known = Noise.uniform(E.shape, 1e-6 * light, photons=light)
+    columns = np.exp(2.0 * np.cos(2.0 * np.pi * x))
+    known = dataclasses.replace(known, columns=columns[None] / columns.mean())
+    photon = light * known.columns[0]
+    noisy = np.random.default_rng(seed).poisson(E / photon) * photon
+    np.fill_diagonal(noisy, np.diag(E))
+    T = ltcl.Transport(noisy, exact.grid, noise=known)
+
+    def last(some: ltcl.Transport) -> np.ndarray:
+        return (
+            ltcl.separate(some, exact @ white, 3).bounces[2]
+            - ltcl.separate(exact, exact @ white, 3).bounces[2]
+        )
+
+    assert relative(last, T, ltcl.denoise(T)) < 0.75
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_noise_of_the_result_is_that_of_its_pictures(scene: str) -> None:
+    """Within a factor 2, of a white one."""
+    exact, white = truth(scene, 8), np.ones((1, *truth(scene, 8).grid))
+    T = measure(exact, noise_of(exact, 1e-3), seed=2)
+    D = ltcl.denoise(T)
+    error = np.linalg.norm(D @ white - exact @ white) / np.sqrt(
+        D.noise.variance(D.to_numpy()).sum()
+    )
+    assert 0.5 < error < 2.0
+    assert D.noise.floor < T.noise.floor
+
+
+def test_without_noise_nothing_changes() -> None:
+    exact = truth("painted", 8)
+    D = ltcl.denoise(
+        ltcl.Transport(exact.to_numpy(), exact.grid, noise=Noise.uniform(exact.shape, 0.0))
+    )
+    assert np.allclose(D.to_numpy(), exact.to_numpy(), atol=1e-6)
+
+
+def test_what_a_transport_carries_stays() -> None:
+    exact = truth("corner", 6)
+    entries = [measure(exact, noise_of(exact, 1e-3), seed).to_numpy() for seed in range(3)]
+    mixing = np.eye(3) + 0.1
+    F = np.stack([A.diagonal() * 0.9 for A in entries])
+    F[:, 5] = 0.0
+    noise = Noise.uniform(exact.shape, 3 * [6e-4])
+    matrices = [scipy.sparse.csr_array(A) for A in entries]
+    T = ltcl.Transport(matrices, exact.grid, F, on_dark="mask", mixing=mixing, noise=noise)
+    shares: list[float] = []
+    D = ltcl.denoise(T, progress=lambda text, share: shares.append(share))
+    assert (D.grid, D.channels, D.masked.tolist()) == (T.grid, 3, T.masked.tolist())
+    assert np.array_equal(D.first_bounce, T.first_bounce)
+    assert np.array_equal(np.asarray(D.mixing), mixing)
+    assert all(
+        np.array_equal(a.diagonal(), b.diagonal()) for a, b in zip(D.matrices, entries, strict=True)
+    )
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_rectangular_transport() -> None:
+    exact = truth("box", 8).to_numpy()[:128]
+    noisy = exact + random.normal(0.0, 1e-3, exact.shape)
+    noise = Noise.uniform(exact.shape, 1e-3)
+    D = ltcl.denoise(ltcl.Transport(noisy, (8, 24), camera_grid=(16, 8), noise=noise))
+    assert D.camera_grid == (16, 8)
+    assert np.linalg.norm(D.to_numpy() - exact) < 0.6 * np.linalg.norm(noisy - exact)
+
+
+def test_what_cannot_be_denoised_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    T = measure(truth("corner", 6), noise_of(truth("corner", 6), 1e-3), 0)
+    blocks: Any = [[T.to_numpy()] * 3] * 3
+    no_transport: Any = [[1.0]]
+    with pytest.raises(InputTypeError, match="T is made of ScaledColumns"):
+        ltcl.denoise(ltcl.compress(T, 0.1))
+    with pytest.raises(InputError, match="T has blocks"):
+        ltcl.denoise(ltcl.Transport(blocks, T.grid))
+    with pytest.raises(InputTypeError, match="T is a list"):
+        ltcl.denoise(no_transport)
+    monkeypatch.setattr("ltcl.checks.host_memory", lambda: 1000)
+    with pytest.raises(MemoryLimitError, match="denoising needs"):
+        ltcl.denoise(T)

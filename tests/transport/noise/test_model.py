@@ -1,0 +1,403 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Noise of T against noise that is known: estimated, from a second measurement, acquired; in files."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+
+import ltcl
+from ltcl import scenes
+from ltcl.acquisition import VirtualRig, acquire
+from ltcl.acquisition.radiometry import Response
+from ltcl.cli.main import main
+from ltcl.errors import InputError, InputTypeError
+from ltcl.transport.noise import Noise
+
+from .measured import SCENES, measure, noise_of, truth
+
+random = np.random.default_rng()
+LEVELS = (1e-5, 1e-4, 1e-3, 1e-2)
+CLOSE = 1.3
+LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))
+ATTRIBUTES = ("photons", "floor", "rows", "columns", "white", "direct", "neighbours")
+
+
+def seed() -> int:
+    return int(random.integers(1 << 31))
+
+
+def ratios(T: ltcl.Transport, noise: Noise, exact: Noise) -> np.ndarray:
+    """Standard deviations over true ones, of all entries of the truth T."""
+    return np.sqrt(noise.variance(T.to_numpy()) / exact.variance(T.to_numpy()))
+
+
+def within(ratio: np.ndarray) -> float:
+    return float(np.mean(np.abs(np.log(ratio)) < np.log(CLOSE)))
+
+
+def with_factors(noise: Noise, spread: float) -> Noise:
+    rows, columns = (
+        np.exp(spread * random.standard_normal(x.shape)) for x in (noise.rows, noise.columns)
+    )
+    return replace(noise, rows=rows / rows.mean(), columns=columns / columns.mean())
+
+
+def same(a: Noise | None, b: Noise) -> bool:
+    return (
+        a is not None
+        and a.source == b.source
+        and all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ATTRIBUTES)
+    )
+
+
+@pytest.mark.parametrize("photons", [0.0, 1.0, 300.0])
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_estimate_is_within_a_factor_of_1_3(scene: str, level: float, photons: float) -> None:
+    """Of 95 % of the entries, and of the first bounce; that of the glossy scene has structure of 1e-5."""
+    T = truth(scene)
+    exact = noise_of(T, level, photons)
+    ratio = ratios(T, measure(T, exact, seed(), known=False).noise, exact)
+    assert within(ratio) > 0.95
+    limit = 2.5 if (scene, level) == ("glossy", 1e-5) else 1.45  # few samples: 1.3 of most seeds
+    assert 1.0 / limit < np.median(np.diag(ratio)) < limit
+
+
+@pytest.mark.parametrize("scene", ["corner", "occluded"])
+def test_estimate_finds_factors_of_rows_and_columns(scene: str) -> None:
+    T = truth(scene)
+    exact = with_factors(noise_of(T, 1e-3), 0.6)
+    noise = measure(T, exact, seed(), known=False).noise
+    assert within(ratios(T, noise, exact)) > 0.8  # 0.33 without factors
+    for name in ("rows", "columns"):
+        logs = np.log([getattr(noise, name)[0], getattr(exact, name)[0]])
+        assert np.corrcoef(logs)[0, 1] > 0.8
+
+
+def noisy(change: Any = None, n: int = 8) -> tuple[np.ndarray, tuple[int, int], float]:
+    T = truth("corner", n)
+    noise = noise_of(T, 1e-3)
+    entries = measure(T, noise, seed()).to_numpy()
+    return entries, T.grid, float(noise.floor[0])
+
+
+def dark(T: np.ndarray) -> np.ndarray:
+    T = T.copy()
+    T[:, 5] = T[[7, 40]] = 0.0
+    return T + np.diag(np.where(np.diag(T) == 0, 0.1, 0.0)).astype(T.dtype)
+
+
+@pytest.mark.parametrize(
+    ("change", "upper"),
+    [
+        (lambda T, grid: ltcl.Transport(T, grid), 1.5),
+        (lambda T, grid: ltcl.Transport(scipy.sparse.csr_array(T), grid), 1.5),
+        (lambda T, grid: ltcl.Transport([T, T, T], grid), 1.5),
+        (lambda T, grid: ltcl.Transport(T[:100], grid, camera_grid=(10, 10)), 1.5),
+        (lambda T, grid: ltcl.Transport(dark(T), grid), 1.5),
+        (lambda T, grid: ltcl.Transport(np.maximum(T, 0.0), grid), 1.5),
+        (lambda T, grid: ltcl.Transport(T, (1, 128)), 1.5),
+        # Three standard deviations are a threshold: what stays is larger than the noise.
+        (
+            lambda T, grid: ltcl.Transport(
+                scipy.sparse.csr_array(np.where(T > 0.002, T, 0.0)), grid
+            ),
+            4.0,
+        ),
+    ],
+    ids=[
+        "dense",
+        "sparse",
+        "colour",
+        "rectangular",
+        "dark rows",
+        "clipped",
+        "one row",
+        "thresholded",
+    ],
+)
+def test_estimate_of_any_transport(change: Any, upper: float) -> None:
+    T, grid, floor = noisy()
+    noise = change(T, grid).noise
+    assert noise.source == "estimated"
+    assert np.all(noise.floor > floor / 1.5)
+    assert np.all(noise.floor < upper * floor)
+
+
+def test_estimate_is_not_confused_by_texture() -> None:
+    scene = scenes.dihedral(12)
+    T = replace(scene, albedo=random.uniform(0.2, 0.9, scene.albedo.shape)).transport()
+    exact = noise_of(T, 1e-3)
+    assert within(ratios(T, measure(T, exact, seed(), known=False).noise, exact)) > 0.95
+
+
+@pytest.mark.parametrize("grid", [(1, 1), (1, 2), (6, 12), (8, 16)])
+def test_estimate_of_a_transport_without_noise_is_next_to_nothing(grid: tuple[int, int]) -> None:
+    exact = (
+        scenes.dihedral(grid[0]).transport()
+        if grid[1] > 2
+        else ltcl.Transport(np.eye(grid[1]), grid)
+    )
+    assert np.max(exact.noise.diagonal(exact.first_bounce)) < 1e-4 * np.median(exact.first_bounce)
+
+
+def test_estimate_refuses_what_shows_no_entries() -> None:
+    T = truth("corner", 8)
+    operator = scipy.sparse.linalg.aslinearoperator(T.to_numpy())
+    for closed in (ltcl.compress(T, rtol=0.1), ltcl.Transport(operator, T.grid, T.first_bounce)):
+        with pytest.raises(InputError, match="noise="):
+            closed.noise  # noqa: B018
+
+
+@pytest.mark.parametrize("photons", [0.0, 300.0])
+@pytest.mark.parametrize("layout", [np.asarray, scipy.sparse.csr_array])
+def test_second_measurement_shows_the_noise(layout: Any, photons: float) -> None:
+    """Also where an object has moved, of 1 % of a row and one more entry."""
+    T = truth("painted")
+    exact = with_factors(noise_of(T, 1e-3, photons), 0.6)
+    first, second = (measure(T, exact, seed(), known=False).to_numpy() for _ in range(2))
+    second[3, 5] += 5.0
+    second[7] += 0.1 * (random.random(len(second)) < 0.01)
+    other = ltcl.Transport(layout(second), T.grid)
+    noise = ltcl.Transport(layout(first), T.grid, noise=other).noise
+    assert noise.source == "measured twice"
+    ratio = ratios(T, noise, exact)
+    assert within(ratio) > 0.97
+    assert 1 / CLOSE < np.median(np.diag(ratio)) < CLOSE
+
+
+BRIGHT = ltcl.Transport(1.5 * truth("corner", 8).to_numpy(), (8, 16))
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "match"),
+    [
+        (0.1, InputTypeError, "noise is a float"),
+        (Noise.uniform((3, 4), 0.1), InputError, r"noise.*\(3, 4\).*\(128, 128\)"),
+        (Noise.uniform((128, 128), [0.1] * 3), InputError, "noise.*3 channel"),
+        (replace(Noise.uniform((128, 128), 1e30), direct=0.0), InputError, r"noise.*1e\+30.*T"),
+        (ltcl.Transport(np.eye(12), (3, 4)), InputError, r"noise.*grid \(3, 4\)"),
+        (ltcl.Transport([np.eye(128)] * 3, (8, 16)), InputError, "noise.*channels 3"),
+        (measure(BRIGHT, noise_of(BRIGHT, 1e-3), 1), InputError, r"noise.*1\.5 times"),
+        (ltcl.compress(truth("corner", 8), rtol=0.1), InputError, "noise.*compressed"),
+    ],
+)
+def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) -> None:
+    T = truth("corner", 8)
+    with pytest.raises(error, match=match):
+        ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
+
+
+BAD = [
+    ("floor", [-1.0], "-1"),
+    ("floor", [1e300], "1e.300"),
+    ("floor", [1.0, 1.0], r"shape \(2,\)"),
+    ("photons", [np.nan], "nan"),
+    ("neighbours", [-0.1], "-0.1"),
+    ("direct", [0.1, 0.2], r"shape \(2,\)"),
+    ("rows", np.ones(4), r"shape \(4,\)"),
+    ("rows", np.full((1, 4), 1e300), "1e.300"),
+    ("columns", [[np.inf] * 4], "inf"),
+    ("white", [[1.0]], r"shape \(1, 1\)"),
+    ("white", [[np.nan] * 4], "nan"),
+    ("source", "guessed", "guessed"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "says"), BAD)
+def test_bad_noise_is_refused(name: str, value: Any, says: str) -> None:
+    good = Noise.uniform((4, 4), 0.1)
+    with pytest.raises((InputError, InputTypeError), match=rf"noise\.{name} .*{says}"):
+        Noise(**{**vars(good), name: value})
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4, 4), None, "ab", (-1, 2), (2.5, 2)])
+def test_noise_of_no_shape_is_refused(shape: Any) -> None:
+    with pytest.raises(InputError, match="shape is"):
+        Noise.uniform(shape, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("floor", None),
+        ("floor", "a"),
+        ("source", 9),
+        ("source", -1),
+        ("source", [0]),
+        ("source", "given"),
+    ],
+)
+@pytest.mark.parametrize("extension", ["npz", "h5"])
+def test_files_of_damaged_noise_are_refused(
+    name: str, value: Any, extension: str, tmp_path: Path
+) -> None:
+    """Those of before `neighbours` are not damaged."""
+    arrays: dict[str, Any] = {
+        "T": np.eye(4),
+        "grid": [2, 2],
+        **Noise.uniform((4, 4), 0.01).to_arrays(),
+    }
+    del arrays["noise_neighbours"]
+    path = tmp_path / f"T.{extension}"
+
+    def write() -> None:
+        if extension == "npz":
+            np.savez(path, allow_pickle=False, **{n: a for n, a in arrays.items() if a is not None})
+            return
+        with h5py.File(path, "w") as file:
+            file.update({n: a for n, a in arrays.items() if a is not None})
+
+    write()
+    assert same(ltcl.load(path).measured_noise, Noise.uniform((4, 4), 0.01))
+    arrays[f"noise_{name}"] = value
+    write()
+    with pytest.raises(InputError, match=f"noise[_.]{name}"):
+        ltcl.load(path)
+
+
+def test_a_transport_is_no_second_measurement_of_itself() -> None:
+    T = truth("corner", 8)
+    with pytest.raises(InputError, match="noise"):
+        ltcl.Transport(T.to_numpy(), T.grid, noise=T).noise  # noqa: B018
+
+
+KINDS = [
+    (kind, end)
+    for kind in ("given", "measured twice", "colour")
+    for end in ("npz", "zarr", "h5", "pickle")
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "extension"), [*KINDS, *(("compressed", end) for end in ("npz", "zarr", "pickle"))]
+)
+def test_noise_is_kept_unless_it_is_an_estimate(
+    kind: str, extension: str, tmp_path: Path, disk_without_delay: None
+) -> None:
+    entries, grid, floor = noisy()
+    again, _, _ = noisy()
+    noise: Any = Noise.uniform(entries.shape, floor, floor**2)
+    if kind == "compressed":
+        plain = ltcl.compress(ltcl.Transport(entries, grid), rtol=0.1)
+        T = ltcl.Transport(plain.matrices, grid, plain.first_bounce, noise=noise)
+    elif kind == "colour":
+        three = Noise.uniform(entries.shape, [floor] * 3)
+        T = ltcl.Transport([scipy.sparse.csr_array(entries)] * 3, grid, noise=three)
+    else:
+        second = ltcl.Transport(again, grid)
+        T = ltcl.Transport(entries, grid, noise=noise if kind == "given" else second)
+    path = tmp_path / f"T.{extension}"
+    if extension == "pickle":
+        kept = pickle.loads(pickle.dumps(T))  # noqa: S301 - our own
+        other = ltcl.Transport(entries, grid)
+        estimated = pickle.loads(pickle.dumps(other))  # noqa: S301 - our own
+    else:
+        ltcl.save(path, T)
+        kept = ltcl.load(path)
+        ltcl.save(path, ltcl.Transport(entries, grid))
+        estimated = ltcl.load(path)
+    assert same(kept.measured_noise, T.noise)
+    assert estimated.measured_noise is None
+
+
+def test_second_measurement_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries = noisy()[0]
+    paths = [str(tmp_path / name) for name in ("T.npz", "again.npz", "other.npz", "C.npz")]
+    for path, T in zip(paths, (entries, noisy()[0], entries[:64, :64]), strict=False):
+        ltcl.save(path, ltcl.Transport(T, (8, len(T) // 8)))
+    assert (
+        main(["compress", paths[0], "--noise", paths[1], "--out", paths[3], "--rtol", "noise"]) == 0
+    )
+    assert main(["analyze", paths[0], "--noise", paths[2]]) == 1
+    assert "noise is a T of grid (8, 8)" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("strategy", "least"), [("pixel", 0.6), ("adaptive", 0.6), ("hadamard", 0.3)]
+)
+def test_acquired_transports_have_the_noise_of_their_scan(
+    strategy: str, least: float, tmp_path: Path, disk_without_delay: None
+) -> None:
+    """Errors of entries, first bounce and pictures, in standard deviations.
+
+    Entries of an S-matrix batch share their noise, the first bounce's; the model has its mean over
+    the row, of all entries only where none is dropped.
+    """
+    T, z, diagonal, pictures = truth("corner", 4), [], [], []
+    seed()
+    exact, p = T.to_numpy(), random.random(T.shape[1])
+    for number in range(2):
+        camera = {"bits": 12, "ambient": 0.01, "read": 0.003, "gain": 2000.0, "response": "linear"}
+        rig, path = (
+            VirtualRig(exact, T.grid, seed=seed() % 1000, **camera),
+            tmp_path / f"{number}.zarr",
+        )
+        options = {"order": 7, "response": LINE, "sigmas": 0.0 if strategy == "hadamard" else 3.0}
+        scan = acquire(rig, geometry="aligned", strategy=strategy, store=path, **options)
+        again = ltcl.load(path, on_dark="mask")
+        assert same(scan.noise, again.noise)
+        assert scan.noise.source == "acquired"
+        measured = scan @ np.eye(32).reshape(32, *T.grid)
+        measured = measured.reshape(32, 32).T * (exact.sum() / measured.sum())
+        v, white = scan.noise.variance(exact), scan.noise.white[0]
+        total = v.sum(axis=1)
+        error = measured - exact
+        own = v + (white / total - 1.0)[:, None] * v**2 / total[:, None]
+        z.append((error / np.sqrt(own))[~np.eye(32, dtype=bool)])
+        diagonal.append(np.diag(error / np.sqrt(own)))
+        square = v @ p**2 + (white / total - 1.0) * (v @ p) ** 2 / total
+        pictures.append((error @ p) / np.sqrt(square))
+    for values in (z, diagonal, pictures):
+        assert least < np.sqrt(np.mean(np.square(values))) < 1.7
+
+
+def test_the_first_bounce_may_have_a_noise_of_its_own() -> None:
+    """As of a path tracer, which has no chance where light comes straight from the projector."""
+    T = truth("box")
+    noise = replace(noise_of(T, 1e-3, photons=100.0), direct=0.01)
+    first, second = (measure(T, noise, seed, known=False) for seed in (1, 2))
+    twice = ltcl.Transport(first.to_numpy(), T.grid, noise=second).noise
+    assert twice.direct == pytest.approx(0.01, rel=0.4)
+    for each in (twice, first.noise):
+        ratio = each.diagonal(T.first_bounce) / noise.diagonal(T.first_bounce)
+        assert 0.7 < np.median(ratio) < 1.4
+    shown = ltcl.compensate(
+        ltcl.Transport(first.to_numpy(), T.grid, noise=twice), T @ np.full(T.grid, 0.5)
+    )
+    errors = (first @ shown.pattern - T @ shown.pattern) / shown.std.appearance
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("twice", [False, True])
+def test_errors_of_neighbouring_columns_may_cancel(share: float, twice: bool) -> None:
+    """As of a path tracer: by row sums, in deviations of what smooth, single and random pictures show."""
+    T = truth("corner", 16)
+    independent = noise_of(T, 1e-3)
+    noise = replace(independent, neighbours=share)
+    first, second = (
+        T.to_numpy()
+        + noise.filtered((measure(T, independent, k).to_numpy() - T.to_numpy()).T, T.grid).T
+        for k in (1, 2)
+    )
+    other = ltcl.Transport(second, T.grid) if twice else None
+    measured = ltcl.Transport(first, T.grid, noise=other)
+    assert measured.noise.neighbours == pytest.approx(share, abs=0.15)
+    patch = np.zeros(T.grid)
+    patch[2:14, 2:14] = 0.8
+    for p in (np.full(T.grid, 0.5), patch, random.random(T.grid)):
+        c = ltcl.compensate(measured, T @ p, bounds=(-9.0, 9.0))
+        errors = (measured @ c.pattern - T @ c.pattern) / c.std.appearance
+        assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.3
