@@ -34,7 +34,7 @@ from ltcl.acquisition.radiometry.camera import NO_LIGHT
 from ltcl.acquisition.radiometry.merge import Radiance
 from ltcl.acquisition.radiometry.response import Response
 from ltcl.errors import InputError
-from ltcl.transport import frames as layout
+from ltcl.transport.matrices import check_mixing
 
 _TABLE = 1025  # four values for each code of 8 bits
 _SIGNIFICANT = (
@@ -128,4 +128,4 @@ def mixing(lit: Sequence[Radiance], black: Radiance) -> np.ndarray:
                 f"lit[{c}] has no light in its own channel {c}; is the order red, green, blue?"
             )
         M[c, d] = np.sum(w * L[:, c, d] * L[:, c, c]) / own
-    return layout.mixing(M, 3, None)
+    return check_mixing(M, 3, has_blocks=False)
