@@ -20,7 +20,7 @@ from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import ScaledColumns
 from ltcl.operators import stored as stored_operators
-from ltcl.operators.interreflection import made_with
+from ltcl.operators.interreflection import underlying_system
 
 if TYPE_CHECKING:
     from ltcl.transport.transport import Transport
@@ -30,7 +30,7 @@ def to_arrays(T: Transport) -> dict[str, np.ndarray]:
     """The arrays of a compressed T, S diag(d) in each channel."""
     systems = []
     for matrix in T.matrices:
-        S = made_with(matrix)
+        S = underlying_system(matrix)
         if S is not None:
             systems.append(S)
     if not T.is_square or len(systems) < T.channels:

@@ -21,6 +21,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
+from ltcl.files import check_mapped_file
 from ltcl.operators import (
     Coupled,
     IdentityPlus,
@@ -29,8 +30,7 @@ from ltcl.operators import (
     as_operator,
     interreflections,
 )
-from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
-from ltcl.operators.parts import intact
+from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
 from ltcl.transport import diagnostics, stored
 from ltcl.transport import frames as layout
@@ -161,7 +161,7 @@ class Transport:
         self._arrays: dict[str, np.ndarray] = {}
 
         self._requested_device = device
-        matrix_device = device_of(self.blocks or [self.matrices], device)
+        matrix_device = common_device(self.blocks or [self.matrices], device)
         if matrix_device is not None:
             self.device = matrix_device
         self._noise = self._check_noise(noise)
@@ -217,7 +217,7 @@ class Transport:
         """Whether some channel is an operator S diag(d)."""
         if not self.is_square:
             return False
-        return any(made_with(T) is not None for T in self.matrices)
+        return any(underlying_system(T) is not None for T in self.matrices)
 
     def _check_noise(self, noise: Any) -> Noise | Transport | None:
         if noise is None:
@@ -259,7 +259,7 @@ class Transport:
             self.matrices, requested, lambda: self.device, probes, seed, rule
         )
         is_dark = rule.find_dark(F)
-        may_mask = mask and all(map(maskable, self.matrices))
+        may_mask = mask and all(map(can_mask_pixels, self.matrices))
         self._F, self.masked, reason = mask_dark(F, is_dark, self.grid, may_mask)
         # The zeros of a first bounce that the caller gave are no news to the caller.
         is_news = isinstance(requested, str) or np.any(self.masked & (F > 0))
@@ -469,7 +469,7 @@ class Transport:
 
     def _operator(self, channel: int) -> Operator:
         """T of one channel: S F if that has all of its digits, so that nothing is stored twice."""
-        T = intact(self.matrices[channel])
+        T = check_mapped_file(self.matrices[channel])
         if self._F is None or self.masked.any() or isinstance(T, Operator):
             return as_operator(T, self.device)
         F = self._F[channel]
@@ -509,7 +509,7 @@ class Transport:
             # A sparse matrix in memory, or the rows of a store.
             matrix = matrix.tocsr().toarray()
         if isinstance(matrix, np.ndarray):
-            return intact(matrix)
+            return check_mapped_file(matrix)
         return as_operator(matrix, self.device).to_dense()
 
 
