@@ -474,7 +474,11 @@ def relative_deviation(before: np.ndarray, after: np.ndarray) -> float:
         return np.inf
     difference = np.abs(before.astype(np.float64) - after.astype(np.float64))
     largest = np.abs(before.astype(np.float64)).max(initial=0.0)
-    return float(difference.max(initial=0.0) / largest) if largest else float(difference.max(initial=0.0))
+    return (
+        float(difference.max(initial=0.0) / largest)
+        if largest
+        else float(difference.max(initial=0.0))
+    )
 
 
 def main(arguments: list[str]) -> int:
