@@ -216,10 +216,27 @@ def task_commands() -> list[str]:
 
 
 def help_commands() -> list[str]:
-    commands = (
-        "devices doctor demo simulate info analyze convert compress invert denoise compensate film "
-        "separate relight view play show acquire"
-    ).split()
+    """Ask each command for its help."""
+    commands = [
+        "devices",
+        "doctor",
+        "demo",
+        "simulate",
+        "info",
+        "analyze",
+        "convert",
+        "compress",
+        "invert",
+        "denoise",
+        "compensate",
+        "film",
+        "separate",
+        "relight",
+        "view",
+        "play",
+        "show",
+        "acquire",
+    ]
     lines = ["--help", "acquire plan --help", "acquire run --help", "acquire report --help"]
     return lines + [f"{command} --help" for command in commands]
 
@@ -342,6 +359,7 @@ def run(line: str) -> dict[str, Any]:
 
 
 def files() -> Iterator[Path]:
+    """Files below the working folder, without those of the record."""
     for path in sorted(Path().rglob("*")):
         if path.is_file() and not path.name.endswith((".lock", "record.json", "calls.npz")):
             yield path
@@ -358,6 +376,7 @@ def plain_text(text: str) -> Any:
 
 
 def without_variable_fields(value: Any) -> Any:
+    """A JSON value without fields of times and versions, numbers with four digits."""
     if isinstance(value, dict):
         return {
             key: without_variable_fields(entry)
@@ -391,6 +410,7 @@ def digest(path: Path) -> Any:
 
 
 def summary(array: np.ndarray) -> Any:
+    """Type, shape and moments of an array."""
     if array.dtype.kind not in "fiub":
         return str(array)[:200]
     values = array.astype(np.float64)
@@ -399,6 +419,7 @@ def summary(array: np.ndarray) -> Any:
 
 
 def record(folder: Path) -> None:
+    """Run all command lines and public calls, and write the record."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     os.chdir(folder)
@@ -417,6 +438,7 @@ def record(folder: Path) -> None:
 
 
 def differences(before: Any, after: Any, place: str) -> Iterator[str]:
+    """Lines that name what differs between two JSON values."""
     if isinstance(before, dict) and isinstance(after, dict):
         for key in sorted({*before, *after}):
             if key not in before:
@@ -446,6 +468,7 @@ def named_by_line(runs: dict[str, Any]) -> dict[str, Any]:
 
 
 def compare(before: Path, after: Path) -> int:
+    """Print what differs between two records; 1 where something does."""
     count = 0
     old = json.loads((before / "record.json").read_text("utf-8"))
     new = json.loads((after / "record.json").read_text("utf-8"))
@@ -470,6 +493,7 @@ def compare(before: Path, after: Path) -> int:
 
 
 def relative_deviation(before: np.ndarray, after: np.ndarray) -> float:
+    """Largest deviation over the largest value."""
     if before.shape != after.shape:
         return np.inf
     difference = np.abs(before.astype(np.float64) - after.astype(np.float64))
@@ -482,6 +506,7 @@ def relative_deviation(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def main(arguments: list[str]) -> int:
+    """Exit code of this program."""
     if len(arguments) == 2 and arguments[0] == "record":
         record(Path(arguments[1]).resolve())
         return 0
