@@ -191,7 +191,7 @@ class Transport:
         return f"<ltcl Transport {text}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         if self._F is None:
             return thumbnails(self, {"picture under white": self @ np.ones(self.grid)})
