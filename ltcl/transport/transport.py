@@ -194,7 +194,7 @@ class Transport:
 
     def _repr_html_(self) -> str:
         # Imported here, as it brings OpenCV.
-        from ltcl.images.pictures import thumbnails
+        from ltcl.images.thumbnails import thumbnails
 
         if self._F is None:
             return thumbnails(self, {"picture under white": self @ np.ones(self.grid)})

@@ -30,9 +30,10 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.acquisition.rig import as_codes, as_exposures, fingerprint, shot_key
+from ltcl.acquisition.rig import as_codes, as_exposures, shot_key
 from ltcl.errors import InputError
 from ltcl.images import from_srgb, to_srgb
+from ltcl.transport.fingerprint import fingerprint
 from ltcl.transport.matrices import check_matrices, check_mixing
 
 Curve = Callable[[np.ndarray], np.ndarray]
