@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Checks of the matrices of a transport: one (M, N), three for RGB, 3 x 3 blocks, and a mixing of colours.
+"""Checks of the matrices of a transport: one (M, N), three for RGB, 3 x 3 blocks, and a mixing.
 
 Checked matrices are NumPy arrays, `scipy.sparse.csr_array` or LinearOperators.
 """
@@ -42,7 +42,7 @@ def check_matrices(value: Any, name: str = "matrix") -> tuple[Any, ...]:
 
 
 def check_blocks(value: Any) -> tuple[tuple[Any, ...], ...] | None:
-    """3 x 3 checked matrices of one shape; None if `value` is no nested sequence or (3, 3, M, N) array."""
+    """3 x 3 checked matrices of one shape; None if `value` is not nested, or (3, 3, M, N)."""
     rows = [_members(row, 3) for row in _members(value, 4)]
     if not any(_is_matrix(block) for row in rows for block in row):
         return None

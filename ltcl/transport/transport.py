@@ -356,7 +356,7 @@ class Transport:
 
     @cached_property
     def noise(self) -> Noise:
-        """Standard deviations of the entries: as given or measured, else estimated from T at the first call.
+        """Standard deviations of the entries: given, measured, or estimated at the first call.
 
         InputError if T does not show its entries (compressed, or a LinearOperator) and no noise is
         given.
@@ -376,7 +376,7 @@ class Transport:
 
     @property
     def is_square(self) -> bool:
-        """Whether S exists: camera and projector have the same pixels, and colours no blocks between them."""
+        """Whether S exists: one grid of camera and projector, and no blocks between colours."""
         return self.camera_grid == self.grid and self.blocks is None
 
     @property
@@ -407,12 +407,12 @@ class Transport:
         """Deviation of the worst channel from reciprocity, by a sample of pixels; computed once."""
         defects = []
         for T, F in zip(self.matrices, self._require_first_bounce(), strict=True):
-            defects.append(diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK))
+            defects.append(diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK_ENTRIES))
         return max(defects)
 
     @cached_property
     def negative_bounces(self) -> tuple[float, ...]:
-        """Share of light that one bounce takes away, for each channel (`ltcl.transport.diagnostics`)."""
+        """Share of light that one bounce takes away, for each channel; computed once."""
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
 
     # Operators on the device.
@@ -439,9 +439,9 @@ class Transport:
 
     @property
     def error(self) -> float:
-        """Relative error of solutions that compression leaves, as its `norm` states it: of pictures, or all.
+        """Relative error of solutions that compression leaves, besides rounding, 1e-7.
 
-        Rounding, 1e-7, comes on top.
+        It holds for pictures, or for all right-hand sides, as the `norm` of the compression states.
         """
         if not self.is_compressed:
             return 0.0
@@ -480,7 +480,7 @@ class Transport:
     # Use.
 
     def __matmul__(self, pattern: Any) -> np.ndarray:
-        """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
+        """Relight: the picture (float32) under `pattern`, as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
         if self.couples:
             columns = [np.concatenate(columns)]
@@ -492,7 +492,7 @@ class Transport:
         return shape.pack([picture.get() for picture in pictures], self.camera_grid)
 
     def to_numpy(self) -> np.ndarray:
-        """T on the host, dense, without `mixing`: (M, N), (3, M, N) in colour, (3, 3, M, N) of blocks."""
+        """T on the host, dense, without `mixing`: (M, N), (3, M, N), or (3, 3, M, N) of blocks."""
         M, N = self.shape
         count = self.channels if self.blocks is None else 9
         checks.fits_host("T as an array", 8 * count * M * N)
@@ -514,7 +514,7 @@ class Transport:
 
 
 def check_transport(T: Any, *, square: bool = True, name: str = "T") -> Transport:
-    """T itself; refused, before any upload, if it is no Transport, or has no S and must be `square`."""
+    """Return T if it is a Transport, and has an S or need not be `square`; refuse others."""
     if not isinstance(T, Transport):
         raise InputTypeError(
             f"{name} is a {type(T).__name__}; it must be a ltcl.Transport(matrix, grid)"
