@@ -61,8 +61,8 @@ def test_gauss_seidel_takes_the_sweeps_foreseen(device, seed, rho, rtol):
 def test_sweeps_beyond_those_tried_go_on_at_their_rate(device, monkeypatch):
     S = IdentityPlus(Dense(device, enclosure(40, 0.97).R))
     every = theory.gauss_seidel_forecast(S, 1e-5).products
-    monkeypatch.setattr(forecast, "_TRIAL", 0)
-    assert every > 2 * forecast._LATE
+    monkeypatch.setattr(forecast, "MAX_TRIAL_ENTRIES", 0)
+    assert every > 2 * forecast.MIN_TRIAL_SWEEPS
     assert theory.gauss_seidel_forecast(S, 1e-5).products == pytest.approx(every, rel=0.1)
 
 

@@ -86,7 +86,7 @@ def reciprocity_defect(
     root = np.exp(_log_scale(R) / 2)
     N = scipy.sparse.diags_array(1 / root) @ R @ scipy.sparse.diags_array(root)
     norm = scipy.sparse.linalg.norm(N)
-    if norm == 0:
+    if not norm > 0:
         return 0.0
     return float(scipy.sparse.linalg.norm(N - N.T) / (np.sqrt(2) * norm))
 

@@ -56,7 +56,8 @@ def cancellation(ratio: float, rows: int) -> float:
     `rows`. 0 if it may be below 1 by chance.
     """
     scatter = (2.0 / max(rows, 1)) ** 0.5
-    if ratio * (1.0 + CHANCE_SIGMAS * scatter) >= 1.0:
+    # Written so that NaN is chance, too.
+    if not ratio * (1.0 + CHANCE_SIGMAS * scatter) < 1.0:
         return 0.0
     # The lower root of a c^2 - 2 b c + 1 - ratio = 0.
     a = 1.0 - SQUARED_NORM * ratio

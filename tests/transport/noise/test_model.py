@@ -241,13 +241,11 @@ def test_noise_of_no_shape_is_refused(shape: Any) -> None:
 def test_files_of_damaged_noise_are_refused(
     name: str, value: Any, extension: str, tmp_path: Path
 ) -> None:
-    """Those of before `neighbours` are not damaged."""
     arrays: dict[str, Any] = {
         "T": np.eye(4),
         "grid": [2, 2],
         **Noise.uniform((4, 4), 0.01).to_arrays(),
     }
-    del arrays["noise_neighbours"]
     path = tmp_path / f"T.{extension}"
 
     def write() -> None:
