@@ -152,9 +152,7 @@ class BlockStore:
             arrays = self._get(name)
             csr = tuple(arrays[array] for array in CSR)
             entries = len(arrays["data"])
-            matrix = sparse_floats(
-                lambda: scipy.sparse.csr_array(csr, shape=shape), shape, entries
-            )
+            matrix = sparse_floats(lambda: scipy.sparse.csr_array(csr, shape=shape), shape, entries)
             return Block(matrix, arrays.get("variance"))
 
     def rows_again(self, channel: int, block: int) -> tuple[int, scipy.sparse.csr_array]:

@@ -53,6 +53,6 @@ def read_document(file: Path) -> dict[str, Any]:
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder holds a store of ltcl, damaged or not."""
+    """True if a folder holds a store of ltcl, damaged or not."""
     document = folder / "zarr.json"
     return document.is_file() and document.read_bytes().startswith(BEGINNING)

@@ -46,7 +46,7 @@ class PlacedBlock(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class FinalContent:
-    """What a final store holds, apart from its layout and provenance.
+    """Content of a final store, apart from its layout and provenance.
 
     The first bounce is the diagonal of T where that is above 0 by `sigmas` standard deviations.
     """

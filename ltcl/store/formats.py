@@ -16,13 +16,13 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import FileError, InputTypeError
-from ltcl.files import as_path, input_file, replace_file, unknown_extension
+from ltcl.files import as_path, check_mapped_file, input_file, replace_file, unknown_extension
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, hdf5, matlab, matrix_market, npz
 from ltcl.store.guards import about, floats
 from ltcl.store.record import INVERSE_FORMAT, CompressedRecord, Matrix, StoreRecord
 from ltcl.transport.first_bounce import DARK
-from ltcl.transport.transport import Transport, from_arrays, intact, require, to_arrays
+from ltcl.transport.transport import Transport, from_arrays, require, to_arrays
 
 logger = logging.getLogger(__name__)
 
@@ -159,7 +159,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     matrices = []
     for matrix in T.matrices:
         if isinstance(matrix, np.ndarray):
-            matrix = floats("T", intact(matrix))
+            matrix = floats("T", check_mapped_file(matrix))
         matrices.append(matrix)
     record = StoreRecord(
         matrices=tuple(matrices),
@@ -203,7 +203,7 @@ def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse
 def read(
     path: str | os.PathLike[str], *, variable: str | None = None
 ) -> StoreRecord | CompressedRecord:
-    """What a transport file holds; errors are those of `load`."""
+    """Read a transport file; errors are those of `load`."""
     path = as_path(path)
     suffix = find(path)
     file_format = FORMATS[suffix]
@@ -237,9 +237,7 @@ def write(path: str | os.PathLike[str], record: StoreRecord | CompressedRecord) 
             file_format.write(place, record)
 
 
-def check_losses(
-    path: Path, file_format: Format, record: StoreRecord | CompressedRecord
-) -> None:
+def check_losses(path: Path, file_format: Format, record: StoreRecord | CompressedRecord) -> None:
     """Refuse a format that cannot hold `record`; warn where it leaves out what can be found again."""
     loss = f"{path}: {path.suffix} does not keep"
     if isinstance(record, CompressedRecord):
@@ -258,7 +256,7 @@ def check_losses(
 
 
 def _is_diagonal(record: StoreRecord) -> bool:
-    """Whether the first bounce is the diagonal of T, or unknown."""
+    """True if the first bounce is the diagonal of T, or unknown."""
     if record.first_bounce is None:
         return True
     diagonals = [matrix.diagonal() for matrix in record.matrices]
@@ -279,7 +277,7 @@ def find(path: Path, *, inverse: bool = False) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """How a format is read and written, and what it keeps of a transport beside the matrices."""
+    """Functions by which a format is read and written, and what it keeps of a transport beside the matrices."""
 
     read: Callable[..., Any]
     write: Callable[[Path, Any], None]
@@ -302,9 +300,7 @@ MTX = Format(
 )
 HDF5 = Format(read=hdf5.read_hdf5, write=hdf5.write_hdf5)
 MAT = Format(read=matlab.read_mat, write=matlab.write_mat, keeps_noise=False)
-ZARR = Format(
-    read=block_store.read, write=block_store.write, has_names=False, keeps_operators=True
-)
+ZARR = Format(read=block_store.read, write=block_store.write, has_names=False, keeps_operators=True)
 FORMATS: dict[str, Format] = {
     ".npz": NPZ,
     ".npy": NPY,

@@ -56,7 +56,7 @@ class StoreLayout:
 
     @property
     def is_square(self) -> bool:
-        """Whether camera and projector have the same pixels, so that T has a first bounce."""
+        """True if camera and projector have the same pixels, so that T has a first bounce."""
         return self.camera_grid in (None, self.grid)
 
     def blocks(self, orientation: str = "rows") -> int:

@@ -32,7 +32,7 @@ PLACE = rb"\d++[ \t]++\d++[ \t]++"
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """What the first lines declare."""
+    """Sizes that the first lines declare."""
 
     rows: int
     columns: int
@@ -52,7 +52,7 @@ class Header:
 
     @property
     def is_possible(self) -> bool:
-        """Whether the sizes are those of a matrix."""
+        """True if the sizes are those of a matrix."""
         is_symmetric = self.symmetry == "symmetric" and self.rows == self.columns
         has_symmetry = self.symmetry == "general" or is_symmetric
         return has_symmetry and min(self.rows, self.columns) >= 1

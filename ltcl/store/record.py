@@ -82,12 +82,12 @@ class StoreRecord:
 
     @property
     def dense(self) -> bool:
-        """Whether the matrices are arrays."""
+        """True if the matrices are arrays."""
         return isinstance(self.matrices[0], np.ndarray)
 
     @property
     def stored(self) -> bool:
-        """Whether the matrices are rows of a store."""
+        """True if the matrices are rows of a store."""
         return isinstance(self.matrices[0], StoredRows)
 
     def in_memory(self) -> StoreRecord:
@@ -118,7 +118,7 @@ class StoreRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class FileNames:
-    """How a format calls T and its channels, and whether it holds axes in reverse order."""
+    """Names that a format gives to T and its channels, and whether it holds axes in reverse order."""
 
     matrix: str = "T"
     channels: tuple[str, ...] = CHANNELS
@@ -199,7 +199,7 @@ def _check_dense(
 
 
 def _is_matrix(shape: tuple[int, ...]) -> bool:
-    """Whether an array may be T: (M, N), or one or three of them."""
+    """True if an array may be T: (M, N), or one or three of them."""
     if 0 in shape:
         return False
     return len(shape) == 2 or (len(shape) == 3 and shape[0] in (1, 3))
@@ -246,7 +246,7 @@ class CompressedRecord:
 
     @property
     def mixing(self) -> np.ndarray | None:
-        """How the projector's colours mix, (3, 3), where that is known."""
+        """Mixing of the projector's colours, (3, 3), where that is known."""
         return self.arrays.get("mixing")
 
     @property
