@@ -129,7 +129,7 @@ def _first_bounce(rows: Block, start: int, sigmas: float) -> np.ndarray:
         variances = scipy.sparse.csr_array(pattern, shape=matrix.shape).diagonal(start)
     else:
         variances = np.zeros(len(diagonal))
-    return first_bounce.certain(diagonal, variances, sigmas)
+    return first_bounce.drop_uncertain(diagonal, variances, sigmas)
 
 
 def _write_group(folder: Path, arrays: Mapping[str, np.ndarray], **attributes: Any) -> None:

@@ -21,8 +21,8 @@ from ltcl.solvers import Inverse
 from ltcl.store import block_store, hdf5, matlab, matrix_market, npz
 from ltcl.store.guards import about, floats
 from ltcl.store.record import INVERSE_FORMAT, CompressedRecord, Matrix, StoreRecord
-from ltcl.transport.first_bounce import DARK
-from ltcl.transport.transport import Transport, from_arrays, require, to_arrays
+from ltcl.transport.first_bounce import DARK_THRESHOLD
+from ltcl.transport.transport import Transport, check_transport
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def load(
     camera_grid: tuple[int, int] | None = None,
     first_bounce: str | np.ndarray | None = None,
     on_dark: str = "mask",
-    dark: float = DARK,
+    dark_threshold: float = DARK_THRESHOLD,
     device: Any = None,
     noise: Any = None,
 ) -> Transport:
@@ -52,7 +52,7 @@ def load(
     grid, camera_grid
         (h, w) of projector and camera; needed where they are not in the file, and preferred to its
         own.
-    first_bounce, on_dark, dark, device, noise
+    first_bounce, on_dark, dark_threshold, device, noise
         As in `Transport`; None takes what is in the file, or else the diagonal, and noise is
         estimated.
 
@@ -76,12 +76,12 @@ def load(
         "camera_grid": camera_grid,
         "first_bounce": first_bounce,
         "on_dark": on_dark,
-        "dark": dark,
+        "dark_threshold": dark_threshold,
     }
     options: dict[str, Any] = {
         "first_bounce": first_bounce,
         "on_dark": on_dark,
-        "dark": dark,
+        "dark_threshold": dark_threshold,
         "device": device,
         "noise": noise,
     }
@@ -90,7 +90,7 @@ def load(
         if isinstance(record, CompressedRecord):
             if record.format == INVERSE_FORMAT:
                 raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
-            T = from_arrays(record.arrays, grid=grid or camera_grid, **options)
+            T = Transport.from_arrays(record.arrays, grid=grid or camera_grid, **options)
         else:
             T = _transport(record, grid, camera_grid, options)
     T.reload = functools.partial(load, os.path.abspath(path), **reload_options)
@@ -148,13 +148,13 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     >>> ltcl.load(path).grid
     (2, 3)
     """
-    if require(T, square=False).blocks is not None:
+    if check_transport(T, square=False).blocks is not None:
         raise InputTypeError(
             "T has 3 x 3 blocks between colours; only one matrix or three can be saved"
         )
     has_entries = any(isinstance(matrix, Matrix) for matrix in T.matrices)
     if not has_entries:
-        write(path, CompressedRecord(to_arrays(T)))
+        write(path, CompressedRecord(T.to_arrays()))
         return
     matrices = []
     for matrix in T.matrices:

@@ -15,7 +15,7 @@ from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.store.guards import floats
 from ltcl.store.stored_rows import StoredRows
-from ltcl.transport import frames
+from ltcl.transport.matrices import check_mixing
 from ltcl.transport.noise import Noise
 
 EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
@@ -73,7 +73,7 @@ class StoreRecord:
             pixels = self.shape[1]
             checks.shape("first_bounce", self.first_bounce, (pixels,), (3, pixels))
         if self.mixing is not None:
-            frames.mixing(self.mixing, len(self.matrices), None)
+            check_mixing(self.mixing, len(self.matrices), has_blocks=False)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -232,7 +232,7 @@ class CompressedRecord:
             if array.dtype.kind == "f" and not name.endswith(MAYBE_INFINITE):
                 checks.finite(f"array {name!r}", array)
         if self.mixing is not None:
-            frames.mixing(self.mixing, len(F), None)
+            check_mixing(self.mixing, len(F), has_blocks=False)
 
     @property
     def grid(self) -> tuple[int, int]:
