@@ -23,6 +23,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ltcl import checks
 from ltcl.errors import FileError, InputTypeError, LtclError
 
@@ -189,7 +191,7 @@ def sweep(folder: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    """Whether a process of this host runs, be it somebody else's."""
+    """True if a process of this host runs, be it somebody else's."""
     try:
         os.kill(process, 0)  # asks, and does nothing
     except ProcessLookupError:
@@ -247,7 +249,7 @@ def _place_to_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _is_about(error: OSError, target: Path) -> bool:
-    """Whether an error is about `target` or its folders, not about a file that the block read."""
+    """True if an error is about `target` or its folders, not about a file that the block read."""
     if not isinstance(error.filename, (str, Path)):
         return True
     place = Path(error.filename)
@@ -301,3 +303,24 @@ def read_ahead(read: Callable[[Any], Any], keys: Iterable[Any], ahead: int = 2) 
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+
+
+def check_mapped_file(array: Any) -> Any:
+    """Return `array`; FileError if it is mapped to a file that has become shorter.
+
+    Reading pages beyond the end of a file ends the process.
+    """
+    root = underlying_array(array)
+    path = getattr(root, "filename", None)
+    if path is None or not os.path.exists(path):
+        return array
+    if os.path.getsize(path) < root.offset + root.nbytes:
+        raise FileError(f"{path}: has become shorter; it must stay as it is while T is used")
+    return array
+
+
+def underlying_array(array: Any) -> Any:
+    """The array that owns the memory of `array`, which is a view of it or that array itself."""
+    while isinstance(getattr(array, "base", None), np.ndarray):
+        array = array.base
+    return array
