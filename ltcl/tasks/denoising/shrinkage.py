@@ -79,8 +79,8 @@ def threshold_coefficients(
     for count, basis in enumerate(bases, 1):
         C, variance = problem.coefficients(problem.Z, basis)
         threshold = SIGNIFICANCE**2 * variance
-        is_significant = C * C > threshold
-        C *= is_significant
+        power = C * C
+        C *= power > threshold
         total += basis.backward(C)
         note(count / len(bases))
     return total / len(bases)
