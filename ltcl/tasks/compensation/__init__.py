@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
-from ltcl.tasks.compensation.compensate import RTOL, Compensation, compensate
+from ltcl.tasks.compensation.compensate import RTOL, compensate
+from ltcl.tasks.compensation.result import Compensation
 
 __all__ = ["RTOL", "Compensation", "compensate"]
