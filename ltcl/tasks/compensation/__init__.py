@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from ltcl.tasks.compensation.compensate import RTOL, compensate
+from ltcl.tasks.compensation.compensate import compensate
+from ltcl.tasks.compensation.inputs import RTOL
 from ltcl.tasks.compensation.result import Compensation
 
 __all__ = ["RTOL", "Compensation", "compensate"]

@@ -12,45 +12,34 @@ from there on. Where T has no S, it is solved from no light on.
 from __future__ import annotations
 
 import dataclasses
+import logging
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ltcl import checks
 from ltcl.device import Array
-from ltcl.errors import ConvergenceError, InputError
-from ltcl.operators import Operator
+from ltcl.errors import ConvergenceError
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.tasks.compensation.gain import exact_gain, gain_within_loss
-from ltcl.tasks.compensation.inputs import (
-    check_background,
-    check_gain,
-    check_range,
-    check_rules,
-    check_weights,
-    warn_of_units,
-)
+from ltcl.tasks.compensation.inputs import Request, check_inputs
 from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
-    Limits,
-    channel_systems,
     join_channels,
+    scale,
+    subtract,
 )
 from ltcl.tasks.compensation.result import Compensation, Evidence
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import (
-    Transport,
-    default_rtol,
-    require,
-    require_inverse,
-    resolve_reference,
-)
+from ltcl.transport.transport import Transport
 
-RTOL = 1e-2
+logger = logging.getLogger(__name__)
+
 # From this rtol on, the rounding of a pattern does not count beside the residual of the solve.
 MIN_RESIDUAL_RTOL = 1e-5
+# Times the brightest pixel that was reached: beyond, desired is hardly in the units of T.
+UNITS_RATIO = 4.0
 # Times the root mean square of an error: few values of a solve's error are larger.
 EXPLAINED_DEVIATIONS = 3.0
 
@@ -142,7 +131,7 @@ def compensate(
     >>> round(c.gain, 2), c.pattern.round(2).tolist()
     (0.6, [[1.0, 1.0]])
     """
-    request = _check_inputs(
+    request = check_inputs(
         T,
         desired,
         bounds=bounds,
@@ -158,63 +147,12 @@ def compensate(
         options=options,
     )
     start = _undo_light(request)
-    check_range(request.problem, start.gain)
+    request.problem.check_range(start.gain)
     bounded = _bring_within_bounds(request, start)
     compensation = _judge(request, start, bounded)
-    evidence = compensation._evidence
-    is_float = np.asarray(desired).dtype.kind == "f"
-    if evidence.explained is not None and request.gain is not None and is_float:
-        warn_of_units(evidence.target, evidence.appearance)
+    if request.gain is not None and compensation.clipped > 0.0:
+        _warn_of_units(desired, compensation._evidence)
     return compensation
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LightSolver:
-    """The solves that undo light: S^-1 of pictures, one per channel."""
-
-    T: Transport
-    exact: tuple[Operator | None, ...]
-    inverse: Inverse | None
-    method: str
-    rtol: float
-    options: dict[str, Any]
-
-    def solve(self, targets: Columns) -> tuple[Solution, ...]:
-        """S^-1 of the targets of all systems: one solution per channel."""
-        if len(targets) != self.T.channels:
-            targets = np.split(targets[0], 3)
-        if self.inverse is not None:
-            solutions = [self.inverse.solve(b, channel) for channel, b in enumerate(targets)]
-            return tuple(solutions)
-        return solve_each(
-            self.T.systems,
-            targets,
-            self.method,
-            exact=self.exact,
-            rtol=self.rtol,
-            with_residual=self.rtol >= MIN_RESIDUAL_RTOL,
-            **self.options,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Request:
-    """The checked inputs of `compensate`.
-
-    `gain` is None for "auto"; `is_gain_exact` tells whether "auto" may take the largest gain
-    without an error. `reference` is the transport that judges.
-    """
-
-    T: Transport
-    reference: Transport
-    problem: CompensationProblem
-    shape: layout.Layout
-    solver: LightSolver
-    gain: float | None
-    loss: float | None
-    is_gain_exact: bool
-    clamp: bool
-    throw: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -243,75 +181,10 @@ class BoundedLight:
     solves: tuple[Bounded, ...]
     frame_clipped: np.ndarray
 
-
-def _check_inputs(
-    T: Transport,
-    desired: Any,
-    *,
-    bounds: tuple[float, float],
-    background: Any,
-    gain: float | str,
-    loss: float | None,
-    weights: Any,
-    method: str,
-    rtol: float | None,
-    exact: Transport | None,
-    inverse: Inverse | None,
-    clamp: bool,
-    options: dict[str, Any],
-) -> Request:
-    """Step 1: refuse bad inputs before anything is uploaded, and set up the problem."""
-    require(T, square=False)
-    bounds = checks.interval("bounds", bounds)
-    checked_gain = check_gain(gain, loss)
-    system_count = 1 if T.couples else T.channels
-    masked = join_channels([T.masked] * T.channels, system_count)[0]
-    limits = Limits.in_float32(bounds, masked)
-    columns, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
-    dark = check_background(background, T, shape, columns)
-    channel_weights, weight_unit = check_weights(weights, T, shape, columns)
-    if inverse is not None:
-        other_method = None if method == "auto" else method
-        require_inverse(T, inverse, rtol, exact=exact, method=other_method)
-    if rtol is None:
-        rtol = default_rtol(RTOL, T, exact, inverse)
-    rules = check_rules(T, method, rtol, options, weight_unit)
-    if checks.flag("clamp", clamp) and not T.is_square:
-        raise InputError(
-            "clamp is True, but this T has no S; its light is found within the bounds only"
-        )
-    reference, judging_systems = resolve_reference(T, exact)
-    if channel_weights is not None:
-        channel_weights = join_channels(channel_weights, system_count)
-    problem = CompensationProblem(
-        systems=channel_systems(reference),
-        desired=join_channels(columns, system_count),
-        background=join_channels(dark, system_count),
-        weights=channel_weights,
-        weight_unit=weight_unit,
-        limits=limits,
-        rules=rules,
-    )
-    solver = LightSolver(
-        T=T,
-        exact=tuple(judging_systems),
-        inverse=inverse,
-        method=method,
-        rtol=rtol,
-        options=options,
-    )
-    return Request(
-        T=T,
-        reference=reference,
-        problem=problem,
-        shape=shape,
-        solver=solver,
-        gain=checked_gain,
-        loss=loss,
-        is_gain_exact=weights is None and loss is None,
-        clamp=clamp,
-        throw=options.get("throw", True),
-    )
+    @property
+    def clipped(self) -> float:
+        """The share of all frames together."""
+        return float(np.mean(self.frame_clipped))
 
 
 def _undo_light(request: Request) -> StartingLight:
@@ -323,7 +196,7 @@ def _undo_light(request: Request) -> StartingLight:
         columns = problem.desired[0].shape[1]
         light = [np.zeros((len(scale), columns)) for _, scale in problem.systems]
         return StartingLight(gain=request.gain, light=light)
-    solutions = request.solver.solve(problem.missing_light(request.gain))
+    solutions = _solve_channels(request, problem.missing_light(request.gain))
     # S^-1 meets every pixel but masked ones, which count only where weights say so.
     return StartingLight(
         gain=request.gain,
@@ -341,17 +214,17 @@ def _undo_light_at_largest_gain(request: Request) -> StartingLight:
     # Light is affine in the gain: desired and background are solved side by side, once.
     columns = problem.desired[0].shape[1]
     sides = [np.hstack(pair) for pair in zip(problem.desired, problem.background, strict=True)]
-    solutions = request.solver.solve(sides)
+    solutions = _solve_channels(request, sides)
     slopes = _projector_light(request, [s.x[:, :columns] for s in solutions])
     shifts = _projector_light(request, [s.x[:, columns:] for s in solutions])
     gain = None
-    if request.is_gain_exact:
+    if request.is_exact_gain_allowed:
         gain = exact_gain(slopes, shifts, problem.limits)
     meets_target = gain is not None
     if gain is None:
         gain, light = gain_within_loss(problem, request.loss)
     else:
-        light = [gain * slope - shift for slope, shift in zip(slopes, shifts, strict=True)]
+        light = subtract(scale(gain, slopes), shifts)
     return StartingLight(
         gain=gain,
         light=light,
@@ -360,11 +233,31 @@ def _undo_light_at_largest_gain(request: Request) -> StartingLight:
     )
 
 
+def _solve_channels(request: Request, targets: Columns) -> tuple[Solution, ...]:
+    """S^-1 of the targets of all systems: one solution per channel."""
+    T = request.T
+    if len(targets) != T.channels:
+        targets = np.split(targets[0], 3)
+    if request.inverse is not None:
+        solutions = []
+        for channel, target in enumerate(targets):
+            solutions.append(request.inverse.solve(target, channel))
+        return tuple(solutions)
+    rtol = request.problem.rules.rtol
+    return solve_each(
+        T.systems,
+        targets,
+        request.method,
+        exact=request.exact,
+        rtol=rtol,
+        with_residual=rtol >= MIN_RESIDUAL_RTOL,
+        **request.options,
+    )
+
+
 def _projector_light(request: Request, direct: Columns) -> Columns:
     """The projector light of each system from the direct light of each channel."""
-    T = request.T
-    F = np.atleast_2d(T.first_bounce)
-    light = layout.to_light(direct, F, T.mixing)
+    light = layout.to_light(direct, request.first_bounce, request.T.mixing)
     return join_channels(light, len(request.problem.systems))
 
 
@@ -406,12 +299,42 @@ def _bring_within_bounds(request: Request, start: StartingLight) -> BoundedLight
 
 
 def _judge(request: Request, start: StartingLight, bounded: BoundedLight) -> Compensation:
-    """Step 4: what the scene will look like under the light, and how far that is from the target."""
+    """Step 4: how far the scene under this light is from the target, with the evidence."""
+    problem = request.problem
+    pattern, evidence, target_norms = _gather_evidence(request, start, bounded)
+    frames = len(bounded.frame_clipped)
+    frame_sizes = _norms_of_frames(target_norms, frames)
+    frame_errors = _norms_of_frames(problem.norms(evidence.missing), frames)
+    size = float(np.linalg.norm(frame_sizes))
+    if size == 0.0:
+        size = 1.0
+    error = float(np.linalg.norm(frame_errors))
+    solutions = start.solutions
+    if not solutions:
+        solutions = bounded.solves
+    return Compensation(
+        pattern=pattern,
+        gain=start.gain,
+        clipped=bounded.clipped,
+        error=error / size,
+        gap=max(error - _least_error(problem, bounded), 0.0) / size,
+        frame_errors=frame_errors / np.where(frame_sizes > 0, frame_sizes, 1.0),
+        frame_clipped=bounded.frame_clipped,
+        solution=solutions[0] if len(solutions) == 1 else solutions,
+        limited=bounded.solves,
+        transport_error=request.transport_error,
+        rtol=problem.rules.rtol,
+        _evidence=evidence,
+    )
+
+
+def _gather_evidence(
+    request: Request, start: StartingLight, bounded: BoundedLight
+) -> tuple[np.ndarray, Evidence, list[np.ndarray]]:
+    """The pattern, the evidence, and the norms of the target, (k,) of each system."""
     problem = request.problem
     reference = request.reference
     target = problem.target(start.gain)
-    frames = len(bounded.frame_clipped)
-    clipped = float(np.mean(bounded.frame_clipped))
     residuals = _residuals_of_solves(request, start, bounded)
     queued: list[Array] = []
     if residuals is None:
@@ -420,56 +343,44 @@ def _judge(request: Request, start: StartingLight, bounded: BoundedLight) -> Com
     # While the device works:
     pattern = request.shape.pack(bounded.light, reference.grid)
     target_norms = problem.norms(target)
+    appearance = None
     if residuals is None:
         appearance = _read_appearance(problem, queued)
-        missing = [d - c for d, c in zip(target, appearance, strict=True)]
+        missing = subtract(target, appearance)
     else:
-        appearance = None
         missing = join_channels(residuals, len(problem.systems))
-
-    frame_sizes = _norms_of_frames(target_norms, frames)
-    frame_errors = _norms_of_frames(problem.norms(missing), frames)
-    size = float(np.linalg.norm(frame_sizes)) or 1.0
-    error = float(np.linalg.norm(frame_errors))
-    least_of_solves = []
-    for solution in bounded.solves:
-        least_of_solves.append(np.linalg.norm(solution.least / problem.weight_unit))
-    least_error = float(np.linalg.norm(least_of_solves))
-    solutions = start.solutions or bounded.solves
-    return Compensation(
-        pattern=pattern,
-        gain=start.gain,
-        clipped=clipped,
-        error=error / size,
-        gap=max(error - least_error, 0.0) / size,
-        frame_errors=frame_errors / np.where(frame_sizes > 0, frame_sizes, 1.0),
-        frame_clipped=bounded.frame_clipped,
-        solution=solutions[0] if len(solutions) == 1 else solutions,
-        limited=bounded.solves,
-        transport_error=reference.error,
-        rtol=problem.rules.rtol,
-        _evidence=Evidence(
-            shape=request.shape,
-            camera_grid=reference.camera_grid,
-            target=target,
-            missing=missing,
-            appearance=appearance,
-            weights=problem.weights,
-            explained=_explained_values(problem, target_norms) if clipped else None,
-            solving=request.T,
-            reference=reference,
-            inverse=request.solver.inverse,
-            bounds=(problem.limits.low, problem.limits.high),
-        ),
+    explained = None
+    if bounded.clipped:
+        explained = _explained_values(problem, target_norms)
+    evidence = Evidence(
+        shape=request.shape,
+        camera_grid=reference.camera_grid,
+        target=target,
+        missing=missing,
+        appearance=appearance,
+        weights=problem.weights,
+        explained=explained,
+        solving=request.T,
+        reference=reference,
+        inverse=request.inverse,
+        bounds=(problem.limits.low, problem.limits.high),
     )
+    return pattern, evidence, target_norms
+
+
+def _least_error(problem: CompensationProblem, bounded: BoundedLight) -> float:
+    """No light within the bounds has a smaller error, as far as the solves have proved it."""
+    least = []
+    for solution in bounded.solves:
+        least.append(np.linalg.norm(solution.least / problem.weight_unit))
+    return float(np.linalg.norm(least))
 
 
 def _residuals_of_solves(
     request: Request, start: StartingLight, bounded: BoundedLight
 ) -> Columns | None:
     """The residuals of the solves without bounds, if they are the missing light of this pattern."""
-    has_changed = bounded.solves or bounded.frame_clipped.any()
-    if has_changed or request.problem.limits.masked.any():
+    if bounded.solves or bounded.clipped or request.problem.limits.masked.any():
         return None
     residuals = [s.rest for s in start.solutions if s.rest is not None]
     if len(residuals) < request.T.channels:
@@ -499,3 +410,18 @@ def _explained_values(problem: CompensationProblem, target_norms: list[np.ndarra
         tolerance = np.maximum(problem.rules.rtol * norms, problem.rules.atol)
         explained.append(EXPLAINED_DEVIATIONS * tolerance / np.sqrt(pixels))
     return explained
+
+
+def _warn_of_units(desired: Any, evidence: Evidence) -> None:
+    """Log a warning if the target is far brighter than the appearance; integers are warned of."""
+    if evidence.appearance is None or np.asarray(desired).dtype.kind != "f":
+        return
+    highest = max(float(c.max()) for c in evidence.target)
+    reached = max(float(c.max()) for c in evidence.appearance)
+    if highest > UNITS_RATIO * reached:
+        logger.warning(
+            "desired reaches %.3g, the scene %.3g at most; %s",
+            highest,
+            reached,
+            layout.UNITS % 255,
+        )

@@ -17,7 +17,15 @@ import scipy.optimize
 
 from ltcl.errors import InputError
 from ltcl.solvers import Status
-from ltcl.tasks.compensation.problem import Columns, CompensationProblem, Limits, StoppingRules
+from ltcl.tasks.compensation.problem import (
+    Columns,
+    CompensationProblem,
+    Limits,
+    StoppingRules,
+    inner_product,
+    scale,
+    subtract,
+)
 
 # Steps of a solve on the device.
 MAX_SOLVE_STEPS = 200
@@ -86,10 +94,11 @@ class GainTrials:
                 "gain is 'auto', but desired is 0 everywhere that weights count: "
                 "no gain is too large"
             )
-        self.is_on_host = all(np.prod(A.shape) <= MAX_HOST_ENTRIES for A, _ in problem.systems)
-        self.matrices: list[Any] = [A for A, _ in problem.systems]
-        if self.is_on_host:
-            self.matrices = [A.to_dense() for A in self.matrices]
+        largest_size = max(np.prod(A.shape) for A, _ in problem.systems)
+        self.is_on_host = largest_size <= MAX_HOST_ENTRIES
+        self.matrices: list[Any] = []
+        for A, _ in problem.systems:
+            self.matrices.append(A.to_dense() if self.is_on_host else A)
 
     def upper_bound(self, loss: float) -> tuple[float, Columns]:
         """A gain that no gain within `loss` exceeds, and the light that is most like desired.
@@ -178,7 +187,7 @@ class GainTrials:
         problem = self.problem
         Wd = problem.weighted(problem.desired)
         missing = self._weighted_missing(gain, [system.light for system in solved])
-        error = float(np.sqrt(_inner(missing, missing)))
+        error = float(np.sqrt(inner_product(missing, missing)))
         divisor = error if error > 0.0 else 1.0
         # Each column has a bound and a slope of its own, which add up with weights error / norm.
         above_least = 0.0
@@ -186,20 +195,20 @@ class GainTrials:
             above_least += float(np.sum(system.errors * (system.errors - system.least)))
 
         # W c in parts along W d and across it.
-        Wc = [gain * d - r for d, r in zip(Wd, missing, strict=True)]
-        norm = float(np.sqrt(_inner(Wc, Wc)))
-        along = _inner(Wc, Wd) / self.desired_norm**2
-        across = [c - along * d for c, d in zip(Wc, Wd, strict=True)]
+        Wc = subtract(scale(gain, Wd), missing)
+        norm = float(np.sqrt(inner_product(Wc, Wc)))
+        along = inner_product(Wc, Wd) / self.desired_norm**2
+        across = subtract(Wc, scale(along, Wd))
         norm_divisor = norm if norm > 0.0 else 1.0
         sine = 1.0
         if along > 0.0:
-            sine = float(np.sqrt(_inner(across, across))) / norm_divisor
+            sine = float(np.sqrt(inner_product(across, across))) / norm_divisor
         return GainTrial(
             gain=gain,
             light=[system.light for system in solved],
             error=error / (gain * self.desired_norm),
             least=(error - above_least / divisor) / (gain * self.desired_norm),
-            slope=_inner(missing, Wd) / (divisor * self.desired_norm),
+            slope=inner_product(missing, Wd) / (divisor * self.desired_norm),
             cosine=along * self.desired_norm / norm_divisor,
             sine=sine,
             size=norm / self.desired_norm,
@@ -233,9 +242,3 @@ def _bounded_least_squares(
     gradient = T.T @ residual
     gap = np.maximum(gradient * (x - limits.low), gradient * (x - limits.high))
     return x, max(error - float(np.sum(gap)) / error, 0.0)
-
-
-def _inner(a: Columns, b: Columns) -> float:
-    """The inner product of two lists of arrays."""
-    products = [np.sum(x * y, dtype=np.float64) for x, y in zip(a, b, strict=True)]
-    return float(sum(products))

@@ -4,20 +4,36 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import Operator
+from ltcl.solvers import Inverse
 from ltcl.solvers.solve import METHODS, OPTIONS
-from ltcl.tasks.compensation.problem import Columns, CompensationProblem, StoppingRules
+from ltcl.tasks.compensation.problem import (
+    Columns,
+    CompensationProblem,
+    Limits,
+    StoppingRules,
+    channel_systems,
+    join_channels,
+)
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import Transport
+from ltcl.transport.transport import (
+    Transport,
+    default_rtol,
+    require,
+    require_inverse,
+    resolve_reference,
+)
 
-logger = logging.getLogger(__name__)
-
+# Tolerance of the solves if none is given.
+RTOL = 1e-2
 # Arguments of `compensate` itself.
 ARGUMENTS = (
     "bounds",
@@ -35,11 +51,120 @@ ARGUMENTS = (
 SOLVE_OPTIONS = ("atol", "maxiter", "callback", "throw")
 # The least relative error that float32 resolves.
 MIN_LOSS = 1e-6
-# Brightest pixels: from 1e-38 on float32 has all digits, and some devices have any.
-MIN_BRIGHTNESS = 1e-30
-MAX_BRIGHTNESS = 1e38
-# Times the brightest pixel that was reached: beyond, desired is hardly in the units of T.
-UNITS_RATIO = 4.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Request:
+    """The checked inputs of `compensate`.
+
+    Attributes
+    ----------
+    T, reference : Transport
+        The transport that solves, and the one that judges.
+    problem : CompensationProblem
+    shape : Layout
+        Frames and colours of `desired`.
+    gain, loss : float, optional
+        No gain means "auto".
+    is_exact_gain_allowed : bool
+        True if gain="auto" takes the largest gain without an error, if there is one.
+    first_bounce : (channels, N) float64
+        Empty if T has no S.
+    transport_error : float
+        ``.error`` of the reference.
+    inverse : Inverse, optional
+    method, options : str, dict
+        Arguments of `ltcl.solve`.
+    exact : sequence of Operator or None
+        The systems that judge the solves of each channel.
+    clamp, throw : bool
+    """
+
+    T: Transport
+    reference: Transport
+    problem: CompensationProblem
+    shape: layout.Layout
+    gain: float | None
+    loss: float | None
+    is_exact_gain_allowed: bool
+    first_bounce: np.ndarray
+    transport_error: float
+    inverse: Inverse | None
+    method: str
+    options: dict[str, Any]
+    exact: Sequence[Operator | None]
+    clamp: bool
+    throw: bool
+
+
+def check_inputs(
+    T: Transport,
+    desired: Any,
+    *,
+    bounds: tuple[float, float],
+    background: Any,
+    gain: float | str,
+    loss: float | None,
+    weights: Any,
+    method: str,
+    rtol: float | None,
+    exact: Transport | None,
+    inverse: Inverse | None,
+    clamp: bool,
+    options: dict[str, Any],
+) -> Request:
+    """Refuse bad inputs before anything is uploaded, and set up the problem."""
+    require(T, square=False)
+    bounds = checks.interval("bounds", bounds)
+    checked_gain = check_gain(gain, loss)
+    system_count = 1 if T.couples else T.channels
+    masked = join_channels([T.masked] * T.channels, system_count)[0]
+    limits = Limits.in_float32(bounds, masked)
+    columns, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
+    dark = check_background(background, T, shape, columns)
+    channel_weights, weight_unit = check_weights(weights, T, shape, columns)
+    if inverse is not None:
+        other_method = None if method == "auto" else method
+        require_inverse(T, inverse, rtol, exact=exact, method=other_method)
+    if rtol is None:
+        rtol = default_rtol(RTOL, T, exact, inverse)
+    rules = check_rules(T, method, rtol, options, weight_unit)
+    if checks.flag("clamp", clamp) and not T.is_square:
+        raise InputError(
+            "clamp is True, but this T has no S; its light is found within the bounds only"
+        )
+    reference, judging_systems = resolve_reference(T, exact)
+    if channel_weights is not None:
+        channel_weights = join_channels(channel_weights, system_count)
+    problem = CompensationProblem(
+        systems=channel_systems(reference),
+        desired=join_channels(columns, system_count),
+        background=join_channels(dark, system_count),
+        weights=channel_weights,
+        weight_unit=weight_unit,
+        limits=limits,
+        rules=rules,
+    )
+    first_bounce = np.zeros((T.channels, 0))
+    if T.is_square:
+        first_bounce = np.atleast_2d(T.first_bounce)
+    return Request(
+        T=T,
+        reference=reference,
+        problem=problem,
+        shape=shape,
+        gain=checked_gain,
+        loss=loss,
+        is_exact_gain_allowed=weights is None and loss is None,
+        first_bounce=first_bounce,
+        transport_error=reference.error,
+        inverse=inverse,
+        method=method,
+        options=options,
+        exact=judging_systems,
+        clamp=clamp,
+        throw=options.get("throw", True),
+    )
 
 
 def check_gain(gain: Any, loss: Any) -> float | None:
@@ -124,7 +249,7 @@ def check_rules(
 
 
 def _check_option_names(T: Transport, method: str, options: dict[str, Any]) -> None:
-    known = list(SOLVE_OPTIONS)
+    known: list[str] = [*SOLVE_OPTIONS]
     if T.is_square:
         known.append("x0")
     known.extend(OPTIONS.get(method, ()))
@@ -138,38 +263,6 @@ def _check_option_names(T: Transport, method: str, options: dict[str, Any]) -> N
             problem = f"{name} is an option of method={' and '.join(owners)}"
         allowed = ", ".join([*ARGUMENTS, *known])
         raise InputTypeError(f"{problem}; compensate with method {method!r} has {allowed}")
-
-
-def check_range(problem: CompensationProblem, gain: float) -> None:
-    """Refuse pictures that float32 does not resolve, or does not hold."""
-    brightest_light = max(abs(problem.limits.low), abs(problem.limits.high))
-    largest_scale = max(float(scale.max()) for _, scale in problem.systems)
-    brightest_desired = max(max(float(d.max()), -float(d.min())) for d in problem.desired)
-    light = f"light of {brightest_light:.3g}, as bounds allow it, makes"
-    pictures = {
-        "T reaches": largest_scale,
-        "desired reaches": gain * brightest_desired,
-        light: brightest_light * largest_scale,
-    }
-    for subject, brightest in pictures.items():
-        if 0.0 < brightest < MIN_BRIGHTNESS or brightest > MAX_BRIGHTNESS:
-            raise InputError(
-                f"{subject} {brightest:.3g}; it must be from {MIN_BRIGHTNESS:g} to "
-                f"{MAX_BRIGHTNESS:g}: scale T, desired or bounds"
-            )
-
-
-def warn_of_units(target: Columns, appearance: Columns) -> None:
-    """Log a warning if the brightest pixel of the target is far beyond that of the appearance."""
-    highest = max(float(c.max()) for c in target)
-    reached = max(float(c.max()) for c in appearance)
-    if highest > UNITS_RATIO * reached:
-        logger.warning(
-            "desired reaches %.3g, the scene %.3g at most; %s",
-            highest,
-            reached,
-            layout.UNITS % 255,
-        )
 
 
 def _check_frames(

@@ -29,6 +29,9 @@ Columns = list[np.ndarray]
 
 # Of the width of the bounds: light beyond a bound by rounding counts as inside.
 BOUNDS_SLACK = 1e-6
+# Brightest pixels: from 1e-38 on float32 has all digits, and some devices have any.
+MIN_BRIGHTNESS = 1e-30
+MAX_BRIGHTNESS = 1e38
 # Products that estimate the norms of columns that cannot be read, to a factor of 2.
 NORM_PROBES = 16
 
@@ -132,21 +135,40 @@ class CompensationProblem:
         """Weighted norms of the columns, (k,) float64 of each system."""
         norms = []
         for c in self.weighted(pictures):
-            norms.append(np.sqrt(np.einsum("mk,mk->k", c, c, dtype=np.float64)))
+            squares = np.einsum("mk,mk->k", c, c, dtype=np.float64)
+            norms.append(np.sqrt(squares))
         return norms
 
     def target(self, gain: float) -> Columns:
         """gain * desired."""
         if gain == 1.0:
             return self.desired
-        return [gain * d for d in self.desired]
+        return scale(gain, self.desired)
 
     def missing_light(self, gain: float) -> Columns:
         """gain * desired - background: the light that the projector has to add."""
         target = self.target(gain)
         if not self.has_background:
             return target
-        return [d - dark for d, dark in zip(target, self.background, strict=True)]
+        return subtract(target, self.background)
+
+    def check_range(self, gain: float) -> None:
+        """Refuse pictures that float32 does not resolve, or does not hold."""
+        brightest_light = max(abs(self.limits.low), abs(self.limits.high))
+        largest_scale = max(float(scale.max()) for _, scale in self.systems)
+        brightest_desired = max(max(float(d.max()), -float(d.min())) for d in self.desired)
+        light = f"light of {brightest_light:.3g}, as bounds allow it, makes"
+        pictures = {
+            "T reaches": largest_scale,
+            "desired reaches": gain * brightest_desired,
+            light: brightest_light * largest_scale,
+        }
+        for subject, brightest in pictures.items():
+            if 0.0 < brightest < MIN_BRIGHTNESS or brightest > MAX_BRIGHTNESS:
+                raise InputError(
+                    f"{subject} {brightest:.3g}; it must be from {MIN_BRIGHTNESS:g} to "
+                    f"{MAX_BRIGHTNESS:g}: scale T, desired or bounds"
+                )
 
     def nearest(
         self, index: int, gain: float, start: np.ndarray, rules: StoppingRules
@@ -186,6 +208,24 @@ class CompensationProblem:
         light = np.where(x <= lower, limits.low, light)
         light = np.where(x >= upper, np.where(is_free, limits.high, 0.0), light)
         return limits.clip(light), solution
+
+
+def scale(factor: float, columns: Columns) -> Columns:
+    """`factor` times each array."""
+    return [factor * c for c in columns]
+
+
+def subtract(a: Columns, b: Columns) -> Columns:
+    """a - b, array by array."""
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def inner_product(a: Columns, b: Columns) -> float:
+    """The sum of all products, in float64."""
+    total = 0.0
+    for x, y in zip(a, b, strict=True):
+        total += float(np.sum(x * y, dtype=np.float64))
+    return total
 
 
 def join_channels(channels: Columns, systems: int) -> Columns:

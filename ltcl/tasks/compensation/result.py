@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ltcl.solvers import Bounded, Inverse, Solution
-from ltcl.tasks.compensation.problem import Columns, channel_systems
+from ltcl.tasks.compensation.problem import Columns, channel_systems, subtract
 from ltcl.transport import frames as layout
 from ltcl.transport.transport import Transport, error_note
 from ltcl.transport.uncertainty import CompensationStd, of_compensation
@@ -52,7 +52,7 @@ class Evidence:
         """T pattern + background, on the camera's grid."""
         appearance = self.appearance
         if appearance is None:
-            appearance = [d - r for d, r in zip(self.target, self.missing, strict=True)]
+            appearance = subtract(self.target, self.missing)
         return self._picture(appearance)
 
     def target_picture(self) -> np.ndarray:
