@@ -27,7 +27,7 @@ from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
     join_channels,
-    scale,
+    multiply,
     subtract,
 )
 from ltcl.tasks.compensation.result import Compensation, Evidence
@@ -224,7 +224,7 @@ def _undo_light_at_largest_gain(request: Request) -> StartingLight:
     if gain is None:
         gain, light = gain_within_loss(problem, request.loss)
     else:
-        light = subtract(scale(gain, slopes), shifts)
+        light = subtract(multiply(gain, slopes), shifts)
     return StartingLight(
         gain=gain,
         light=light,

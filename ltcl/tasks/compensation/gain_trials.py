@@ -23,7 +23,7 @@ from ltcl.tasks.compensation.problem import (
     Limits,
     StoppingRules,
     inner_product,
-    scale,
+    multiply,
     subtract,
 )
 
@@ -195,10 +195,10 @@ class GainTrials:
             above_least += float(np.sum(system.errors * (system.errors - system.least)))
 
         # W c in parts along W d and across it.
-        Wc = subtract(scale(gain, Wd), missing)
+        Wc = subtract(multiply(gain, Wd), missing)
         norm = float(np.sqrt(inner_product(Wc, Wc)))
         along = inner_product(Wc, Wd) / self.desired_norm**2
-        across = subtract(Wc, scale(along, Wd))
+        across = subtract(Wc, multiply(along, Wd))
         norm_divisor = norm if norm > 0.0 else 1.0
         sine = 1.0
         if along > 0.0:

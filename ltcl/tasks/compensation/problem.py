@@ -143,7 +143,7 @@ class CompensationProblem:
         """gain * desired."""
         if gain == 1.0:
             return self.desired
-        return scale(gain, self.desired)
+        return multiply(gain, self.desired)
 
     def missing_light(self, gain: float) -> Columns:
         """gain * desired - background: the light that the projector has to add."""
@@ -210,7 +210,7 @@ class CompensationProblem:
         return limits.clip(light), solution
 
 
-def scale(factor: float, columns: Columns) -> Columns:
+def multiply(factor: float, columns: Columns) -> Columns:
     """`factor` times each array."""
     return [factor * c for c in columns]
 
