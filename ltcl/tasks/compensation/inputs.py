@@ -23,14 +23,9 @@ from ltcl.tasks.compensation.problem import (
     channel_systems,
     join_channels,
 )
+from ltcl.tasks.requirements import check_inverse, default_rtol, resolve_reference
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import (
-    Transport,
-    default_rtol,
-    require,
-    require_inverse,
-    resolve_reference,
-)
+from ltcl.transport.transport import Transport, check_transport
 
 # Tolerance of the solves if none is given.
 RTOL = 1e-2
@@ -62,7 +57,7 @@ class Request:
     T, reference : Transport
         The transport that solves, and the one that judges.
     problem : CompensationProblem
-    shape : Layout
+    shape : PictureLayout
         Frames and colours of `desired`.
     gain, loss : float, optional
         No gain means "auto".
@@ -83,7 +78,7 @@ class Request:
     T: Transport
     reference: Transport
     problem: CompensationProblem
-    shape: layout.Layout
+    shape: layout.PictureLayout
     gain: float | None
     loss: float | None
     is_exact_gain_allowed: bool
@@ -114,7 +109,7 @@ def check_inputs(
     options: dict[str, Any],
 ) -> Request:
     """Refuse bad inputs before anything is uploaded, and set up the problem."""
-    require(T, square=False)
+    check_transport(T, square=False)
     bounds = checks.interval("bounds", bounds)
     checked_gain = check_gain(gain, loss)
     system_count = 1 if T.couples else T.channels
@@ -125,7 +120,7 @@ def check_inputs(
     channel_weights, weight_unit = check_weights(weights, T, shape, columns)
     if inverse is not None:
         other_method = None if method == "auto" else method
-        require_inverse(T, inverse, rtol, exact=exact, method=other_method)
+        check_inverse(T, inverse, rtol, exact=exact, method=other_method)
     if rtol is None:
         rtol = default_rtol(RTOL, T, exact, inverse)
     rules = check_rules(T, method, rtol, options, weight_unit)
@@ -184,7 +179,7 @@ def check_gain(gain: Any, loss: Any) -> float | None:
 
 
 def check_background(
-    background: Any, T: Transport, shape: layout.Layout, desired: Columns
+    background: Any, T: Transport, shape: layout.PictureLayout, desired: Columns
 ) -> Columns:
     """The background of every channel, like `desired`: none, one number, one or all frames."""
     if background is None:
@@ -197,7 +192,7 @@ def check_background(
 
 
 def check_weights(
-    weights: Any, T: Transport, shape: layout.Layout, desired: Columns
+    weights: Any, T: Transport, shape: layout.PictureLayout, desired: Columns
 ) -> tuple[Columns | None, float]:
     """The weights of every channel, None if all are alike, and their unit.
 
@@ -266,7 +261,7 @@ def _check_option_names(T: Transport, method: str, options: dict[str, Any]) -> N
 
 
 def _check_frames(
-    name: str, value: Any, T: Transport, shape: layout.Layout, desired: Columns
+    name: str, value: Any, T: Transport, shape: layout.PictureLayout, desired: Columns
 ) -> Columns:
     """Columns of a picture with as many frames and colours as `desired`, or one of these."""
     columns, value_shape = layout.unpack(name, value, T.camera_grid, T.channels)
@@ -286,7 +281,7 @@ def _check_frames(
     return repeated
 
 
-def _frames_and_colours(shape: layout.Layout, channels: int) -> tuple[int, int]:
+def _frames_and_colours(shape: layout.PictureLayout, channels: int) -> tuple[int, int]:
     """Frames, and colours that stand side by side in the columns of one channel."""
     frames = 1 if shape.frames is None else shape.frames
     colours = 3 if shape.colour and channels == 1 else 1

@@ -10,9 +10,10 @@ import numpy as np
 
 from ltcl.solvers import Bounded, Inverse, Solution
 from ltcl.tasks.compensation.problem import Columns, channel_systems, subtract
+from ltcl.tasks.requirements import error_note
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import Transport, error_note
-from ltcl.transport.uncertainty import CompensationStd, of_compensation
+from ltcl.transport.transport import Transport
+from ltcl.transport.uncertainty import CompensationStd, compensation_std
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,7 +22,7 @@ class Evidence:
 
     Attributes
     ----------
-    shape, camera_grid : Layout, (h, w)
+    shape, camera_grid : PictureLayout, (h, w)
         Frames and colours of the pictures, and their size.
     target, missing : list of (M, k)
         gain * desired, and target - appearance, one array per system.
@@ -36,7 +37,7 @@ class Evidence:
     bounds : (low, high)
     """
 
-    shape: layout.Layout
+    shape: layout.PictureLayout
     camera_grid: tuple[int, int]
     target: Columns
     missing: Columns
@@ -159,7 +160,7 @@ class Compensation:
         bounds = (-np.inf, np.inf)
         if self.clipped:
             bounds = evidence.bounds
-        return of_compensation(
+        return compensation_std(
             evidence.solving,
             evidence.reference.noise,
             self.pattern,
@@ -176,7 +177,7 @@ class Compensation:
 
     def _repr_html_(self) -> str:
         # Imports OpenCV.
-        from ltcl.images.pictures import thumbnails
+        from ltcl.images.thumbnails import thumbnails
 
         pictures = {
             "pattern": self.pattern,

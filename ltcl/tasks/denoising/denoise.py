@@ -16,7 +16,7 @@ from ltcl.operators import Operator
 from ltcl.tasks.denoising.problem import DenoisingProblem
 from ltcl.tasks.denoising.shrinkage import NoteShare, first_estimate, refine
 from ltcl.transport.noise import Noise
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 # Arrays of float32 of the size of T that are in memory at once.
 ARRAYS_AT_ONCE = 15
@@ -69,7 +69,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
 
 
 def _check_input(T: Any, progress: Any) -> None:
-    require(T, square=False)
+    check_transport(T, square=False)
     if T.blocks is not None:
         raise InputError("T has blocks between colours; denoise takes a T of 1 or 3 channels")
     for A in T.matrices:
@@ -132,7 +132,7 @@ def _transport_like(T: Transport, matrices: list[np.ndarray], noise: Noise) -> T
         first_bounce,
         T.camera_grid,
         device=T._requested_device,
-        dark=0.0,
+        dark_threshold=0.0,
         mixing=T.mixing,
         noise=noise,
     )
