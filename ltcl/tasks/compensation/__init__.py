@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Radiometric compensation: the projector pattern that makes the scene look as desired (section 8.2)."""
+"""Radiometric compensation: the pattern that makes the scene look as desired (section 8.2)."""
 
 from __future__ import annotations
 

@@ -397,7 +397,7 @@ def _read_appearance(problem: CompensationProblem, queued: list[Array]) -> Colum
 
 
 def _norms_of_frames(norms: list[np.ndarray], frames: int) -> np.ndarray:
-    """Norms (frames,) from those of the columns of each system, of which frames lie side by side."""
+    """Norms (frames,) from those of the columns of each system, where frames lie side by side."""
     columns_of_frames = [n.reshape(frames, -1) for n in norms]
     return np.linalg.norm(np.concatenate(columns_of_frames, axis=1), axis=1)
 

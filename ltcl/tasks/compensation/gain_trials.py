@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Trials of a gain: the light within the bounds that comes nearest to gain * desired, and its error.
+"""Trials of a gain: the light within the bounds nearest to gain * desired, and its error.
 
 Every solve has a certificate, a lower bound on the least error. It may take thousands of products
 where T has fewer rows than columns, or small singular values: systems of few numbers are solved on
@@ -127,7 +127,10 @@ class GainTrials:
         return largest_product / ((1.0 - loss) * self.desired_norm**2), light
 
     def nearest(self, gain: float, start: Columns, accuracy: float) -> GainTrial:
-        """The trial at this gain; once settled, its error is above the least by `accuracy` at most."""
+        """Try this gain.
+
+        The error of a settled trial is above the least by `accuracy` at most.
+        """
         solved = []
         for index, light in enumerate(start):
             if self.is_on_host:

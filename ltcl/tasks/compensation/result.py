@@ -79,9 +79,9 @@ class Evidence:
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Compensation:
-    """Result of `ltcl.compensate`. Pictures are linear, float32, of the frames and colours of `desired`.
+    """Result of `ltcl.compensate`.
 
-    Those of the camera, `appearance`, `target` and `out_of_reach`, are made when they are asked
+    Pictures are linear, float32, with the frames and colours of `desired`. Those of the camera, `appearance`, `target` and `out_of_reach`, are made when they are asked
     for.
 
     Attributes
