@@ -81,8 +81,8 @@ class Evidence:
 class Compensation:
     """Result of `ltcl.compensate`.
 
-    Pictures are linear, float32, with the frames and colours of `desired`. Those of the camera, `appearance`, `target` and `out_of_reach`, are made when they are asked
-    for.
+    Pictures are linear, float32, with the frames and colours of `desired`. Those of the camera,
+    `appearance`, `target` and `out_of_reach`, are made when they are asked for.
 
     Attributes
     ----------
