@@ -12,20 +12,25 @@ Measured: 0 for diffuse boxes, 0.0004 for a path-traced diffuse corner; for a gl
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ltcl.errors import ConvergenceError
-from ltcl.operators import IdentityPlus
+from ltcl.operators import IdentityPlus, Operator
 from ltcl.solvers import solve
 
 # Parts along each side of the picture for negative light; twice as many for ambient light.
 PARTS_PER_SIDE = 4
 AMBIENT_PARTS_PER_SIDE = 8
+# Pixels of a picture whose parts tell ambient light from a bounce, at least.
+MIN_AMBIENT_PIXELS = 64
 # Solves for negative light: far below the smallest share that counts.
 SOLVE_RTOL = 1e-3
+# Solves for ambient light.
+AMBIENT_SOLVE_RTOL = 1e-2
 
 
 def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
@@ -87,3 +92,24 @@ def ambient(inverse: Callable[[np.ndarray], Any], grid: tuple[int, int], step: i
     least = float(np.median(np.nanmin(between, axis=least_axis)))
     mean = float(np.nanmean(np.abs(between)))
     return max(least, 0.0) / max(mean, 1e-300)
+
+
+def ambient_share(systems: Sequence[IdentityPlus], grid: tuple[int, int]) -> float:
+    """`ambient` of the worst channel, from every 7th part alone; 0 if it is not known.
+
+    Pictures of fewer than 64 pixels have too few parts, and a solve may not converge.
+    """
+    if grid[0] * grid[1] < MIN_AMBIENT_PIXELS:
+        return 0.0
+    shares = []
+    try:
+        for S in systems:
+            undo = partial(_undo_coarsely, S.as_it_stands())
+            shares.append(ambient(undo, grid, step=7))
+    except ConvergenceError:
+        return 0.0
+    return max(shares)
+
+
+def _undo_coarsely(S: Operator, light: np.ndarray) -> np.ndarray:
+    return solve(S, light, rtol=AMBIENT_SOLVE_RTOL).x
