@@ -41,7 +41,7 @@ from ltcl.transport.first_bounce import (
     find_first_bounce,
     mask_dark,
 )
-from ltcl.transport.matrices import check_blocks, check_matrices, check_mixing
+from ltcl.transport.matrices import check_mixing, split_channels
 from ltcl.transport.noise import Noise, estimate
 
 logger = logging.getLogger(__name__)
@@ -138,11 +138,7 @@ class Transport:
         probes: int = 128,
         seed: int = 0,
     ) -> None:
-        self.blocks = check_blocks(matrix)
-        if self.blocks is None:
-            self.matrices = check_matrices(matrix)
-        else:
-            self.matrices = tuple(self.blocks[channel][channel] for channel in range(3))
+        self.blocks, self.matrices = split_channels(matrix)
         self.channels = len(self.matrices)
         self.shape: tuple[int, int] = self.matrices[0].shape
         self.mixing: np.ndarray | None = None
@@ -171,12 +167,7 @@ class Transport:
         self.dark_note = ""
         self.first_bounce_error: np.ndarray | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
-        rule = DarkRule(
-            matrices=self.matrices,
-            threshold=checks.number("dark_threshold", dark_threshold, least=0.0, below=1.0),
-            noise=lambda: self.noise,
-            is_measured=noise is not None and getattr(noise, "source", "") != "estimated",
-        )
+        rule = self._dark_rule(dark_threshold)
         if self.is_square:
             self._set_first_bounce(first_bounce, rule, on_dark == "mask", probes, seed)
             self._warn_of_other_grid()
@@ -250,6 +241,17 @@ class Transport:
                     f"noise is a T of {name} {value}; a second measurement has {name} {expected}, "
                     "as matrix"
                 )
+
+    def _dark_rule(self, threshold: float) -> DarkRule:
+        is_measured = self._noise is not None
+        if isinstance(self._noise, Noise):
+            is_measured = self._noise.source != "estimated"
+        return DarkRule(
+            matrices=self.matrices,
+            threshold=checks.number("dark_threshold", threshold, least=0.0, below=1.0),
+            noise=lambda: self.noise,
+            is_measured=is_measured,
+        )
 
     def _set_first_bounce(
         self, requested: Any, rule: DarkRule, mask: bool, probes: int, seed: int
