@@ -29,7 +29,8 @@ from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.files import as_path, locked
 from ltcl.images.encoding import Encoding
 from ltcl.images.frames import Source, check_video, open_frames, write_video
-from ltcl.tasks.compensation import compensate, problem
+from ltcl.tasks.compensation import compensate
+from ltcl.tasks.compensation.inputs import check_gain
 from ltcl.tasks.report import versions
 from ltcl.tasks.requirements import error_note, resolve_reference
 from ltcl.transport import frames as picture_frames
@@ -190,7 +191,7 @@ def compensate_frames(
         frames = checks.count("frames", frames)
     check_transport(T, square=False)
     resolve_reference(T, options.get("exact"))
-    problem.gain(gain, loss)
+    check_gain(gain, loss)
     _check_functions(codes=codes, progress=progress)
     _check_pictures(T, options)
     _, high = checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
