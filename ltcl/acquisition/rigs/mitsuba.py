@@ -21,7 +21,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.rig import load_extra
-from ltcl.acquisition.rigs.virtual import SimulatedRig
+from ltcl.acquisition.rigs.simulated import SimulatedRig
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 from ltcl.files import input_file
 
