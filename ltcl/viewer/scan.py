@@ -23,7 +23,8 @@ from ltcl.acquisition import Calibration, Project, Setup
 from ltcl.acquisition.agreement import CameraModel, find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.rig import to_unit
-from ltcl.acquisition.rigs.folder import Shot, read_photograph
+from ltcl.acquisition.rigs.photographs import read_photograph
+from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.acquisition.session import calibration_folder
 from ltcl.errors import LtclError
 from ltcl.store import ArrayLog, BlockStore, load

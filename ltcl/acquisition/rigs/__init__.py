@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Set-ups of a projector and a camera, each an `ltcl.acquisition.Rig`.
 
-folder        a person photographs; patterns and photographs are files
-live          a camera on a cable photographs a display
-link          commands to camera and display, in time
-survey        what a live rig measures before its first photograph
-cameras       cameras that OpenCV or gphoto2 opens
-display       a display in full screen; `show` of a folder of patterns there
-photographs   files of a camera as codes
-simulated     sensor and projector curve of a computed scene
-virtual       a scene of known light transport
-camera_maps   parts of projector pixels that camera pixels see
-mitsuba       a rendered scene
+folder          a person photographs; patterns and photographs are files
+shooting_list   shots that a person is to take
+live            a camera on a cable photographs a display
+link            commands to camera and display, in time
+survey          what a live rig measures before its first photograph
+cameras         cameras that OpenCV or gphoto2 opens
+display         a display in full screen; `show` of a folder of patterns there
+photographs     files of a camera as codes
+simulated       sensor and projector curve of a computed scene
+virtual         a scene of known light transport
+camera_maps     parts of projector pixels that camera pixels see
+mitsuba         a rendered scene
 """
 
 from __future__ import annotations

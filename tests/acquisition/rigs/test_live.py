@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition import Display, LiveRig, Shots, VirtualRig
-from ltcl.acquisition.rigs import live
+from ltcl.acquisition.rigs import link
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
 random = np.random.default_rng()
@@ -50,7 +50,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Screen]:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with Screen(GRID) as screen:
         screen.history = [(-math.inf, 0 * WHITE)]
-        monkeypatch.setattr(live, "time", screen)
+        monkeypatch.setattr(link, "time", screen)
         yield screen
 
 
