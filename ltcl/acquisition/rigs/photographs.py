@@ -45,11 +45,8 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     used, or was not exposed for `seconds` by its EXIF.
     """
     codes, exposure = _read_with_exposure(name, path)
-    is_known = bool(exposure) and seconds is not None
-    if is_known and abs(exposure / seconds - 1.0) > EXPOSURE_TOLERANCE:
-        raise AcquisitionError(
-            f"{name} was exposed for {exposure:.4g} s by its EXIF, not {seconds:.4g} s"
-        )
+    if seconds is not None:
+        _check_exposure(name, exposure, seconds)
     if codes.dtype.kind == "f" and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
         raise AcquisitionError(
             f"{name} reaches {codes.max():.4g}; full scale of float photographs is 1: "
@@ -58,6 +55,16 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     if codes.ndim == 3 and channels == 1:
         return np.ascontiguousarray(codes[..., 1])
     return codes
+
+
+def _check_exposure(name: str, exposure: float | None, seconds: float) -> None:
+    """Refuse a photograph whose header has another exposure; none or 0 says nothing."""
+    if not exposure:
+        return
+    if abs(exposure / seconds - 1.0) > EXPOSURE_TOLERANCE:
+        raise AcquisitionError(
+            f"{name} was exposed for {exposure:.4g} s by its EXIF, not {seconds:.4g} s"
+        )
 
 
 def _read_with_exposure(name: str, path: Path) -> tuple[np.ndarray, float | None]:

@@ -133,13 +133,13 @@ def _check_camera_map(camera_map: Any, rows: int) -> Any:
     """The matrix C (H W, rows of T); None for the identity."""
     if camera_map is None:
         return None
-    maps = check_matrices(camera_map, "camera_map")
-    if len(maps) > 1 or maps[0].shape[1] != rows:
+    first, *others = check_matrices(camera_map, "camera_map")
+    if others or first.shape[1] != rows:
         raise InputError(
-            f"camera_map has shape {len(maps)} x {maps[0].shape}; "
+            f"camera_map has shape {1 + len(others)} x {first.shape}; "
             f"it must be 1 x (H W, {rows}), the rows of T"
         )
-    return maps[0]
+    return first
 
 
 def _check_ambient(ambient: Any, rows: int, channels: int) -> np.ndarray:
