@@ -15,8 +15,14 @@ from tests.acquisition.radiometry.cameras import Camera, corner
 random = np.random.default_rng()
 
 
+def burst(camera: Camera, light: np.ndarray, seconds: float, count: int) -> list[np.ndarray]:
+    """Photographs repeated without any change."""
+    return [camera.shoot(light, seconds, random) for _ in range(count)]
+
+
 def test_the_variance_is_photons_reading_and_rounding():
-    model, light = NoiseModel(1000.0, 0.01, levels=11), np.array([-0.1, 0.0, 0.5])
+    model = NoiseModel(1000.0, 0.01, levels=11)
+    light = np.array([-0.1, 0.0, 0.5])
     np.testing.assert_allclose(
         model.variance(light, 2.0), light.clip(0) / 1000 + 1e-4 + 2.0**2 * 0.1**2 / 12
     )
@@ -30,7 +36,7 @@ def test_the_variance_is_photons_reading_and_rounding():
 def test_photon_transfer_estimates_electrons_and_read_noise(curve, levels, read):
     """Half a million degrees of freedom: a standard error of about half a percent."""
     camera = Camera(curve, levels, 4000.0, read, black=0.05)
-    bursts = [[camera.shoot(corner(), t, random) for _ in range(5)] for t in (0.05, 1.0)]
+    bursts = [burst(camera, corner(), t, 5) for t in (0.05, 1.0)]
     model = estimate(bursts, response=camera.response, levels=levels or None)
     assert model.electrons == pytest.approx(4000.0, rel=0.03)
     assert model.read == pytest.approx(read, rel=0.03)
@@ -51,9 +57,7 @@ def test_read_noise_is_estimated_where_black_is_clipped_or_rounded_to_one_code(
     """
     camera = Camera("linear", 256, electrons, read, black)
     ramp = np.broadcast_to(np.linspace(0, 1, 64) ** 2.2 * 0.6, (64, 64))
-    bursts = [
-        [camera.shoot(light, 1.0, random) for _ in range(6)] for light in (ramp, 0 * ramp, 0 * ramp)
-    ]
+    bursts = [burst(camera, light, 1.0, 6) for light in (ramp, 0 * ramp, 0 * ramp)]
     model = estimate(bursts, response=camera.response, levels=256)
     assert model.electrons == pytest.approx(electrons, rel=0.24)
     assert abs(model.read - read) < max(0.5 * read, 0.29 / 255)  # what rounding alone adds
@@ -70,14 +74,10 @@ def test_a_scene_that_moves_between_repeated_photographs_is_not_noise():
 
 @pytest.mark.parametrize("levels", [4096, 0])
 def test_pixels_that_are_clipped_at_either_end_do_not_count(levels):
-    camera, light = (
-        Camera("linear", levels, read=5e-4, black=0.0),
-        np.geomspace(1e-3, 8, 9600).reshape(80, 120),
-    )
-    bursts = [
-        [camera.shoot(light * t, 1.0, random).clip(0, None) for _ in range(6)]
-        for t in (0.05, 0.3, 0.0)
-    ]
+    camera = Camera("linear", levels, read=5e-4, black=0.0)
+    light = np.geomspace(1e-3, 8, 9600).reshape(80, 120)
+    bursts = [burst(camera, light, t, 6) for t in (0.05, 0.3, 0.0)]
+    bursts = [[shot.clip(0, None) for shot in shots] for shots in bursts]
     model = estimate(bursts, levels=levels or None)
     assert model.electrons == pytest.approx(10000.0, rel=0.03)
     assert model.read == pytest.approx(5e-4, rel=0.1)
@@ -139,14 +139,13 @@ def test_the_level_of_each_channel_is_separated_from_ambient_light_without_bias(
 
 
 def test_the_projectors_light_is_the_difference():
-    """Offset and ambient light are there with and without the projector, and gone from the difference."""
-    ambient, light = 0.05 * corner(100), 0.5 * corner(100)[::-1]
+    """Offset and ambient light cancel in the difference."""
+    ambient = 0.05 * corner(100)
+    light = 0.5 * corner(100)[::-1]
     black = black_level(shots(ambient, 0.02), SECONDS, LINE, MODEL)
-    pictures = [
-        merge(shots(seen, 0.02), SECONDS, noise=MODEL, black=black)
-        for seen in (ambient, ambient + light)
-    ]
-    lit = pictures[1] - pictures[0]
+    dark = merge(shots(ambient, 0.02), SECONDS, noise=MODEL, black=black)
+    bright = merge(shots(ambient + light, 0.02), SECONDS, noise=MODEL, black=black)
+    lit = bright - dark
     z = (lit.value - light) / np.sqrt(lit.variance)
     assert abs(z.mean()) < 0.06
     assert z.std() == pytest.approx(1.0, abs=0.05)

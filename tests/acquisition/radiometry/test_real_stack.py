@@ -8,29 +8,40 @@ light is not the same in all of them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from ltcl.acquisition.radiometry import NoiseModel, calibrate, merge
+from ltcl.acquisition.radiometry import NoiseModel, Response, calibrate, merge
 
-EXIF, EXPOSURE_TIME = 0x8769, 33434
+EXIF = 0x8769
+EXPOSURE_TIME = 33434
+
+
+@dataclass(frozen=True)
+class Room:
+    """Photographs, their exposures, and the response estimated from them."""
+
+    images: list[np.ndarray]
+    seconds: np.ndarray
+    response: Response
 
 
 @pytest.fixture(scope="module")
-def room(shared_data: Path) -> SimpleNamespace:
-    images, seconds = [], []
+def room(shared_data: Path) -> Room:
+    images = []
+    seconds = []
     for path in sorted((shared_data / "hdr-stack-real").glob("*.jpg")):
         with Image.open(path) as image:
             images.append(np.array(image))
             seconds.append(float(image.getexif().get_ifd(EXIF)[EXPOSURE_TIME]))
     steps = 2.0 ** np.round(np.log2(seconds))
     assert (len(steps), steps.max(), steps.min()) == (7, 2.0, 2.0**-12)
-    return SimpleNamespace(images=images, seconds=steps, response=calibrate(images, steps))
+    return Room(images, steps, calibrate(images, steps))
 
 
 def test_the_response_is_monotone(room):
