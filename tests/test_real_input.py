@@ -2,8 +2,8 @@
 """A transport traced by an independent renderer, with its true bounces.
 
 The file is ../shared/data/transport-dihedral. Bounds of the errors follow from its README.md: F is
-wrong by e, 0.93 % for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a corner
-whose form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and 0.15 % of
+wrong by e, 0.93 % for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a
+corner whose form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and 0.15 % of
 T p.
 
 With F' = (1 + d) F the solve gives b_0' = (1 + d) b_0, and to first order of d, X = S^-1 = I - A,
@@ -11,8 +11,8 @@ With F' = (1 + d) F the solve gives b_0' = (1 + d) b_0, and to first order of d,
     b_k' - b_k = A^k d b_0 - sum_{j < k} A^j d (b_{k-1-j} - b_{k-j})
 
 so that its norm is at most e (m^k |b_0| + sum m^j |b_{k-1-j} - b_{k-j}|). Noise is independent from
-pixel to pixel: it passes the I of X as it is, A averages it away, and it adds to the bias as squares
-do.
+pixel to pixel: it passes the I of X as it is, A averages it away, and it adds to the bias as
+squares do.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +61,12 @@ class Camera:
             np.uint8 if self.levels == 256 else np.uint16
         )
 
+    def bracket(
+        self, radiance: np.ndarray, seconds: Iterable[float], rng: np.random.Generator
+    ) -> list[np.ndarray]:
+        """A photograph at each exposure."""
+        return [self.shoot(radiance, t, rng) for t in seconds]
+
     @property
     def response(self) -> Response:
         return Response(self.light(np.linspace(0, 1, 16385)))
@@ -75,11 +81,8 @@ def shoot_channels(
 ) -> list[np.ndarray]:
     """Photographs (H, W, 3) whose channels have a camera each."""
     random = np.random.default_rng()
-    shots = []
-    for t in seconds:
-        channels = [camera.shoot(radiance, t, random) for camera in cameras]
-        shots.append(np.stack(channels, axis=-1))
-    return shots
+    channels = [camera.bracket(radiance, seconds, random) for camera in cameras]
+    return list(np.stack(channels, axis=-1))
 
 
 def corner(n: int = 256) -> np.ndarray:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,7 +28,7 @@ def test_merged_radiance_is_unbiased_and_its_variance_true(curve, levels):
     """
     camera = Camera(curve, levels, read=0.002 if levels == 256 else 0.001, black=0.02)
     light = np.repeat(np.geomspace(2.5e-3, 6.0, STEPS), REPEATS).reshape(STEPS, REPEATS)
-    shots = [camera.shoot(light, t, random) for t in SECONDS]
+    shots = camera.bracket(light, SECONDS, random)
     merged = merge(shots, SECONDS, camera.response, camera.noise)
     assert merged.valid.mean() > 0.999
     error = np.where(merged.valid, merged.value - light, 0.0)
@@ -40,7 +42,7 @@ def test_it_is_as_good_as_the_noise_allows(light):
     """It reaches the bound of Cramer and Rao; without light radiance scatters about 0."""
     camera = Camera("linear", 4096, black=0.02)
     t = np.array(SECONDS)
-    shots = [camera.shoot(np.full((200, 200), light), seconds, random) for seconds in SECONDS]
+    shots = camera.bracket(np.full((200, 200), light), SECONDS, random)
     merged = merge(shots, SECONDS, camera.response, camera.noise)
     bound = 1.0 / np.sum(t**2 / camera.noise.variance(light * t))
     assert merged.valid.all()
@@ -72,9 +74,8 @@ def test_the_mean_of_repeated_photographs_and_its_variance(shots):
 
 
 def test_each_channel_has_its_own_response():
-    cameras = [
-        Camera(curve, 65536, electrons=1e9, read=0.0) for curve in ("srgb", "gamma2.2", "film")
-    ]
+    clean = Camera("srgb", 65536, electrons=1e9, read=0.0)
+    cameras = [clean, replace(clean, curve="gamma2.2"), replace(clean, curve="film")]
     response = Response(np.concatenate([camera.response.values for camera in cameras]))
     shots = shoot_channels(cameras, corner(32), [0.5, 1.0])
     merged = merge(shots, [0.5, 1.0], response, NoiseModel(1e9, 1e-5))
@@ -136,15 +137,14 @@ def test_a_dark_picture_is_as_dark_at_any_exposure(black, lit, hot):
     light.flat[:lit_pixels] = 0.03 * random.random(lit_pixels)
     stuck = random.random(light.shape) < hot
     for ratio in (1.5, 60.0):
-        shots = [np.where(stuck, 11469, camera.shoot(light, t, random)) for t in (1.0, ratio)]
-        assert merge(
-            [shot.astype(np.uint16) for shot in shots], [1.0, ratio], levels=16384
-        ).valid.any()
+        shots = np.stack(camera.bracket(light, [1.0, ratio], random))
+        shots[:, stuck] = 11469
+        assert merge(list(shots), [1.0, ratio], levels=16384).valid.any()
 
 
 @pytest.mark.parametrize("order", [[0, 1, 3, 2, 4, 5], [0, 1, 2, 2, 4, 5], [0, 2, 3, 4, 5, 1]])
 def test_photographs_in_the_wrong_order_are_named(order):
-    shots = [Camera().shoot(corner(), t, random) for t in SECONDS]
+    shots = Camera().bracket(corner(), SECONDS, random)
     later = 5 if order[-1] == 1 else 3
     with pytest.raises(InputError, match=rf"images\[{later}\] .* images\[{later - 1}\]"):
         merge([shots[k] for k in order], SECONDS)

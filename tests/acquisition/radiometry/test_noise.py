@@ -17,7 +17,7 @@ random = np.random.default_rng()
 
 def burst(camera: Camera, light: np.ndarray, seconds: float, count: int) -> list[np.ndarray]:
     """Photographs repeated without any change."""
-    return [camera.shoot(light, seconds, random) for _ in range(count)]
+    return camera.bracket(light, [seconds] * count, random)
 
 
 def test_the_variance_is_photons_reading_and_rounding():
@@ -67,8 +67,9 @@ def test_a_scene_that_moves_between_repeated_photographs_is_not_noise():
     """Edges of a few pixels: were they noise, nothing that moves would deviate from it any more."""
     camera = Camera("linear", 4096, 10000.0, 0.002, black=0.05)
     light = np.where(np.arange(96) // 24 % 2, 0.7, 0.1) * np.linspace(0.8, 1.0, 64)[:, None]
-    bursts = [[camera.shoot(x, 1.0, random) for x in (light, np.roll(light, 1, axis=1))]]
-    model = estimate(bursts, response=camera.response, levels=4096)
+    moved = np.roll(light, 1, axis=1)
+    burst = [camera.shoot(light, 1.0, random), camera.shoot(moved, 1.0, random)]
+    model = estimate([burst], response=camera.response, levels=4096)
     assert model.electrons == pytest.approx(10000.0, rel=0.2)
 
 
@@ -76,8 +77,7 @@ def test_a_scene_that_moves_between_repeated_photographs_is_not_noise():
 def test_pixels_that_are_clipped_at_either_end_do_not_count(levels):
     camera = Camera("linear", levels, read=5e-4, black=0.0)
     light = np.geomspace(1e-3, 8, 9600).reshape(80, 120)
-    bursts = [burst(camera, light, t, 6) for t in (0.05, 0.3, 0.0)]
-    bursts = [[shot.clip(0, None) for shot in shots] for shots in bursts]
+    bursts = [np.clip(burst(camera, light, t, 6), 0, None) for t in (0.05, 0.3, 0.0)]
     model = estimate(bursts, levels=levels or None)
     assert model.electrons == pytest.approx(10000.0, rel=0.03)
     assert model.read == pytest.approx(5e-4, rel=0.1)
@@ -125,8 +125,11 @@ LINE = Response.identity()
 
 
 def shots(ambient: np.ndarray, offset: Any) -> list[np.ndarray]:
-    light = [random.poisson(ambient * t * MODEL.electrons) / MODEL.electrons for t in SECONDS]
-    return [offset + part + random.normal(0, MODEL.read, part.shape) for part in light]
+    photographs = []
+    for t in SECONDS:
+        light = random.poisson(ambient * t * MODEL.electrons) / MODEL.electrons
+        photographs.append(offset + light + random.normal(0, MODEL.read, light.shape))
+    return photographs
 
 
 def test_the_level_of_each_channel_is_separated_from_ambient_light_without_bias():

@@ -89,10 +89,13 @@ BLACK = Radiance(np.zeros(WALL.shape), np.zeros(WALL.shape), np.full(WALL.shape,
 
 
 def lit(sigma: float, M: np.ndarray = M, ambient: float = 0.0) -> list[Radiance]:
-    clean = [ambient + WALL * M[:, d] for d in range(3)]
     variance = np.full(WALL.shape, sigma**2)
     valid = np.full(WALL.shape, True)
-    return [Radiance(c + random.normal(0, sigma, c.shape), variance, valid) for c in clean]
+    pictures = []
+    for d in range(3):
+        noise = random.normal(0, sigma, WALL.shape)
+        pictures.append(Radiance(ambient + WALL * M[:, d] + noise, variance, valid))
+    return pictures
 
 
 def test_the_mixing_of_a_set_up_is_estimated_without_bias_less_black():

@@ -55,7 +55,7 @@ def test_bad_tables_are_refused(values, part):
 
 
 def bracket(camera: Camera, seconds=SECONDS) -> list[np.ndarray]:
-    return [camera.shoot(corner(), t, random) for t in seconds]
+    return camera.bracket(corner(), seconds, random)
 
 
 def error(response: Response, camera: Camera) -> float:
