@@ -3,8 +3,8 @@
 
 The file is ../shared/data/transport-dihedral. Bounds of the errors follow from its README.md: F is
 wrong by e, 0.93 % for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a
-corner whose form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and 0.15 % of
-T p.
+corner whose form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and
+0.15 % of T p.
 
 With F' = (1 + d) F the solve gives b_0' = (1 + d) b_0, and to first order of d, X = S^-1 = I - A,
 

@@ -77,7 +77,7 @@ def test_a_scene_that_moves_between_repeated_photographs_is_not_noise():
 def test_pixels_that_are_clipped_at_either_end_do_not_count(levels):
     camera = Camera("linear", levels, read=5e-4, black=0.0)
     light = np.geomspace(1e-3, 8, 9600).reshape(80, 120)
-    bursts = [np.clip(burst(camera, light, t, 6), 0, None) for t in (0.05, 0.3, 0.0)]
+    bursts = [list(np.clip(burst(camera, light, t, 6), 0, None)) for t in (0.05, 0.3, 0.0)]
     model = estimate(bursts, levels=levels or None)
     assert model.electrons == pytest.approx(10000.0, rel=0.03)
     assert model.read == pytest.approx(5e-4, rel=0.1)
