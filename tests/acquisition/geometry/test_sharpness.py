@@ -17,8 +17,7 @@ from ltcl.acquisition.calibrate import measure as calibrate
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots
-from ltcl.errors import AcquisitionError, FileError
-from ltcl.store import BlockStore
+from ltcl.errors import AcquisitionError
 
 from ..scanning.helpers import corner
 from .scenes import places, turned
@@ -102,7 +101,7 @@ def test_a_hopeless_camera_is_refused_before_the_scan(geometry: Any) -> None:
         acquire(camera(0.95), strategy="pixel", response=LINE, geometry=geometry)
 
 
-def test_it_is_stored_and_reported(tmp_path: Path, monkeypatch: Any) -> None:
+def test_it_is_stored_and_reported(tmp_path: Path) -> None:
     """Out of focus: the store has it, and the report says it."""
     path = tmp_path / "T.zarr"
     T = acquire(camera(3.0, 1.0), strategy="hadamard", store=path, response=LINE)
@@ -116,10 +115,6 @@ def test_it_is_stored_and_reported(tmp_path: Path, monkeypatch: Any) -> None:
     scale = (seen @ truth) / (seen @ seen)
     error = np.linalg.norm(scale * seen - truth) / np.linalg.norm(truth)
     assert error > 0.05
-    extras = [name for name in BlockStore.open(path).extras if not name.endswith("doubtful")]
-    monkeypatch.setattr(BlockStore, "extras", property(lambda store: extras))
-    with pytest.raises(FileError, match="earlier ltcl"):
-        Calibration.of(path)
 
 
 def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_path: Path) -> None:
