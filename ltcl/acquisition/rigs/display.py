@@ -31,7 +31,7 @@ POLL_SECONDS = 0.05
 
 
 class Display(Closing):
-    """One display in full screen that shows codes of a grid (extra `projector`).
+    """A display in full screen that shows codes of a grid (extra `projector`).
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Display(Closing):
         self._pygame.display.flip()
 
     def key_pressed(self) -> bool:
-        """Whether a key was pressed since the last call.
+        """True if a key was pressed since the last call.
 
         Escape and the window's button close the display: AcquisitionError, then and afterwards.
         """

@@ -71,7 +71,7 @@ class ShootingList:
         return self.folder / "shots.json"
 
     def has_pattern(self, key: ShotKey) -> bool:
-        """Whether some shot projects the same pattern."""
+        """True if some shot projects the same pattern."""
         return key.pattern_hash in self._pattern_numbers
 
     def add(self, key: ShotKey, repeats: int) -> Shot:
