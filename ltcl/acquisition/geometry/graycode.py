@@ -28,7 +28,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import check_photographs
-from ltcl.acquisition.radiometry.merge import in_strips
+from ltcl.acquisition.radiometry.strips import in_strips
 from ltcl.errors import InputError
 
 # Values of all pictures of a strip of rows: 2 MiB of float32 stay in the cache.
