@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -22,7 +23,9 @@ from .stopping import Unplugged
 
 random = np.random.default_rng(0)
 WHITE = np.ones((2, 2), np.float32)
-SENSOR = CameraModel(Response.identity(), NoiseModel(1000.0, 0.003, levels=256), 0.02)
+SENSOR = CameraModel(
+    response=Response.identity(), noise=NoiseModel(1000.0, 0.003, levels=256), offset=0.02
+)
 
 
 def photograph(light: np.ndarray, seconds: float = 1.0, electrons: float = 1000.0) -> np.ndarray:
@@ -59,13 +62,13 @@ def test_noise_deviates_from_nothing(shape: tuple[int, ...], most: float) -> Non
             light = most * random.random(shape) ** random.choice([0.5, 1, 6])
             images = [photograph(light, t, electrons) for t in times]
             for noise in (ROUGH_NOISE, NoiseModel(electrons, 0.003, levels=256)):
-                assert not deviating(images, times, sensor=SENSOR._replace(noise=noise))
+                assert not deviating(images, times, sensor=replace(SENSOR, noise=noise))
 
 
 def test_few_photons_deviate_from_nothing() -> None:
     """Dark pixels get no photon in most photographs, and hardly any other noise."""
     sensor, times = (
-        CameraModel(Response.identity(), NoiseModel(100.0, 1e-4)),
+        CameraModel(response=Response.identity(), noise=NoiseModel(100.0, 1e-4)),
         (0.25, 1.0, 1.0, 1.0, 4.0),
     )
     for light in 0.2 * random.random((20, 32, 32)) ** 3:
@@ -109,7 +112,7 @@ def test_an_exposure_that_dim_pixels_alone_show(gain: float) -> None:
     """Of two, 64 times apart: what one shows well the other does not, or it is saturated."""
     light, sensor = (
         random.random((60, 60)) ** 4,
-        CameraModel(Response.identity(), NoiseModel(20000.0, 0.001)),
+        CameraModel(response=Response.identity(), noise=NoiseModel(20000.0, 0.001)),
     )
     codes = [
         x + random.normal(0, 0.001, x.shape) for x in (gain * light, np.minimum(64 * light, 1.0))

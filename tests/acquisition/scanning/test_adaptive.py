@@ -110,7 +110,9 @@ def test_the_core_as_a_transport(device: Any, grid: tuple[int, int], channels: i
         Known(flat(grid, channels) + 0.02 * random.random((channels, n, n)), grid), threshold=0.03
     )
     C, mixing = dense(core), np.eye(3) + 0.1 if channels == 3 else np.eye(1)
-    T = from_arrays(adaptive.arrays(core, mixing if channels == 3 else None), device=device)
+    T = from_arrays(
+        adaptive.transport_arrays(core, mixing if channels == 3 else None), device=device
+    )
     np.testing.assert_allclose(
         np.atleast_2d(T.first_bounce), np.diagonal(C, axis1=1, axis2=2), rtol=1e-6
     )
@@ -128,5 +130,5 @@ def test_variance_of_light_that_stays_at_a_cell() -> None:
     """Four children and their parent, each of variance v: 4 v / 5 of each sum, over 4 pixels squared."""
     v = 1e-4
     core = scan(Known(np.ones((1, 16, 16)), (4, 4), v**0.5), threshold=0.9)
-    variance = core.matrices("variance")[0][:, slice(*core.cells.offsets[1:3])].toarray()
+    variance = core.variances()[0][:, slice(*core.cells.offsets[1:3])].toarray()
     np.testing.assert_allclose(variance, np.full((16, 4), 0.8 * v / 4**2))

@@ -26,7 +26,7 @@ def lit(value: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("code", [Pixels(), Hadamard()], ids=["pixel", "hadamard"])
 def test_columns_come_back_without_noise(code: columns.Code, pixels: int) -> None:
     T, P = random.random((pixels, 4)), code.patterns(pixels)
-    assert len(P) == columns.patterns(code, pixels)
+    assert len(P) == columns.count_patterns(code, pixels)
     assert P.any(axis=1).all()  # no pattern is black
     x, variance = code.decode(P @ T, np.full((len(P), 4), 1e-4), np.zeros(4))
     np.testing.assert_allclose(x[:pixels], T, atol=1e-12)
