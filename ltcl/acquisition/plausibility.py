@@ -21,7 +21,7 @@ from ltcl.acquisition import agreement, anchor
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.geometry import Correspondence, Resampling, decode
 from ltcl.acquisition.radiometry import Radiance
-from ltcl.acquisition.radiometry.camera import NO_LIGHT
+from ltcl.acquisition.radiometry.exposures import NO_LIGHT
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.session import CaptureSession, Photograph
 from ltcl.errors import AcquisitionError, InputError
