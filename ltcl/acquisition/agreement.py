@@ -87,21 +87,21 @@ class CameraModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Deviation:
-    """Photographs (indices) of which one deviates, or two that are exchanged; and the likely cause."""
+    """Photographs (indices) one of which deviates, or two exchanged ones; and the likely cause."""
 
     suspects: tuple[int, ...]
     cause: str
     is_exchange: bool = False
 
     def describe(self, numbers: Sequence[int], name: PhotographName = name_by_number) -> str:
-        """One line about photographs with these numbers."""
+        """Describe the deviation of photographs with these numbers in one line."""
         names = [name(numbers[k]) for k in self.suspects]
         conjunction = " and " if self.is_exchange else " or "
         return f"{conjunction.join(names)} {self.cause}"
 
 
 def spread(pixels: int | np.ndarray) -> np.ndarray:
-    """At most `MAX_PIXELS` of so many pixels, or of an array of their numbers, spread evenly."""
+    """Choose at most `MAX_PIXELS` of so many pixels, or of an array of numbers, spread evenly."""
     numbers = np.arange(pixels) if isinstance(pixels, int) else pixels
     step = -(-max(len(numbers), 1) // MAX_PIXELS)
     return numbers[::step]
@@ -195,7 +195,7 @@ class AgreementRecord:
 def _deviation_of_inverses(
     group: Sequence[_RecordedPhotograph], camera: CameraModel
 ) -> Deviation | None:
-    """Photographs of patterns and their inverses, at one exposure, that do not add up as the others."""
+    """Patterns and inverses, at one exposure, that do not add up to the same as the others."""
     first = []
     for k, (photograph, following) in enumerate(pairwise(group)):
         if _are_inverse(photograph.codes, following.codes):
@@ -222,7 +222,7 @@ def _deviation_of_inverses(
 
 
 def _are_inverse(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether codes of 0 and 1 are those of a pattern and its inverse."""
+    """True for codes of 0 and 1 of a pattern and its inverse."""
     if a.shape != b.shape:
         return False
     return bool(np.all(a + b == 1.0) and np.all(a * b == 0.0))
@@ -230,7 +230,7 @@ def _are_inverse(a: np.ndarray, b: np.ndarray) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _MeanLight:
-    """Radiance (n, c) by several photographs, its variance and common error, and where any shows it."""
+    """Radiance (n, c) by several photographs, its variance, common error, and where it is known."""
 
     value: np.ndarray
     variance: np.ndarray
@@ -300,7 +300,7 @@ class LinearLight:
         )
 
     def with_known(self, radiance: np.ndarray, variance: np.ndarray) -> LinearLight:
-        """One photograph more, as the shortest exposure would show known light."""
+        """Add a photograph of known light at the shortest exposure."""
         t = self.seconds.min(axis=0, keepdims=True)
         value = t * radiance
         shape = (1, 1, value.shape[2])
@@ -322,7 +322,7 @@ class LinearLight:
         )
 
     def select(self, numbers: Sequence[int]) -> LinearLight:
-        """Some of the photographs."""
+        """Select photographs by their places."""
         chosen = list(numbers)
         return LinearLight(
             seconds=self.seconds[chosen],
@@ -334,7 +334,7 @@ class LinearLight:
         )
 
     def without(self, k: int) -> LinearLight:
-        """All photographs but one."""
+        """Leave one photograph out."""
         return self.select([number for number in range(len(self.value)) if number != k])
 
     def plus(self, other: LinearLight) -> LinearLight:
@@ -398,7 +398,7 @@ class LinearLight:
         return max(by_pixel, together / SINGLE_Z2)
 
     def agrees(self) -> bool:
-        """Whether no photograph deviates."""
+        """True if no photograph deviates."""
         return bool(self.scores().max(initial=0.0) <= 1.0)
 
     def likely_cause(self, k: int) -> str:

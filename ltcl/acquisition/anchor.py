@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A pattern of blocks that is photographed in the calibration, and again after each batch of a scan.
+"""A pattern of blocks, photographed in the calibration and again after each batch of a scan.
 
 If it does not show the same light as before (`agreement`), something moved during the batch, or
 the light changed. The edges of the batch's patterns tell from which pattern on: with a picture y
@@ -30,7 +30,7 @@ MIN_SCALE = 0.05
 
 
 def pattern(grid: tuple[int, int]) -> np.ndarray:
-    """Codes (h, w): blocks of 2 x 2 pixels that begin at odd rows and columns, on or off at random."""
+    """Codes (h, w): blocks of 2 x 2 pixels from odd rows and columns on, on or off at random."""
     height, width = grid
     random = np.random.default_rng(0)
     coarse = random.random((height // 2 + 1, width // 2 + 1)) < 0.5
@@ -60,7 +60,7 @@ class Anchor:
 
     @classmethod
     def of(cls, picture: Radiance, resampling: Resampling) -> Self:
-        """From a picture (H, W[, c]) of the pattern."""
+        """The anchor of a picture (H, W[, c]) of the pattern."""
         seen = np.unique(resampling.weights.indices)
         is_valid = sample(picture.valid, seen).all(axis=1)
         pixels = spread(seen[is_valid])
@@ -91,7 +91,7 @@ def shift_of(
     ambient: Radiance,
     resampling: Resampling,
 ) -> np.ndarray:
-    """Movement d along x and y, in camera pixels, of a `compact` picture under codes (h, w[, c])."""
+    """Movement d along x and y, in camera pixels, of a `compact` picture under some codes."""
     grey = codes if codes.ndim == 2 else codes.mean(axis=2)
     P = grey.ravel()
     weights = abs(resampling.weights).T

@@ -310,7 +310,7 @@ def _measure_response(
         session.hot = hot_pixels(session.photograph(np.zeros_like(white), seconds))
     session.camera = CameraModel(response=response)
     level = brightness(session.photograph(white, seconds), session.hot)
-    # Those of probes go: photographs at the exposure of white tell rigs apart.
+    # The digest is of photographs at the exposure of white, which tell rigs apart, not of probes.
     shots.digest.clear()
     return nearest(shots.exposures, seconds * WHITE_LEVEL / max(level, 0.01))
 

@@ -130,7 +130,7 @@ class CaptureSession:
 
     @contextlib.contextmanager
     def naming_photographs(self) -> Iterator[None]:
-        """Where the block cannot use the photographs, name those that deviate."""
+        """Name photographs that deviate, if the block cannot use them."""
         try:
             yield
         except AcquisitionError as error:

@@ -364,7 +364,7 @@ def _choose_plan(
 
 
 def _store_sizes(strategy: str, grid: ScanGrid, order: int) -> dict[str, Any]:
-    """Sizes of the store of a scan: T, whose columns are batches, or pictures of an adaptive scan."""
+    """Sizes of the store of a scan: columns of T, or pictures of an adaptive scan."""
     pixels = math.prod(grid.grid)
     if strategy == "adaptive":
         most = adaptive.most_patterns(adaptive.Cells(grid.grid))

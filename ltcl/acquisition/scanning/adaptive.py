@@ -132,7 +132,7 @@ class Entries:
     variance: np.ndarray
 
     def select(self, mask: np.ndarray) -> Entries:
-        """Some of the entries."""
+        """Select entries by a mask (entries,)."""
         return Entries(
             cell=self.cell[mask],
             pixel=self.pixel[mask],
@@ -264,7 +264,7 @@ class _Division:
         log.announce(self._pattern(child, members) for child, members in groups)
         cell = self.children[:, self.parent]
         energy = np.zeros((4, *self.parents.energy.shape))
-        # Where no photograph follows the light is unknown.
+        # The light is unknown unless a photograph follows.
         variance = energy + np.where(cell >= 0, UNKNOWN, 0.0)[:, None]
         for first in range(0, len(groups), BATCH_SIZE):
             batch = groups[first : first + BATCH_SIZE]
@@ -304,7 +304,7 @@ class _Division:
         return np.stack([(C @ sums)[pixels] for C in self.matrices])
 
     def _add_up(self, energy: np.ndarray, variance: np.ndarray) -> None:
-        """Correct children (4, channels, entries) in place, so that they add up to their parents."""
+        """Correct children (4, channels, entries) in place: they add up to their parents."""
         others = all_but_one(variance) + self.parents.variance
         total = np.maximum(variance + others, 1e-300)
         rest = energy.sum(axis=0) - self.parents.energy
@@ -328,7 +328,7 @@ class _Division:
 
 
 class PictureLog:
-    """Pictures in the order in which an adaptive scan asks for them, a batch in each block of a store.
+    """Pictures in the order of an adaptive scan's requests, a batch in each block of a store.
 
     The next request depends on nothing but the pictures before. So a scan that was stopped is run
     again from its start with the pictures of the log, to the bit the same, until it asks for a new

@@ -53,7 +53,7 @@ class Pixels:
     size: int = 64
 
     def patterns(self, pixels: int) -> np.ndarray:
-        """Which pixels of a batch are on, (patterns, pixels) bool."""
+        """Patterns of a batch: the pixels that are on, (patterns, pixels) bool."""
         single = np.eye(pixels, dtype=bool)
         if pixels == 1:
             return single
@@ -121,7 +121,7 @@ class Hadamard:
             raise InputError(f"size is {self.size}; it must be 2^k - 1: 1, 3, 7, 15, ...")
 
     def patterns(self, pixels: int) -> np.ndarray:
-        """Which pixels of a batch are on, (patterns, pixels) bool.
+        """Patterns of a batch: the pixels that are on, (patterns, pixels) bool.
 
         For fewer pixels: columns of the smallest matrix that has as many.
         """

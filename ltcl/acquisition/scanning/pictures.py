@@ -7,7 +7,7 @@ channels of the projector send. Before a batch is kept, its photographs are comp
 noise (`agreement`):
 
     exposures     of one pattern show the same light
-    patterns      no picture of a batch shows the pattern of another (the only check of one exposure)
+    patterns      no picture of a batch shows the pattern of another
     anchor        after each batch, the pattern of blocks looks as in the calibration
 """
 
@@ -61,7 +61,7 @@ class Picture(NamedTuple):
 
     @property
     def known(self) -> np.ndarray:
-        """Where the value is known, (channels, M) bool."""
+        """Mask of known values, (channels, M) bool."""
         return self.variance < KNOWN_VARIANCE
 
 
@@ -107,7 +107,7 @@ class ScanGrid:
         return cls(setup.calibration, setup.blocks.side)
 
     def noise(self, entries: Callable[[int], Any]) -> dict[str, np.ndarray]:
-        """The noise of T for its store, by the entries of each channel as `Noise.fit` takes them."""
+        """The noise of T for its store, by entries of each channel as `Noise.fit` takes them."""
         white = np.where(self.white.known, self.white.variance, np.inf)
         pixels = len(self.seen)
         samples = [entries(channel) for channel in range(self.channels)]
@@ -352,7 +352,7 @@ class _Rearrangement:
         return pairs
 
     def _agrees(self, order: Sequence[int | None]) -> bool:
-        """Whether the photographs agree in another order, in which None is a missing one."""
+        """True if the photographs agree in another order, in which None is a missing one."""
         remaining = iter(order)
         for pattern in self.patterns:
             images = []
@@ -395,7 +395,7 @@ class _BatchComparison:
                 yield a, b
 
     def _shown_patterns(self) -> np.ndarray:
-        """Whether picture a shows the pattern of b, (a, b).
+        """Matrix (a, b) that is True if picture a shows the pattern of b.
 
         Relative to white, it is four times as bright where b alone is lit as where a alone is,
         beyond the noise.
@@ -423,7 +423,7 @@ class _BatchComparison:
         return mean, count, variance
 
     def _shows_same_light(self, a: int, b: int) -> bool:
-        """Whether two pictures agree within their noise."""
+        """True if two pictures agree within their noise."""
         both = self.known[a] & self.known[b]
         if not both.any():
             return False

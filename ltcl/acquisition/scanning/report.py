@@ -122,7 +122,7 @@ class Report:
         )
 
     def to_json(self) -> str:
-        """One line of JSON; NaN as null."""
+        """The report in one line of JSON, with null for NaN."""
         content = asdict(self)
         for name, value in content.items():
             if isinstance(value, float) and math.isnan(value):
@@ -206,7 +206,7 @@ def _relative_noise(variance: np.ndarray, value: np.ndarray, known: np.ndarray) 
 
 
 def _cells_of_pixels(store: BlockStore) -> scipy.sparse.csr_array:
-    """Which cells a pixel is in, (N, cells); columns of T are cells of one pixel."""
+    """Membership of pixels in cells, (N, cells); columns of T are cells of one pixel."""
     if store.layout.kind == "compressed":
         return adaptive.Cells(store.layout.grid).W.T.tocsr()
     return scipy.sparse.csr_array(scipy.sparse.eye_array(store.layout.shape[1]))
