@@ -281,10 +281,7 @@ class LinearLight:
         limit = np.broadcast_to(CLIPPING_SHARE * saturation, (len(value), 1, value.shape[2]))
         t = np.asarray(seconds, np.float64)[:, None, None]
         if radiance is None:
-            usable = value < limit
-            total_light = np.sum(value * usable, axis=0)
-            total_seconds = np.sum(t * usable, axis=0)
-            radiance = total_light / np.maximum(total_seconds, 1e-30)
+            radiance = _mean_radiance(value, t, value < limit)
         slope = camera.response.derivative(curve).reshape(codes.shape)
         dim_bias = BLACK_ELECTRONS / max(noise.electrons, MIN_ELECTRONS)
         variance = noise.variance(t * radiance, slope)
@@ -420,6 +417,13 @@ class LinearLight:
         return (
             "deviates from the others of its pattern: another pattern, or the camera or scene moved"
         )
+
+
+def _mean_radiance(value: np.ndarray, seconds: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Mean radiance (n, c) by the usable ones of linear values (k, n, c)."""
+    light = np.sum(value * usable, axis=0)
+    total_seconds = np.sum(seconds * usable, axis=0)
+    return light / np.maximum(total_seconds, 1e-30)
 
 
 def _deviation(light: LinearLight, count: int) -> Deviation | None:

@@ -84,8 +84,8 @@ def test_a_camera_with_few_exposures() -> None:
 class SilentAboutBits:
     """A rig that does not say how many bits its photographs have."""
 
-    projector_grid = (4, 8)
-    channels = 1
+    projector_grid: tuple[int, int] = (4, 8)
+    channels: int = 1
 
     def __init__(self, bits: int) -> None:
         self.photograph = rig(4, bits=bits).photograph

@@ -458,7 +458,7 @@ def _diagonal_of_product(C: scipy.sparse.csr_array, cells: Cells) -> np.ndarray:
     return C.multiply(cells.W.T).sum(axis=1)
 
 
-def _remainder_arrays(C: scipy.sparse.csr_array, diagonal: np.ndarray) -> dict[str, Any]:
+def _remainder_arrays(C: Any, diagonal: np.ndarray) -> dict[str, Any]:
     """R = C W - I as a compressed operator: its core C less 1 at every pixel's own cell."""
     rows = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
     values = C.data - (C.indices == rows)

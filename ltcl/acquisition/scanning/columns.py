@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -256,7 +257,7 @@ def finish(store: BlockStore, grid: ScanGrid, patterns: int, sigmas: float) -> N
         store.extra(name, array)
 
     def add_up(
-        channel: int, first: int, matrix: scipy.sparse.csr_array, variance: np.ndarray
+        channel: int, first: int, matrix: Any, variance: np.ndarray
     ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
         rows = slice(first, first + matrix.shape[0])
         expected = Picture(white.value[channel, rows], white.variance[channel, rows])
@@ -415,9 +416,9 @@ def balance(
     >>> rows.toarray().round(3).tolist(), v.round(3).tolist()
     ([[0.56, 0.12]], [1.2, 0.8])
     """
-    rows, N = matrix.shape
     lengths = np.diff(matrix.indptr)
-    V = scipy.sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=(rows, N))
+    V: Any = scipy.sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
+    rows, N = V.shape
     median = np.zeros(rows)
     for row, entries in enumerate(np.split(variance, matrix.indptr[1:-1])):
         if len(entries):
