@@ -39,7 +39,7 @@ from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.settings import ScanSettings
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
-from ltcl.store import BlockStore, Parts, formats, load
+from ltcl.store import BlockStore, CompressedRecord, formats, load
 
 FILE = "acquisition.toml"
 STORE = "transport.zarr"
@@ -347,7 +347,7 @@ def _make_virtual_rig(folder: Path, options: dict[str, Any]) -> rigs.VirtualRig:
         options.setdefault("camera_grid", T.camera_grid)
     else:
         record = formats.read(folder / str(camera_map))
-        if isinstance(record, Parts):
+        if isinstance(record, CompressedRecord):
             raise InputError(
                 f"camera_map is {camera_map}, a compressed transport; it must be a matrix"
             )

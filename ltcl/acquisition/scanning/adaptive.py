@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.scanning.columns import all_but_one
 from ltcl.acquisition.scanning.pictures import (
     KNOWN_VARIANCE,
@@ -38,7 +38,7 @@ from ltcl.acquisition.scanning.pictures import (
     ScanGrid,
 )
 from ltcl.errors import AcquisitionError
-from ltcl.store import BlockStore, Parts
+from ltcl.store import BlockStore, CompressedRecord
 from ltcl.transport import first_bounce
 
 BATCH_SIZE = 16
@@ -420,7 +420,7 @@ def finish(
     for channel, variance in enumerate(core.variances()):
         store.extra(f"core_variance_{channel}", variance.data)
     arrays = transport_arrays(core, mixing, sigmas) | grid.noise(core.known_entries)
-    store.finalize(compressed=Parts(arrays))
+    store.finalize(compressed=CompressedRecord(arrays))
 
 
 def transport_arrays(
@@ -438,7 +438,7 @@ def transport_arrays(
     noise = np.stack([_diagonal_of_product(V, cells) for V in core.variances()])
     result: dict[str, Any] = {
         "grid": cells.grid,
-        "first_bounce": first_bounce.certain(diagonal, noise, sigmas),
+        "first_bounce": first_bounce.drop_uncertain(diagonal, noise, sigmas),
         "basis_0.name": "pyramid",
         "basis_0.grid": cells.grid,
     }

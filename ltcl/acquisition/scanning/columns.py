@@ -16,7 +16,7 @@ import scipy.linalg
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, Picture, ScanCamera, ScanGrid
 from ltcl.errors import InputError, ScanRefused
 from ltcl.store import BlockStore

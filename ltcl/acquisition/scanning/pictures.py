@@ -23,7 +23,7 @@ import numpy as np
 from ltcl.acquisition import anchor
 from ltcl.acquisition.agreement import ADVICE, Deviation, find_deviation, sample, spread
 from ltcl.acquisition.calibration import Calibration, Setup
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.session import acquisition_error

@@ -14,7 +14,6 @@ import ltcl
 from ltcl.acquisition.scanning import adaptive
 from ltcl.acquisition.scanning.adaptive import Cells
 from ltcl.acquisition.scanning.pictures import Picture
-from ltcl.transport.transport import from_arrays
 
 random = np.random.default_rng(0)
 GRIDS = [(1, 1), (1, 6), (7, 1), (4, 4), (5, 7), (8, 8)]
@@ -127,7 +126,7 @@ def test_the_core_as_a_transport(device: Any, grid: tuple[int, int]) -> None:
     n = grid[0] * grid[1]
     core = rough_scan(grid, 1)
     [C] = dense(core)
-    T = from_arrays(adaptive.transport_arrays(core), device=device)
+    T = ltcl.Transport.from_arrays(adaptive.transport_arrays(core), device=device)
     np.testing.assert_allclose(T.first_bounce, np.diagonal(C), rtol=1e-6)
     x = random.random(n)
     picture = np.asarray(T @ x.reshape(grid))
@@ -143,7 +142,7 @@ def test_the_core_as_a_transport_in_colours(device: Any) -> None:
     core = rough_scan(grid, 3)
     C = dense(core)
     mixing = np.eye(3) + 0.1
-    T = from_arrays(adaptive.transport_arrays(core, mixing), device=device)
+    T = ltcl.Transport.from_arrays(adaptive.transport_arrays(core, mixing), device=device)
     np.testing.assert_allclose(T.first_bounce, np.diagonal(C, axis1=1, axis2=2), rtol=1e-6)
     x = random.random((*grid, 3))
     expected = np.einsum("cij,cd,jd->ic", C, mixing, x.reshape(-1, 3))
