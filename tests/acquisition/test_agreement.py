@@ -97,7 +97,7 @@ def test_few_photons_deviate_from_nothing() -> None:
 def test_a_clean_calibration_of_a_noisy_camera_agrees(
     gain: float, albedo: Any, by_hand: bool
 ) -> None:
-    """Its response has to be measured in that noise, which the camera clips at black."""
+    """The response has to be measured in that noise, which the camera clips at black."""
     T = ltcl.scenes.dihedral(8, albedo=albedo).transport()
     rig = Unplugged(T, T.grid, bits=12, gain=gain, response="srgb", ambient=0.01)
     rig.keeps_photographs = by_hand
@@ -128,7 +128,7 @@ def test_another_exposure_is_named(wrong: int, gain: float) -> None:
 
 @pytest.mark.parametrize(("gain", "expected"), [(1.0, set()), (2 ** (1 / 3), {11, 12})])
 def test_an_exposure_that_dim_pixels_alone_show(gain: float, expected: set[int]) -> None:
-    """Exposures are 64 times apart: pixels that one shows well are dim or saturated in the other."""
+    """Exposures are 64 times apart: a pixel good in one is dim or saturated in the other."""
     camera = CameraModel(response=Response.identity(), noise=NoiseModel(20000.0, 0.001))
     light = random.random((60, 60)) ** 4
     short = gain * light + random.normal(0, 0.001, light.shape)

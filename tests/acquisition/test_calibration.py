@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Codes for a pattern of light, ambient light, and the error of a transport against a known scene."""
+"""Codes for a pattern, ambient light, and the error of a transport against a known scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def coloured_rig() -> VirtualRig:
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_picture_is_transport_of_light_and_ambient(tmp_path: Path, channels: int) -> None:
-    """In the units of T, ambient light is that of the projector's black and of the room."""
+    """Ambient light in the units of T is that of the projector's black and of the room."""
     if channels == 3:
         scene = coloured_rig()
         shape: tuple[int, ...] = (*GRID, 3)

@@ -74,7 +74,7 @@ def test_ended_and_resumed(tmp_path: Path, strategy: str) -> None:
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Stores of finished acquisitions, and of others that were stopped in the middle of the scan."""
+    """Stores of finished acquisitions, and of others that were stopped in the scan."""
     paths = {kind: tmp_path_factory.mktemp("stores") / "T.zarr" for kind in FINAL + HALF}
     for kind in FINAL:
         rig, settings = set_up(kind)
@@ -98,7 +98,7 @@ def flip(file: Path) -> bytes:
 
 @pytest.mark.parametrize("kind", FINAL + HALF)
 def test_any_flipped_bit_is_detected(stores: dict[str, Path], tmp_path: Path, kind: str) -> None:
-    """One bit of each file: by `verify`, by the report of a transport, and when half a scan goes on."""
+    """`verify` notices one bit of each file, so does a report, or a run that goes on."""
     path = Path(shutil.copytree(stores[kind], tmp_path / "T.zarr"))
     files = sorted(file for file in path.rglob("*") if file.is_file())
     for file in files:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The closed loop: photographs of a known transport in, and the transport out; stopped and resumed."""
+"""The closed loop, stopped and resumed: photographs of a known transport in, and T out."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Steps:
 def test_photographs_are_enough_for_the_transport(
     tmp_path: Path, scanned: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run that ends between the last photograph and the transport, and one that was not stopped."""
+    """A run that ends after the last photograph, and one that was not stopped, are the same."""
     strategy, T, whole = scanned
     path = tmp_path / "T.zarr"
     monkeypatch.setattr(BlockStore, "finalize", lambda *_, **__: interrupt())

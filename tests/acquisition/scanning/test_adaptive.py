@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scans by cells: light that is flat in cells is exact, sums always are, and few patterns suffice."""
+"""Scans by cells: light flat in cells is exact, sums always are, and few patterns suffice."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_light_that_is_flat_in_cells_is_measured_exactly(
 def test_a_tiny_threshold_measures_every_entry_by_patterns_that_differ(
     grid: tuple[int, int],
 ) -> None:
-    """As patterns differ, the noise of a virtual rig is the same in a run that was stopped."""
+    """The noise of a virtual rig is the same in a run that was stopped, as patterns differ."""
     n = grid[0] * grid[1]
     known = KnownScene(0.1 + random.random((1, n, n)), grid)
     np.testing.assert_allclose(dense(scan(known, threshold=1e-6)), known.T, rtol=1e-6)
@@ -151,7 +151,7 @@ def test_the_core_as_a_transport_in_colours(device: Any) -> None:
 
 
 def test_variance_of_light_that_stays_at_a_cell() -> None:
-    """Four children and their parent, each of variance v: 4 v / 5 of each sum, over 4 pixels squared."""
+    """Four children and a parent of variance v: 4 v / 5 of each sum, over 4 pixels squared."""
     v = 1e-4
     core = scan(KnownScene(np.ones((1, 16, 16)), (4, 4), v**0.5), threshold=0.9)
     _, start, stop, *_ = core.cells.offsets

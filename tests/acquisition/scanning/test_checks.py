@@ -138,7 +138,7 @@ def oblique_rig(shift: float) -> Unplugged:
 
 @pytest.mark.parametrize(("strategy", "after"), [("pixel", 9), ("hadamard", 9), ("adaptive", 10)])
 def test_a_camera_that_moved(strategy: str, after: int) -> None:
-    """It moves half a pixel between two patterns: photographs of each agree, those of blocks do not."""
+    """It moves half a pixel between patterns: each agrees by itself, blocks do not."""
     rig = oblique_rig(4.0)
     moved = oblique_rig(4.5)
     real = rig.photograph

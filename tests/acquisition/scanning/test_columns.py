@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Columns of T: decoded with the least variance, without mere noise, in rows that add up to white."""
+"""Columns of T: decoded with least variance, without noise, in rows that add up to white."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_columns_are_decoded_exactly_without_noise(code: columns.Code, pixels: i
 
 @pytest.mark.parametrize("code", [Pixels(6), Hadamard(7), Hadamard(31)])
 def test_it_is_generalised_least_squares(code: columns.Code) -> None:
-    """With y = A x + n - e 1, cov n = diag(v), var e = a, the estimate is (A' K A)^-1 A' K y."""
+    """The estimate is (A' K A)^-1 A' K y for y = A x + n - e 1, cov n = diag(v), var e = a."""
     A = code.patterns(code.size).astype(float)
     a = 0.3
     v = random.random(len(A)) + 0.1
@@ -143,7 +143,7 @@ def test_rows_with_something_unknown_stay() -> None:
 
 
 def test_the_part_of_dropped_entries_goes_to_the_others() -> None:
-    """As in rows with entries of the median variance there, whose part of the rest is then moved."""
+    """Rows get entries of the median variance there, whose part of the rest is then moved."""
     x = np.array([[1.0, 0.2, 0.0, 0.0]])
     v = np.array([0.3, 0.1])
     white = Picture(np.array([1.5]), np.array([0.05]))

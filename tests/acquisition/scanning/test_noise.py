@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The noise of scans: deviations of bounces and figures of reports match the errors of many scans."""
+"""The noise of scans: deviations and figures of reports match the errors of many scans."""
 
 from __future__ import annotations
 

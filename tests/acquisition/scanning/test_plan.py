@@ -92,7 +92,7 @@ def test_auto_chooses_the_better_picture() -> None:
 
 @pytest.mark.parametrize("strategy", ["pixel", "hadamard", "block"])
 def test_photographs_by_hand_are_all_counted(strategy: str) -> None:
-    """Those of the calibration and after each batch are counted too."""
+    """Photographs of the calibration and after each batch are counted too."""
     grid = (8, 16)
     size = (32, 64)
     view = camera_map(lambda u, v: (u / 4, v / 4), size, grid)
