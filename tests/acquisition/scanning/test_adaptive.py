@@ -97,9 +97,11 @@ def test_a_tiny_threshold_measures_every_entry_by_patterns_that_differ(
 
 @pytest.mark.parametrize("threshold", [0.001, 0.02, 0.3])
 def test_no_light_is_lost_with_any_threshold(threshold: float) -> None:
+    """Light of other lit cells, which is subtracted with an error of 10 %, makes sums inexact."""
     T = random.random((1, 64, 64)) ** 4 + 3 * np.eye(64)
     sums = dense(scan(KnownScene(T, (8, 8)), threshold)).sum(axis=2)
-    np.testing.assert_allclose(sums, T.sum(axis=2), rtol=5e-3)
+    expected = T.sum(axis=2)
+    assert np.linalg.norm(sums - expected) < 0.01 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize(("first_row", "patterns"), [(0.0, 16), (1.0, 4 + 16 + 64 + 256)])
