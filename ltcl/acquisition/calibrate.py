@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ltcl.acquisition import anchor, plausibility, radiometry
+from ltcl.acquisition import anchor, consistency, radiometry
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.calibration import Calibration
@@ -238,7 +238,7 @@ def measure(
 
     # 1. Exposure of white, and response of the camera.
     first_exposure = find_white_exposure(session)
-    plausibility.check_geometry(shots, geometry)
+    consistency.check_geometry(shots, geometry)
     white_exposure = _measure_response(session, effort, first_exposure, response)
 
     # 2. Geometry.
@@ -264,7 +264,7 @@ def measure(
 
     # 4. Noise and offset of the camera; then photographs can be compared.
     shortest_dark = [photograph for photograph in dark if photograph.seconds == white_exposure]
-    plausibility.check_black(session, shortest_dark)
+    consistency.check_black(session, shortest_dark)
     with session.naming_photographs():
         session.camera = _measure_camera(session, dark, bright)
     session.check_agreement()
@@ -274,11 +274,11 @@ def measure(
     ambient = session.merge(dark)
     lit = session.merge(bright)
     white = lit - ambient
-    plausibility.check_light(scan, white, view.resampling, session.camera)
+    consistency.check_light(scan, white, view.resampling, session.camera)
     projector, mixing = _measure_projector(session, effort, uniform, ambient, lit)
     blocks = session.merge([*before, *after])
     block_light = (blocks - ambient).value
-    plausibility.check_map(session, view.resampling, view.stripes, block_light, white.value)
+    consistency.check_map(session, view.resampling, view.stripes, block_light, white.value)
     resampling = view.resampling.ascertained(white.value, white.valid)
     return Calibration(
         exposures=scan,
@@ -455,7 +455,7 @@ def _measure_projector(
     if is_grey:
         pictures[0].append(lit)
     for photographs, channel in zip(uniform, pictures, strict=True):
-        plausibility.check_uniform(session, photographs, channel, ambient)
+        consistency.check_uniform(session, photographs, channel, ambient)
     with acquisition_error("the projector"):
         codes = [0.0, *effort.codes, 1.0]
         channels = [[ambient, *channel] for channel in pictures]
