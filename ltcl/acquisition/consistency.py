@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Checks of a calibration: photographs that cannot be what they should be are refused by number.
 
-geometry        pixels of the photographs and of the projector
-black           no lamp was on in one photograph of several
-uniform codes   show black and a rising part of white
-light           white is brighter than black, and the scan's exposures show it
-map             no pattern of Gray code was exchanged with its inverse
+    geometry        pixels of the photographs and of the projector
+    black           no lamp was on in one photograph of several
+    uniform codes   show black and a rising part of white
+    light           white is brighter than black, and the scan's exposures show it
+    map             no pattern of Gray code was exchanged with its inverse
+
+An AcquisitionError names photographs, an InputError an argument of `ltcl.acquire`.
 """
 
 from __future__ import annotations
