@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""S in float64 on the host, where its numbers are at hand: products, LU, and what float32 products hide.
+"""S in float64 on the host, where its numbers are at hand: products, and what float32 products hide.
 
 A residual b - S x in float32 deviates from the true one by at most about c eps || |S| || ||x||, eps = 2^-23
 (Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.5, with random signs in
@@ -9,14 +9,11 @@ where it is not, S x is computed in float64 with the numbers that were given.
 
 from __future__ import annotations
 
-import math
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 
 from ltcl import checks
@@ -34,15 +31,8 @@ UNIT = 4.0 * EPS
 _SMALL = (
     4 << 20
 )  # bytes of S on the device, up to which a float64 product takes no longer than a few waits
-_FINE = 4.0 * 2.0**-52  # c eps of float64
-
-_Factors = tuple[
-    np.ndarray, np.ndarray, np.ndarray, float
-]  # S, LU, pivots; what rounding hides, over |x|
-_getrf, _gecon = scipy.linalg.get_lapack_funcs(("getrf", "gecon"), dtype=np.float64)
 # What is known of operators, as long as they live; nothing in it may refer to its operator.
 _known: weakref.WeakKeyDictionary[Operator, tuple[Any, Any, Any]] = weakref.WeakKeyDictionary()
-factors: weakref.WeakKeyDictionary[Operator, _Factors] = weakref.WeakKeyDictionary()
 
 
 def _numbers(S: Operator, read: bool = False) -> tuple[Any, Any, Any] | None:
@@ -114,51 +104,3 @@ def dense(S: Operator) -> tuple[np.ndarray, bool]:
 def is_small(S: Operator) -> bool:
     """Whether a float64 product with S is cheap; one with a LinearOperator goes through the host anyway."""
     return S.nbytes + S.bytes_read() <= _SMALL
-
-
-@dataclass(frozen=True)
-class Direct:
-    """Dense LU of S in float64 (LAPACK): O(N^3) once per operator, then O(N^2). No options."""
-
-    name: ClassVar[str] = "direct"
-
-    def solve(self, S: Operator, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """x like b in float64, the norms (k,) of b - S x, and what rounding may hide of them.
-
-        None where S is singular to working precision.
-        """
-        if (factorization := _factorize(S)) is None:
-            return None
-        numbers, lu, pivots, rounding = factorization
-        with np.errstate(all="ignore"):
-            # LAPACK's wrapper shifts the pivots while it runs; other threads have their own copies.
-            x = scipy.linalg.lu_solve((lu, pivots.copy()), b.astype(np.float64), check_finite=False)
-            hidden = rounding * np.linalg.norm(x, axis=0)
-            norms = np.linalg.norm(b - numbers @ x, axis=0)
-        return x, np.atleast_1d(norms), np.atleast_1d(hidden)
-
-
-def _factorize(S: Operator) -> _Factors | None:
-    """Made once and kept as long as S lives: many frames are solved with one S."""
-    if S in factors:
-        return factors[S]
-    n = S.shape[0]
-    what = f"method='direct' factorizes S densely, which for N = {n}"
-    checks.fits_host(what, 3 * 8 * n * n)
-    try:
-        numbers, is_exact = dense(S)
-        with np.errstate(all="ignore"):
-            lu, pivots, info = _getrf(numbers)
-            rcond, _ = _gecon(lu, np.linalg.norm(numbers, 1))
-            norm = math.sqrt(np.linalg.norm(numbers, 1) * np.linalg.norm(numbers, np.inf))
-    except MemoryLimitError:
-        raise
-    except MemoryError as error:
-        raise MemoryLimitError(
-            f"{what} needs {checks.size(24 * n * n)}, more than the host gives"
-        ) from error
-    if info != 0 or not rcond >= np.finfo(np.float64).eps:
-        return None
-    norm = min(norm, float(np.linalg.norm(numbers)))
-    factors[S] = numbers, lu, pivots, (_FINE if is_exact else UNIT) * norm
-    return factors[S]

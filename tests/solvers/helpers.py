@@ -18,7 +18,6 @@ from ltcl.errors import ConvergenceError, InputError
 from ltcl.operators import CSR, Compressed, IdentityPlus
 from ltcl.solvers import METHODS as ALL
 from ltcl.solvers import Solution, Status
-from ltcl.solvers.krylov import STATE, Columns  # noqa: F401 - of the tests of kernels
 from tests.bases import Given, rotation, stands_for, two_sided
 from tests.problems import Scene, enclosure
 

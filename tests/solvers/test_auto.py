@@ -119,7 +119,7 @@ def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device)
 
 def test_many_right_hand_sides_are_worth_a_factorization_and_one_is_not(device):
     S = IdentityPlus(Dense(device, ring(0.9)))
-    methods = [next(auto.plan(S, 1e-2, k))[0].name for k in (4000, 1)]
+    methods = [next(auto.plan(S, 1e-2, k)).method.name for k in (4000, 1)]
     assert methods[1] != methods[0] == "direct"
     ltcl.solve(S, pictures(), "direct")
     assert ltcl.solve(S, pictures(3), rtol=1e-5).method == "direct"  # by factors that are there

@@ -15,9 +15,10 @@ import ltcl
 from ltcl.operators import Dense, IdentityPlus, Operator
 from ltcl.solvers import Bounded, Status
 from ltcl.solvers.bounded import minimise
+from ltcl.solvers.column_reductions import ColumnReductions
 from tests import gallery, reference
 from tests.problems import enclosure, lambertian
-from tests.solvers.helpers import Columns, force_groups
+from tests.solvers.helpers import force_groups
 
 random = np.random.default_rng(60)
 SHAPES = [(1, 1), (1, 5), (53, 5), (257, 3), (5_001, 1)]
@@ -66,7 +67,7 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     Q, G, D, H, R, Y, W, X, L, U = (
         device.upload(part) for part in (q, g, d, h, r, Ad, w, x, lower, upper)
     )
-    columns = Columns(X, *NAMES)
+    columns = ColumnReductions(X, *NAMES)
     slices, tolerance = columns.slices, reference.gamma(rows / 64 + 40) * 8 * rows
     start = np.zeros((4 + 3 * slices, k))
     start[:3] = np.linspace(0.2, 1.0, k), np.linspace(0.5, 1.0, k), np.linspace(0.3, 0.9, k)

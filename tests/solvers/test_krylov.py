@@ -16,10 +16,11 @@ from ltcl.device import Array
 from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
 from ltcl.solvers.bounded import minimise
+from ltcl.solvers.column_reductions import STATE_ROWS, ColumnReductions, pair_codes
 from tests import gallery, reference
 from tests.bases import rotation
 from tests.problems import enclosure, lambertian, residual
-from tests.solvers.helpers import STATE, Columns, force_groups
+from tests.solvers.helpers import force_groups
 
 random = np.random.default_rng(71)
 
@@ -216,7 +217,7 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     w, u, weights = (gallery.vectors(rows, k, seed) for seed in range(6, 9))
     on_device = device.upload(np.concatenate([V.reshape(6, -1), np.zeros((1, rows * k))]))
     W, U, weighing = device.upload(w), device.upload(u), device.upload(weights)
-    columns = Columns(W, "vector_dots", "krylov_subtract")
+    columns = ColumnReductions(W, "vector_dots", "krylov_subtract")
     tolerance = reference.gamma(rows + 40) * rows * 30
     sums = columns.sums(7)
     columns.bind("vector_dots", 0, 0, 0, W, on_device, W, W, sums, across=7)()
@@ -229,7 +230,7 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     )
 
     pairs = columns.sums(2)
-    columns.bind("vector_dots", 0, 0b1010_0100, 1, weighing, W, U, U, pairs, across=2)()
+    columns.bind("vector_dots", 0, pair_codes("ab", "cc"), 1, weighing, W, U, U, pairs, across=2)()
     found = pairs.get().reshape(columns.slices, 2, k).sum(axis=0)
     wanted = reference.vector_dots([(w, u), (u, u)], weights)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance)
@@ -259,7 +260,9 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
 def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     force_groups(monkeypatch, device, group)
     vectors = [gallery.vectors(rows, k, seed) for seed in range(7)]
-    columns = Columns(device.upload(vectors[0]), "krylov_cg", "krylov_half", "krylov_bicgstab")
+    columns = ColumnReductions(
+        device.upload(vectors[0]), "krylov_cg", "krylov_half", "krylov_bicgstab"
+    )
     slices, rest, ones = columns.slices, np.arange(k) % 3 == 1, np.ones(k)
     close: dict[str, Any] = {"rtol": 1e-5, "atol": 1e-4}
 
@@ -279,7 +282,7 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
         return numbers.set(values)
 
     def squares(numbers: Array) -> np.ndarray:
-        return numbers.get()[STATE : STATE + slices].sum(axis=0)
+        return numbers.get()[STATE_ROWS : STATE_ROWS + slices].sum(axis=0)
 
     sums, partials = summed(0.9, 1.3)
     numbers, arrays = state(_0=2.0, _1=0.7), [device.upload(v) for v in vectors[:5]]

@@ -207,7 +207,15 @@ FAILURES = [status for status in Status if status not in (Status.CONVERGED, Stat
 )
 @pytest.mark.parametrize("status", FAILURES)
 def test_every_failure_says_what_to_try_instead(status, method):
-    text = str(Solution(np.zeros(3), status, 3, 4, (1.0, 0.5, 0.7), 0.0, method))
+    solution = Solution(
+        x=np.zeros(3),
+        status=status,
+        iterations=3,
+        products=4,
+        residuals=(1.0, 0.5, 0.7),
+        method=method,
+    )
+    text = str(solution)
     assert re.search(f"{method}.*{status.name.lower()}.* 3 .* 4 .* 0.5", text)
     assert any(word in text for word in ("try ", "check ", "loosen "))
     assert "\n" not in text

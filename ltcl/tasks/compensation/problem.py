@@ -22,7 +22,7 @@ from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator, ScaledColumns, as_operator
-from ltcl.solvers.bounded import Bounded, inwards, minimise
+from ltcl.solvers.bounded import Bounded, minimise, round_inwards
 from ltcl.solvers.solve import METHODS, OPTIONS
 from ltcl.transport import frames as layout
 from ltcl.transport.transport import Transport
@@ -76,7 +76,7 @@ class Limits:
     @classmethod
     def in_float32(cls, bounds: tuple[float, float], masked: np.ndarray) -> Limits:
         """The numbers of float32 within the bounds, so that a rounded pattern does not exceed them."""
-        low, high = inwards(*bounds)
+        low, high = round_inwards(*bounds)
         if not -np.inf < low < high < np.inf:
             raise InputError(f"bounds is {bounds}; there must be two numbers of float32 within")
         return cls(float(low), float(high), masked)
