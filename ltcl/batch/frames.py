@@ -28,8 +28,8 @@ from ltcl.batch.cluster import is_there, stream
 from ltcl.batch.manifest import OtherRun, Record, curve, identity, setting
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, locked, read_ahead
+from ltcl.images.encoding import Encoding
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
-from ltcl.images.pictures import Encoding
 from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
 from ltcl.tasks.compensation import compensate, problem

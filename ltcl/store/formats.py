@@ -23,12 +23,18 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError
-from ltcl.files import as_path, input_file, replace_file, unknown_extension
+from ltcl.files import (
+    as_path,
+    check_mapped_file,
+    input_file,
+    replace_file,
+    unknown_extension,
+)
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
 from ltcl.transport.first_bounce import DARK
-from ltcl.transport.transport import Transport, from_arrays, intact, require, to_arrays
+from ltcl.transport.transport import Transport, from_arrays, require, to_arrays
 
 COMPRESSED, INVERSE, RGB = "ltcl-compressed-1", "ltcl-inverse-1", "ltcl-rgb-csr-1"
 _INDICES = ("indices", "indptr", "row", "col", "coords", "offsets")
@@ -140,7 +146,8 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     if not any(isinstance(M, Matrix) for M in T.matrices):
         return write(path, Parts(to_arrays(T)))
     matrices = [
-        record.floats("T", intact(M)) if isinstance(M, np.ndarray) else M for M in T.matrices
+        record.floats("T", check_mapped_file(M)) if isinstance(M, np.ndarray) else M
+        for M in T.matrices
     ]
     F = T.first_bounce if T.is_square else None
     write(path, Record(tuple(matrices), T.grid, T.camera_grid, F, T.mixing, T.measured_noise))

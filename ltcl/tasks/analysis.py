@@ -89,7 +89,7 @@ class Analysis:
         return f"<ltcl Analysis grid {h} x {w}, rho(R) {radii}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         bars = {}
         for channel in self.channels:

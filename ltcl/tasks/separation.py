@@ -104,7 +104,7 @@ class Separation:
         return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{error}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         bounces = {f"bounce {k}": bounce for k, bounce in enumerate(self.bounces, 1)}
         return thumbnails(self, {"direct": self.direct, **bounces, "rest": self.rest})

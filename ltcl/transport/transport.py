@@ -18,6 +18,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
+from ltcl.files import check_mapped_file
 from ltcl.operators import (
     Coupled,
     IdentityPlus,
@@ -27,8 +28,7 @@ from ltcl.operators import (
     interreflections,
 )
 from ltcl.operators import stored as stored_operators
-from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
-from ltcl.operators.parts import intact
+from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
 from ltcl.transport import diagnostics
 from ltcl.transport import first_bounce as _first_bounce
@@ -145,12 +145,14 @@ class Transport:
         self.dark = ""
         self.first_bounce_error: np.ndarray | None = None
         self._arrays: dict[str, np.ndarray] = {}  # of an unpickled compressed T
-        self.is_compressed = self.is_square and any(made_with(T) is not None for T in self.matrices)
+        self.is_compressed = self.is_square and any(
+            underlying_system(T) is not None for T in self.matrices
+        )
         self._inverses: weakref.WeakSet[Inverse] = (
             weakref.WeakSet()
         )  # that were found to be of this T
         self._requested_device = device
-        if (own := device_of(self.blocks or [self.matrices], device)) is not None:
+        if (own := common_device(self.blocks or [self.matrices], device)) is not None:
             self.device = own
         self._noise = self._checked_noise(noise)
         self._F: np.ndarray | None = None  # (channels, N)
@@ -161,7 +163,7 @@ class Transport:
             rule = partial(_first_bounce.dark, self.matrices, share, lambda: self.noise, known)
             own, may_mask = (
                 lambda: self.device,
-                on_dark == "mask" and all(map(maskable, self.matrices)),
+                on_dark == "mask" and all(map(can_mask_pixels, self.matrices)),
             )
             F, error = _first_bounce.find(self.matrices, first_bounce, own, probes, seed, rule)
             self._F, self.masked, why = _first_bounce.mask_dark(F, rule(F), self.grid, may_mask)
@@ -189,7 +191,7 @@ class Transport:
         return f"<ltcl Transport {text}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         if self._F is None:
             return thumbnails(self, {"picture under white": self @ np.ones(self.grid)})
@@ -208,7 +210,9 @@ class Transport:
                 T.tocsr().toarray() if hasattr(T, "tocsr") else T
             )  # of memory, or of the rows of a store
             return (
-                intact(T) if isinstance(T, np.ndarray) else as_operator(T, self.device).to_dense()
+                check_mapped_file(T)
+                if isinstance(T, np.ndarray)
+                else as_operator(T, self.device).to_dense()
             )
 
         whole = np.array([[dense(T) for T in row] for row in rows])
@@ -341,7 +345,7 @@ class Transport:
 
     def _operator(self, channel: int) -> Operator:
         """T of one channel: S F where that has all of its digits, so that nothing is stored twice."""
-        T = intact(self.matrices[channel])
+        T = check_mapped_file(self.matrices[channel])
         if self._F is not None and not self.masked.any() and not isinstance(T, Operator):
             F = self._F[channel]
             if hasattr(T, "diagonal") and np.all(np.asarray(T.diagonal()) >= _CANCELLATION * F):
@@ -439,7 +443,7 @@ def to_arrays(T: Transport) -> dict[str, np.ndarray]:
     Those of `ltcl.operators.stored`, grid, first_bounce, mixing and noise if any, columns_0, ...
     where d is another F.
     """
-    systems = [S for S in map(made_with, T.matrices) if S is not None]
+    systems = [S for S in map(underlying_system, T.matrices) if S is not None]
     if not T.is_square or len(systems) < T.channels:
         kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
         raise InputTypeError(

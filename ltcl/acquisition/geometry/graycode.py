@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.radiometry.camera import photographs
+from ltcl.acquisition.radiometry.exposures import check_photographs
 from ltcl.acquisition.radiometry.merge import in_strips
 from ltcl.errors import InputError
 
@@ -110,7 +110,7 @@ class GrayCode:
             raise InputError(
                 f"photographs are {len(images)}; they must be {self.count}, one a pattern"
             )
-        pictures = photographs("photographs", images)
+        pictures = check_photographs("photographs", images)
         pictures = [p.mean(axis=2, dtype=np.float32) if p.ndim == 3 else p for p in pictures]
         dark = (
             DARK

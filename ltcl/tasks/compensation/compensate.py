@@ -145,7 +145,7 @@ class Compensation:
         return f"<ltcl Compensation {shape}, {error}, {self.clipped:.2%} clipped>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         names = ("pattern", "appearance", "target", "out_of_reach")
         return thumbnails(self, {name: getattr(self, name) for name in names})
