@@ -86,8 +86,8 @@ class Candidate:
         return self.nbytes / bandwidth + self.overhead + self.operations / flops
 
     def __str__(self) -> str:
-        plural = "" if self.products == 1 else "s"
-        return f"{self.method.name}: {self.products:g} product{plural}"
+        unit = "product" if self.products == 1 else "products"
+        return f"{self.method.name}: {self.products:g} {unit}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,9 +250,10 @@ def _plan_by_survey(S: Operator, rtol: float, columns: int) -> Iterator[PlannedM
 
     ranking = ", ".join(map(str, candidates))
     reason = f"fastest first: {ranking}; {surveyed}"
+    products = len(surveyed.residuals) - 1
     if made_before:
         reason += " made before"
-    products = 0 if made_before else len(surveyed.residuals) - 1
+        products = 0
     first = candidates[0].method
     yield PlannedMethod(method=first, reason=reason, products=products)
     if not isinstance(first, GMRES):
@@ -297,13 +298,15 @@ def _iterative_candidate(S: Operator, columns: int, method: Method, products: fl
 def _direct_candidate(S: Operator, columns: int) -> Candidate:
     """Return what a dense factorization, if it is not there yet, and its use need."""
     n = S.shape[0]
-    factorization = 0.0 if S in factorizations else 2.0 / 3.0 * n**3
+    operations = 4.0 * n * n * columns
+    if S not in factorizations:
+        operations += 2.0 / 3.0 * n**3
     return Candidate(
         method=Direct(),
         products=0,
         # Both triangles, and S for the residual.
         nbytes=16.0 * n * n,
-        operations=factorization + 4.0 * n * n * columns,
+        operations=operations,
     )
 
 

@@ -78,8 +78,8 @@ class Bounded(Solution):
     gap: float
 
     def __str__(self) -> str:
-        cause = "" if self.converged else f": {self.status.value}"
-        return f"{self._outcome()}, at most {self.gap:.2g} above the least{cause}"
+        text = f"{self._outcome()}, at most {self.gap:.2g} above the least"
+        return text if self.converged else f"{text}: {self.status.value}"
 
 
 def minimise(
@@ -119,14 +119,16 @@ def minimise(
     if largest == 0.0:
         largest = float(np.max(np.abs([lower, upper])))
     unit = _power_of_two(largest)
-    weight_unit = 1.0 if weights is None else _power_of_two(float(np.max(weights)))
+    weight_unit = 1.0
+    if weights is not None:
+        weight_unit = _power_of_two(float(np.max(weights)))
+        weights = weights / weight_unit
 
     scaled_lower = np.clip(np.asarray(lower, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
     scaled_upper = np.clip(np.asarray(upper, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
     box = round_inwards(scaled_lower, scaled_upper)
     first = _clip((x0 / unit).astype(np.float32), box)
-    scaled_weights = None if weights is None else weights / weight_unit
-    descent = _Descent(A, b / unit, scaled_weights, box, first)
+    descent = _Descent(A, b / unit, weights, box, first)
     search = _Search(descent, rtol, atol / (unit * weight_unit), maxiter, callback)
     status = search.run()
 
@@ -318,15 +320,21 @@ class _Descent:
         self.A = A
         self.products = 0
         self.has_true_residual = False
-        self.norms = np.linalg.norm(b if w is None else w * b, axis=0)
-        self._largest_weight = 1.0 if w is None else float(np.max(w))
         self._box = box
         self.b = device.upload(b)
         self.x = device.upload(x)
         self.r = self.b.like()
-        # Without weights u is r.
-        self._u = self.r if w is None else self.r.like()
-        self._weights = self.r if w is None else device.upload(np.square(w))
+        if w is None:
+            self.norms = np.linalg.norm(b, axis=0)
+            self._largest_weight = 1.0
+            self._u = self.r
+            # The kernels do not read them.
+            self._weights = self.r
+        else:
+            self.norms = np.linalg.norm(w * b, axis=0)
+            self._largest_weight = float(np.max(w))
+            self._u = self.r.like()
+            self._weights = device.upload(np.square(w))
         self.g = vectors.fill(self.x.like(), 0.0)
         # A^T u
         self._q = vectors.fill(self.x.like(), 0.0)
@@ -445,4 +453,6 @@ def _clip(x: np.ndarray, box: Box) -> np.ndarray:
 
 def _power_of_two(largest: float) -> float:
     """Return a power of two near `largest`: in such units squares stay within float32."""
-    return float(np.exp2(np.floor(np.log2(largest)))) if largest > 0.0 else 1.0
+    if not largest > 0.0:
+        return 1.0
+    return float(np.exp2(np.floor(np.log2(largest))))

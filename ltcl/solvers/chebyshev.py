@@ -117,24 +117,26 @@ class Chebyshev(IterativeMethod):
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends the solve."""
         S = system.S
-        bounds = theory.free_bounds(S) if self.spectrum is None else self.spectrum
+        bounds = self.spectrum
+        if bounds is None:
+            bounds = theory.free_bounds(S)
         first_steps = self._first_steps()
         if first_steps:
             space = krylov_cycle(system, x, r, monitor, first_steps)
             bounds = tighten_bounds(bounds, S, space.ritz_values())
 
-        for repair in range(SEARCH.repairs + 1):
+        for _ in range(SEARCH.repairs):
             if monitor.status is not None:
                 return
-            judges = repair < SEARCH.repairs
-            limit = SEARCH.growth_limit if judges else math.inf
-            has_grown = self._iterate_within(bounds, limit, system, x, r, monitor)
-            if not has_grown and not (judges and monitor.resume(x, r)):
+            has_grown = self._iterate_within(bounds, SEARCH.growth_limit, system, x, r, monitor)
+            if not has_grown and not monitor.resume(x, r):
                 return
             # What has grown are the eigenvectors that the bounds leave out; few steps of GMRES find
             # their eigenvalues.
             space = krylov_cycle(system, x, r, monitor, SEARCH.repair_steps)
             bounds = _repaired_bounds(bounds, S, space.ritz_values())
+        if monitor.status is None:
+            self._iterate_within(bounds, math.inf, system, x, r, monitor)
 
     def _first_steps(self) -> int:
         if self.arnoldi is not None:

@@ -85,14 +85,19 @@ class ColumnReductions:
         self.slices = max(1, min(enough, most))
 
     def bind(
-        self, name: str, *arguments: object, extra: int = 0, across: int = 1, rows: int = 0
+        self,
+        name: str,
+        *arguments: object,
+        extra: int = 0,
+        across: int = 1,
+        rows: int | None = None,
     ) -> Launch:
         """Bind kernel `name` on `rows` rows, `across` times, with local memory for `extra` reals a column."""
         scratch = self.device.local(self.group + extra * min(self.k, self.group))
         return self._kernels[name].bind(
             self.items(across),
             (self.group, 1, 1),
-            rows if rows else self.rows,
+            self.rows if rows is None else rows,
             self.k,
             *arguments,
             scratch,

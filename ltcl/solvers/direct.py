@@ -7,6 +7,7 @@ float64 may hide is added.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import weakref
 from dataclasses import dataclass
@@ -70,15 +71,7 @@ class Direct(Method):
         b = problem.b.astype(np.float64)
         substituted = substitute(problem.S, b)
         if substituted is None:
-            is_lit = bool(np.any(b))
-            return Solution(
-                x=unscale(np.zeros(b.shape), problem.unit),
-                status=Status.BREAKDOWN if is_lit else Status.CONVERGED,
-                iterations=0,
-                products=0,
-                residuals=(1.0,) if is_lit else (0.0,),
-                method=self.name,
-            )
+            return self._without_factors(problem)
 
         rule = problem.rule
         norms = np.linalg.norm(b, axis=0)
@@ -90,14 +83,29 @@ class Direct(Method):
         if rule.callback is not None:
             for iteration, residual in enumerate(residuals):
                 rule.callback(iteration, residual)
-        return Solution(
+        solution = Solution(
             x=unscale(substituted.x, problem.unit),
-            status=Status.CONVERGED if is_claimed else Status.STAGNATED,
+            status=Status.CONVERGED,
             iterations=1,
             products=0,
             residuals=residuals,
             method=self.name,
-            least_rtol=None if is_claimed else relative_residual(largest, norms),
+        )
+        if is_claimed:
+            return solution
+        least_rtol = relative_residual(largest, norms)
+        return dataclasses.replace(solution, status=Status.STAGNATED, least_rtol=least_rtol)
+
+    def _without_factors(self, problem: LinearProblem) -> Solution:
+        """Return x = 0 for a singular S, which solves the system if there is no light."""
+        is_dark = not np.any(problem.b)
+        return Solution(
+            x=np.zeros(problem.b.shape),
+            status=Status.CONVERGED if is_dark else Status.BREAKDOWN,
+            iterations=0,
+            products=0,
+            residuals=(0.0,) if is_dark else (1.0,),
+            method=self.name,
         )
 
     def correct(self, S: Operator, r: Array, tolerance: float, maxiter: int) -> Correction:

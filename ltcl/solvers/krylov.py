@@ -93,7 +93,9 @@ class _CGIteration:
 
         # Without weights the kernel does not read them.
         is_weighted = weights is not None
-        on_device = self._upload_weights(weights) if is_weighted else r
+        on_device = r
+        if is_weighted:
+            on_device = self._upload_weights(weights)
         r_r_and_w_r = pair_codes("aa", "ba")
         dots = columns.bind(
             "vector_dots", 0, r_r_and_w_r, int(is_weighted), on_device, r, w, w, sums, across=2

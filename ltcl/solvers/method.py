@@ -64,7 +64,9 @@ class IterativeMethod(Method):
         if problem.exact is not None:
             return refine(self, problem, problem.exact)
         device = problem.S.device
-        start = None if problem.x0 is None else device.upload(problem.x0)
+        start = None
+        if problem.x0 is not None:
+            start = device.upload(problem.x0)
         result = self.run(
             problem.S,
             device.upload(problem.b),
@@ -123,14 +125,14 @@ class IterativeMethod(Method):
         norms, norms_of_right = vectors.norms(b, right)
         # Tolerances are relative to the whole of b, also where W keeps only a part of it.
         system = CountedOperator(S=space.operator, b=right, norms=norms, on_coefficients=True)
-        start = None if start is None else basis.apply(start)
+        if start is not None:
+            start = basis.apply(start)
         result = self._run(system, rule, start, norms_of_right, with_residual)
         residual = result.residual
-        return IterationResult(
-            x=space.to_pixels(result.x, right, b),
-            monitor=result.monitor,
-            residual=None if residual is None else basis.apply_transpose(residual),
-        )
+        if residual is not None:
+            residual = basis.apply_transpose(residual)
+        x = space.to_pixels(result.x, right, b)
+        return IterationResult(x=x, monitor=result.monitor, residual=residual)
 
     def _run(
         self,
@@ -154,6 +156,5 @@ class IterativeMethod(Method):
         if not monitor.check(x, r, norms[None]):
             self.iterate(system, x, r, monitor)
         has_residual = with_residual and monitor.status is Status.CONVERGED
-        return IterationResult(
-            x=monitor.result(x), monitor=monitor, residual=r if has_residual else None
-        )
+        residual = r if has_residual else None
+        return IterationResult(x=monitor.result(x), monitor=monitor, residual=residual)

@@ -18,7 +18,6 @@ Known limit: rows with sums above 3/4 and above the others, that walks seldom me
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -103,10 +102,9 @@ class MonteCarlo(Sampler):
                 raise InputError(
                     f"pixels is {pixels.shape} of {pixels.dtype}; it must be (P,) whole numbers"
                 )
-            lowest = int(pixels.min())
-            worst = lowest if lowest < 0 else int(pixels.max())
-            if not 0 <= worst < n:
-                raise InputError(f"pixels holds {worst}; they must be in 0..{n - 1}")
+            for extreme in (int(pixels.min()), int(pixels.max())):
+                if not 0 <= extreme < n:
+                    raise InputError(f"pixels holds {extreme}; they must be in 0..{n - 1}")
         if self.adjoint:
             checks.count("samples", self.sample_count, most=MAX_SAMPLES // n)
 
@@ -115,9 +113,11 @@ class MonteCarlo(Sampler):
         q = chance_to_go_on(step, self.albedo)
         if has_variance(step.radius, q):
             return ""
-        lengths = "" if self.albedo is None else f" with albedo={self.albedo:g}"
+        walks_over_R = "walks over R"
+        if self.albedo is not None:
+            walks_over_R += f" with albedo={self.albedo:g}"
         return (
-            f"walks over R{lengths} have no finite variance: the second moments of their weights "
+            f"{walks_over_R} have no finite variance: the second moments of their weights "
             f"grow by {step.radius:.3g} a step, which must be below {min(q, 1.0):.3g}"
         )
 
@@ -133,11 +133,12 @@ class MonteCarlo(Sampler):
         # (N, columns * channels)
         light = np.stack([channel.r for channel in channels], axis=-1).reshape(n, -1)
         square = _mean_square_after_first_step(step, lengths)
+        pixels = np.arange(n)
         if self.adjoint:
-            pixels = np.arange(n)
             estimates = self._estimate_from_b(walker, light, square)
         else:
-            pixels = np.arange(n) if self.pixels is None else np.asarray(self.pixels, np.int64)
+            if self.pixels is not None:
+                pixels = np.asarray(self.pixels, np.int64)
             estimates = self._estimate_in_stages(channels, walker, light, pixels, square)
 
         shape = (len(pixels), *columns, len(channels))
@@ -185,9 +186,15 @@ class MonteCarlo(Sampler):
         scores = np.sqrt(square[pixels][:, channel_of_column])
         unmet = UNMET_CHANCE**0.5 * scores * np.abs(light).max(axis=0)
         units = np.stack([np.broadcast_to(c.unit, columns) for c in channels], axis=-1)
-        target = (np.inf if self.error is None else self.error) / units.ravel()
         most = self.max_samples
-        first = most if self.error is None else min(FIRST_STAGE_SAMPLES, most)
+        if self.error is None:
+            # One stage, after which any error will do.
+            error = np.inf
+            first = most
+        else:
+            error = self.error
+            first = min(FIRST_STAGE_SAMPLES, most)
+        target = error / units.ravel()
         stages = _Stages(walker, light, pixels, unmet, target, first, most)
         return stages.run()
 
@@ -271,18 +278,26 @@ class _Stages:
     def run(self) -> PixelEstimates:
         """Take stages until no pixel needs another one."""
         active = np.arange(len(self.pixels))
-        for stage in itertools.count():
+        stage = 0
+        while True:
             self._sample(active, stage)
             error = np.hypot(self.spread, self.unmet / self.samples[:, None])
-            # A pixel ends after a stage whose samples its own spread has chosen, or without error.
-            limit = self.target if stage else 0.0
-            is_met = np.all(error <= limit, axis=1)
-            active = np.flatnonzero((self.samples < self.most) & ~is_met)
+            active = self._unmet_pixels(error, stage)
             if active.size == 0:
-                break
-            least = self.samples[active] * (2 if stage else 1)
+                return PixelEstimates(mean=self.mean, standard_error=error, samples=self.spent)
+            # The first stage tells the spread; each later one has to have more samples.
+            least = self.samples[active] if stage == 0 else 2 * self.samples[active]
             self.samples[active] = self._next_samples(active, least)
-        return PixelEstimates(mean=self.mean, standard_error=error, samples=self.spent)
+            stage += 1
+
+    def _unmet_pixels(self, error: np.ndarray, stage: int) -> np.ndarray:
+        """Return the pixels that need another stage.
+
+        After the first one these are all but those without error, since it chose no samples.
+        """
+        limit = self.target if stage else 0.0
+        is_met = np.all(error <= limit, axis=1)
+        return np.flatnonzero((self.samples < self.most) & ~is_met)
 
     def _sample(self, active: np.ndarray, stage: int) -> None:
         """Take the samples of one stage, together for all pixels that need as many."""

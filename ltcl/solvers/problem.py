@@ -119,7 +119,8 @@ class LinearProblem:
         >>> problem.b.tolist(), float(problem.unit)
         ([1.5, 0.5], 2.0)
         """
-        settings = SolveSettings() if settings is None else settings
+        if settings is None:
+            settings = SolveSettings()
         rows = check_square("S", S)[0]
         b, unit = scale_rhs(b, rows)
         if x0 is not None:
@@ -188,8 +189,9 @@ def scale_rhs(b: Any, rows: int) -> tuple[np.ndarray, np.ndarray]:
     largest = _largest_values(b)
     unit = np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
     stays_float32 = b.dtype == np.float32 and np.all(unit >= SMALLEST_NORMAL_FLOAT32)
-    divisor = unit.astype(np.float32) if stays_float32 else unit
-    return b / divisor, unit
+    if stays_float32:
+        return b / unit.astype(np.float32), unit
+    return b / unit, unit
 
 
 def unscale(x: np.ndarray, unit: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ on the host.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -46,10 +46,7 @@ class Correction:
 class Corrector(Protocol):
     """A method that computes the steps of a refinement."""
 
-    @property
-    def name(self) -> str:
-        """The name of the method."""
-        ...
+    name: ClassVar[str]
 
     def correct(self, S: Operator, r: Array, tolerance: float, maxiter: int) -> Correction:
         """Solve S d = r to a relative residual of `tolerance`."""

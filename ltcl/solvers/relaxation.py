@@ -97,7 +97,9 @@ class Southwell(IterativeMethod):
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends the solve."""
         n = x.shape[0]
-        rows = max(1, n // SOUTHWELL_STEPS) if self.rows is None else self.rows
+        rows = self.rows
+        if rows is None:
+            rows = max(1, n // SOUTHWELL_STEPS)
         rows = min(rows, n)
         steps = Steps(system.S, self.name, x, r, rows)
 

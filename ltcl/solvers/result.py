@@ -131,8 +131,8 @@ class Solution:
     def _advice(self) -> str:
         """Say why the solve ended and what else to try, never the method that has just failed."""
         cause = self.status.value
-        if self.status is Status.SAMPLED:
-            return self.reason if self.reason else cause
+        if self.status is Status.SAMPLED and self.reason:
+            return self.reason
         if self.least_rtol is not None:
             least = checks.upwards(self.least_rtol)
             return f"rounding may hide up to {least} of it; ask for no less"
@@ -155,12 +155,14 @@ def join_channels(channels: Sequence[Solution]) -> Solution:
         if channel.standard_error is not None:
             errors.append(channel.standard_error)
 
-    has_converged = all(channel.converged for channel in channels)
+    status = Status.SAMPLED
+    if all(channel.converged for channel in channels):
+        status = Status.CONVERGED
     residuals = np.max([channel.residuals for channel in channels], axis=0)
     return dataclasses.replace(
         channels[0],
         x=np.stack([channel.x for channel in channels]),
-        status=Status.CONVERGED if has_converged else Status.SAMPLED,
+        status=status,
         iterations=max(channel.iterations for channel in channels),
         products=sum(channel.products for channel in channels),
         residuals=tuple(residuals.tolist()),

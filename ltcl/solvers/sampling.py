@@ -83,15 +83,18 @@ class SampledChannel:
         norms = np.linalg.norm(self.b.astype(np.float64), axis=0)
         residual_norms = np.linalg.norm(self.residual(x).astype(np.float64), axis=0)
         residual = relative_residual(residual_norms, norms)
-        has_converged = met_error and residual <= self.rtol
+        status = Status.CONVERGED
+        if not (met_error and residual <= self.rtol):
+            status = Status.SAMPLED
+            reason = f"{reason}; {advice}"
         return Solution(
             x=x,
-            status=Status.CONVERGED if has_converged else Status.SAMPLED,
+            status=status,
             iterations=iterations,
             products=self.products,
             residuals=(1.0, residual),
             method=self.method,
-            reason=reason if has_converged else f"{reason}; {advice}",
+            reason=reason,
             # The residual of x, even if that is worse than the start.
             lowest=residual,
             standard_error=standard_error,
@@ -147,12 +150,10 @@ class Sampler(Method):
         solutions = []
         for problem, estimate in zip(problems, estimates, strict=True):
             error = estimate.standard_error
-            solution = dataclasses.replace(
-                estimate,
-                x=unscale(estimate.x, problem.unit),
-                standard_error=None if error is None else unscale(error, problem.unit),
-            )
-            solutions.append(solution)
+            if error is not None:
+                error = unscale(error, problem.unit)
+            x = unscale(estimate.x, problem.unit)
+            solutions.append(dataclasses.replace(estimate, x=x, standard_error=error))
         return solutions
 
     def _sample(self, channels: Channels, callback: Callback | None) -> list[Solution]:

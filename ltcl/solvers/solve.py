@@ -205,7 +205,9 @@ def solve_each(
         with_residual=with_residual,
     )
     chosen = choose_method(method, options)
-    exacts = exact if exact else [None] * len(systems)
+    exacts = list(exact)
+    if not exacts:
+        exacts = [None] * len(systems)
     has_exact = any(operator is not None for operator in exacts)
     if isinstance(chosen, Sampler) and len(systems) == 3 and not has_exact:
         return _solve_together(systems, np.stack(sides), chosen, settings, x0=x0)
@@ -222,7 +224,9 @@ def choose_method(name: str, options: dict[str, Any]) -> Method | None:
         owners = [owner for owner, names in OPTIONS.items() if option in names]
         if not owners:
             known = OPTIONS.get(name)
-            listed = ", ".join(known) if known else "none"
+            listed = "none"
+            if known:
+                listed = ", ".join(known)
             raise InputTypeError(f"unknown option {option!r}; method {name!r} has {listed}")
         if name not in owners:
             several = " or ".join(map(repr, owners))
@@ -276,7 +280,9 @@ def _solve_together(
     rows = shapes[0][0]
     _check_sampler(method, rows, exact)
     b = _check_three("b", b, rows)
-    starts = [None] * len(systems) if x0 is None else _check_three("x0", x0, rows)
+    starts: Any = [None] * len(systems)
+    if x0 is not None:
+        starts = _check_three("x0", x0, rows)
     problems = []
     with np.errstate(all="ignore"):
         for number, S in enumerate(systems):

@@ -100,7 +100,9 @@ class CountedOperator:
     @functools.cached_property
     def product_float64(self) -> precision.Product | None:
         """Products by S in float64; None if the host does not have its numbers."""
-        return None if self.on_coefficients else precision.product(self.S)
+        if self.on_coefficients:
+            return None
+        return precision.product(self.S)
 
     def residual(self, x: Any, r: Array) -> np.ndarray:
         """Compute r = b - S x by one product; return its norms (k,)."""
@@ -292,8 +294,11 @@ class Monitor:
             fastest = float(np.min(recent[1:] / recent[:-1]))
             factor = min(fastest, self.factor)
             goal = np.maximum(self._target, precision.EPS * self._scale)
+            # A factor of NaN tells nothing, either.
+            if not factor < 1.0:
+                return math.inf
             digits = np.log(np.max(self.norms / goal, initial=1.0))
-            return digits / -np.log(factor) if factor < 1.0 else math.inf
+            return digits / -np.log(factor)
 
     def _confirm(self, x: Any, r: Array, norms: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return norms (k,) of the newest residual, as exact as needed, and whether they solve the system."""
@@ -377,11 +382,14 @@ class Monitor:
     def _record(self, norms: np.ndarray) -> None:
         """Append the largest relative residual, and call the callback."""
         residual = float(np.max(norms / self._scale, initial=0.0))
-        previous = self.residuals[-1] if self.residuals else np.inf
+        has_risen = bool(self.residuals) and residual > self.residuals[-1]
         self.residuals.append(residual)
         if self.rule.callback is not None:
             self.rule.callback(self.iterations, residual)
-        self._rises = self._rises + 1 if residual > previous else 0
+        if has_risen:
+            self._rises += 1
+        else:
+            self._rises = 0
 
 
 def relative_residual(residual_norms: np.ndarray, norms: np.ndarray) -> float:
