@@ -24,6 +24,7 @@ from ltcl.solvers.bounded import round_inwards
 from ltcl.solvers.problem import scale_rhs, unscale
 from ltcl.solvers.result import Solution, Status
 from ltcl.transport import frames as layout
+from ltcl.transport.matrices import check_mixing
 
 _ARRAYS = ("grid", "first_bounce", "errors", "confidence")
 
@@ -80,7 +81,9 @@ class Inverse:
         F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce))
         F = np.atleast_2d(F.astype(np.float64))
         self._F = checks.shape("first_bounce", F, (channels, n))
-        self.mixing = None if mixing is None else layout.mixing(mixing, channels, None)
+        self.mixing = None
+        if mixing is not None:
+            self.mixing = check_mixing(mixing, channels, has_blocks=False)
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
 
     def __repr__(self) -> str:
