@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,10 +22,9 @@ import numpy as np
 
 from ltcl import theory
 from ltcl.device import Array, Device, tuning, vectors
-from ltcl.operators import IdentityPlus, Operator
-from ltcl.operators.rows import RowOperator
+from ltcl.operators import Operator
 from ltcl.solvers.krylov import CG, GMRES, KrylovSpace
-from ltcl.solvers.precision import Direct, factors
+from ltcl.solvers.precision import Direct
 from ltcl.solvers.stationary import Chebyshev, Jacobi, drawn_in
 from ltcl.solvers.stopping import Monitor, System
 
@@ -89,14 +87,10 @@ class Survey:
         return f"{self.defect:.2g} of R is not self-adjoint, {spectrum} by {len(self.residuals) - 1} products"
 
 
-_surveys: weakref.WeakKeyDictionary[Operator, Survey] = weakref.WeakKeyDictionary()
-_tried: weakref.WeakSet[Operator] = weakref.WeakSet()
-
-
 def survey(S: Operator) -> Survey:
     """The survey of S, made at the first call."""
-    if S in _surveys:
-        return _surveys[S]
+    if S.known.survey is not None:
+        return S.known.survey
     start = S.device.upload(np.random.default_rng(0).uniform(size=S.shape[0]))
     space, residuals, ended = (
         KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0])),
@@ -108,8 +102,8 @@ def survey(S: Operator) -> Survey:
         residuals.append(float(space.residuals[0]))
     ritz = space.ritz_values()
     spectrum = drawn_in(theory.free_bounds(S), S, ritz)
-    _surveys[S] = Survey(ritz, spectrum, tuple(residuals), _defect(S, space))
-    return _surveys[S]
+    S.known.survey = Survey(ritz, spectrum, tuple(residuals), _defect(S, space))
+    return S.known.survey
 
 
 def _defect(S: Operator, space: KrylovSpace) -> float:
@@ -173,17 +167,15 @@ def plan(
     free = _Candidate(Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
     if plain.products <= free.products:
         yield plain.method, f"{plain}, {free}; row sums of R are at most {rho:.2g}", 0
-    elif not (
-        refines or columns > _AT_ONCE or any(S in known for known in (_tried, _surveys, factors))
-    ):
-        _tried.add(S)
+    elif not (refines or columns > _AT_ONCE or _is_known(S)):
+        S.known.was_tried = True
         most = min(STEPS + int(free.products), GMRES.restart)
         yield (
             _Trial(most),
             f"gmres: at most {most} products, without a survey at the first solve",
             0,
         )
-    made_before = S in _surveys
+    made_before = S.known.survey is not None
     surveyed = survey(S)
     products = surveyed.krylov_products(rtol)
     candidates = [_candidate(S, columns, GMRES(), products)]
@@ -192,7 +184,7 @@ def plan(
             candidates.append(_candidate(S, columns, CG(), products + 1))  # which confirms its end
         products = theory.chebyshev_products(*surveyed.spectrum, rtol)
         candidates.append(_candidate(S, columns, Chebyshev(surveyed.spectrum), products))
-    if n <= LARGEST_DIRECT and isinstance(S.R if isinstance(S, IdentityPlus) else S, RowOperator):
+    if n <= LARGEST_DIRECT and S.has_entries:
         candidates.append(_candidate(S, columns, Direct()))
     bandwidth, flops = _bandwidth(S.device), _flops()
     candidates.sort(key=lambda candidate: candidate.seconds(bandwidth, flops))
@@ -204,6 +196,12 @@ def plan(
         yield GMRES(), "gmres: next, as it needs no bounds", 0
     if n <= LARGEST_DIRECT and not isinstance(first, Direct):
         yield Direct(), "direct: last, as products did not do", 0
+
+
+def _is_known(S: Operator) -> bool:
+    """Whether an earlier solve has tried S, surveyed or factorized it."""
+    known = S.known
+    return known.was_tried or known.survey is not None or known.factorization is not None
 
 
 _bandwidth = functools.cache(tuning.bandwidth)
@@ -223,7 +221,7 @@ def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _
     """What so many products need; or a dense factorization, where it is not there yet, and its use."""
     n = S.shape[0]
     if isinstance(method, Direct):
-        factorize = 0.0 if S in factors else 2.0 / 3.0 * n**3
+        factorize = 0.0 if S.known.factorization is not None else 2.0 / 3.0 * n**3
         nbytes = 16.0 * n * n  # both triangles, and S for the residual
         return _Candidate(method, 0, nbytes, 0.0, factorize + 4.0 * n * n * columns)
     moved, launches, waits = _STEPS[method.name]

@@ -19,14 +19,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import Array, Device, vectors
+from ltcl.device import Array, vectors
 from ltcl.errors import (
     ConvergenceError,
     InputError,
@@ -34,10 +33,11 @@ from ltcl.errors import (
     MemoryLimitError,
     ToleranceError,
 )
-from ltcl.operators import Compressed, Dense, IdentityPlus, Operator, as_operator
+from ltcl.operators import Operator
+from ltcl.operators.conversion import as_exact_operator
 from ltcl.solvers import auto, krylov, stationary
 from ltcl.solvers.monte_carlo import Channel, Hybrid, MonteCarlo, of_channel
-from ltcl.solvers.precision import Direct, is_small, product
+from ltcl.solvers.precision import Direct
 from ltcl.solvers.result import Solution, Status, joined
 from ltcl.solvers.stopping import CLAIM, Monitor, Rule, System, relative, scale_rhs, unscale
 
@@ -55,9 +55,6 @@ _LEAST, _MOST = (
     0.1,
 )  # of the tolerance of a step: many short steps waste products by S, long ones by S~
 _HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
-_on_coefficients: weakref.WeakKeyDictionary[IdentityPlus, IdentityPlus] = (
-    weakref.WeakKeyDictionary()
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,7 +302,7 @@ def _validate(
         norms = np.atleast_1d(np.linalg.norm(b.astype(np.float64), axis=0))
         lit = norms > 0.0
         required = float(np.min(rule.target(norms)[lit] / norms[lit], initial=np.inf))
-    A = S if isinstance(S, Operator) else _operator(S)
+    A = S if isinstance(S, Operator) else as_exact_operator(S)
     if exact is not None:
         exact = _exact_operator(exact, A)
     elif required < A.solution_error:  # says less about the solution than S itself
@@ -320,19 +317,11 @@ def _validate(
     return _Problem(A, b, x0, rule, unit, required, chosen, exact, with_residual)
 
 
-def _operator(S: Any, device: Device | None = None) -> Operator:
-    """`as_operator`, which remembers the numbers of an array as they were before they became float32."""
-    A = as_operator(S, device)
-    if isinstance(A, Dense) and A is not S:
-        A.exact = np.asarray(S), np.ones(A.shape[1]), np.zeros(A.shape[0])
-    return A
-
-
 def _exact_operator(exact: Any, S: Operator) -> Operator:
     """`exact` on the device of S, checked."""
     if (shape := _shape("exact", exact)) != S.shape:
         raise InputError(f"exact has shape {shape}; it must be that of S, {S.shape}")
-    E = _operator(exact, S.device)
+    E = as_exact_operator(exact, S.device)
     if E.device is not S.device:
         raise InputError(f"exact is on another device, {E.device}; it must be on {S.device}")
     return E
@@ -358,7 +347,7 @@ def _automatic(problem: _Problem) -> Solution:
     products, S = 0, problem.S
     target = min(problem.required, 0.5)
     if problem.exact is None and target < auto.PRECISE and S.shape[0] > auto.SMALL:
-        if product(S) is not None:
+        if S.product_float64() is not None:
             problem = dataclasses.replace(problem, exact=S)
             reasons.append(
                 f"refined in float64, since rtol={target:g} is below what float32 products reach"
@@ -432,20 +421,9 @@ def _iterate(
     """
     W, right = None, b
     weighted = isinstance(method, krylov.CG) and method.inner(S) is not None
-    if (
-        isinstance(S, IdentityPlus)
-        and isinstance(S.R, Compressed)
-        and S.R.two_sided
-        and not weighted
-    ):
-        W, core = S.R.into, S.R.core
-        if S not in _on_coefficients:  # what is learnt of it serves all solves
-            inside = _on_coefficients[S] = IdentityPlus(core, S.sign)
-            inside.weights, inside._row_sums = (
-                S.weights,
-                S.row_sums(),
-            )  # in pixels these bound the spectrum
-        S = _on_coefficients[S]
+    between = None if weighted else S.on_coefficients()
+    if between is not None:
+        S, W = between
     if W is None:
         norms = vectors.norms(b)
     else:
@@ -475,7 +453,7 @@ def _refine(method: Any, problem: _Problem, exact: Operator) -> tuple[np.ndarray
     S, b, rule = problem.S, problem.b, problem.rule
     right = S.device.upload(b)
     system = System(exact, right, vectors.norm(right), b)
-    system.fine = (is_small(exact) or problem.required < _FLOAT32) and system.times is not None
+    system.fine = (exact.has_cheap_float64_product or problem.required < _FLOAT32) and system.times is not None
     x, r, norms = np.zeros(b.shape), right.copy(), system.norms
     if problem.x0 is not None:
         x = problem.x0.astype(np.float64)

@@ -8,10 +8,8 @@ needed.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,10 +19,9 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles
+from ltcl.operators import Operator
 from ltcl.solvers import precision
 from ltcl.solvers.result import Status
-from ltcl.theory import row_sum_range
 
 SLOTS = 8  # steps between two readings, at most
 
@@ -41,9 +38,6 @@ CLAIM = 1.01  # times the tolerance: what a residual may reach with what roundin
 _REFUSALS = 3  # claims in a row that could not be confirmed, none better than those before
 _BETTER = 0.99  # times a residual: less of it is progress
 _MOST, _NORMAL = float(np.finfo(np.float32).max), 2.0**-126  # of float32
-_LARGEST = 1e18  # Frobenius norm whose square stays in float32
-_LEAST = 2.0**-63  # entries of S below have squares that are 0 on the device
-_norms: weakref.WeakKeyDictionary[Operator, float] = weakref.WeakKeyDictionary()
 
 
 @dataclass(eq=False)
@@ -67,7 +61,7 @@ class System:
     @functools.cached_property
     def times(self) -> precision.Product | None:
         """Products by S in float64, None where its numbers are not at hand on the host."""
-        return None if self.on_coefficients else precision.product(self.S)
+        return None if self.on_coefficients else self.S.product_float64()
 
     def residual(self, x: Any, r: Array) -> np.ndarray:
         """r = b - S x, and its norms (k,)."""
@@ -226,7 +220,7 @@ class Monitor:
             return norms, False
         if system.fine or self._is_proven(x, norms):
             return norms, bool(seems_solved)
-        at_hand = precision.is_small(system.S) and system.times is not None
+        at_hand = system.S.has_cheap_float64_product and system.times is not None
         if self._steps and not (at_hand and seems_solved and np.all(np.isfinite(self._travelled))):
             self._steps, self._travelled = 0, 0.0
             norms = system.residual(x, r)
@@ -248,7 +242,7 @@ class Monitor:
         """Whether norms are within the tolerance with all that rounding may hide of the residual of x."""
         if not np.all(norms <= self._target):
             return False
-        norm, is_bound = norm_bound(self.system.S)
+        norm, is_bound = self.system.S.norm_bound()
         if self._steps and not is_bound:
             return False
         size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
@@ -319,28 +313,3 @@ def unscale(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
 def relative(residuals: np.ndarray, norms: np.ndarray) -> float:
     """The largest residual relative to its right-hand side; absolute of a dark one."""
     return float(np.max(residuals / np.where(norms > 0.0, norms, 1.0), initial=0.0))
-
-
-def norm_bound(S: Operator) -> tuple[float, bool]:
-    """A bound on the 2-norm of |S|, entry by entry, and whether it is one, computed once in the life of S.
-
-    The Frobenius norm of the numbers, between isometric bases that of the core; of other operators
-    the largest row sum, a bound of symmetric S >= 0, an estimate else.
-    """
-    if isinstance(S, IdentityPlus):
-        norm, is_bound = norm_bound(S.R)
-        return 1.0 + norm, is_bound
-    if isinstance(S, Compressed) and all(W is None or W.isometric for W in (S.out, S.into)):
-        return norm_bound(S.core)
-    if not isinstance(S, Tiles | CSR | Dense):
-        least, _, most = row_sum_range(S)
-        return max(1.0, most, -least), False
-    if S not in _norms:
-        if isinstance(S, Tiles):
-            norm = S.frobenius
-        else:
-            values = [slab.arguments[-1] for slab in S.slabs if slab.arguments[-1].size]
-            flat = [dataclasses.replace(array, shape=(array.size,)) for array in values]
-            norm = math.sqrt(math.fsum(float(vectors.dot(array, array)[0]) for array in flat))
-        _norms[S] = 1.01 * norm + _LEAST * max(S.shape) if norm < _LARGEST else math.inf
-    return _norms[S], True
