@@ -112,7 +112,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
 
     @property
     def has_entries(self) -> bool:
-        """Whether its entries lie on one device, in rows."""
+        """True if its entries lie on one device, in rows."""
         return False
 
     def on_coefficients(self) -> tuple[Operator, Basis] | None:
@@ -269,7 +269,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
 
     @property
     def has_cheap_float64_product(self) -> bool:
-        """Whether a float64 product on the host takes no longer than a few waits, if there is one."""
+        """True if a float64 product on the host takes no longer than a few waits, if there is one."""
         return self.nbytes + self.bytes_read() <= CHEAP_PRODUCT_BYTES
 
     def product_float64(self) -> Product | None:

@@ -79,7 +79,7 @@ class Compressed(Operator):
 
     @property
     def _keeps_norms(self) -> bool:
-        """Whether the norms of R are those of its core."""
+        """True if the norms of R are those of its core."""
         return all(W is None or W.isometric for W in (self.out, self.into))
 
     def diagonal(self) -> np.ndarray:

@@ -79,7 +79,7 @@ class Pattern:
         return slabs
 
     def matches(self, matrix: Any) -> bool:
-        """Whether `matrix` has its nonzeros in the same places, as far as the host can tell."""
+        """True if `matrix` has its nonzeros in the same places, as far as the host can tell."""
         if self.indices is None or self.shape != matrix.shape or len(self.indices) != matrix.nnz:
             return False
         if not np.array_equal(self.indptr, matrix.indptr):

@@ -73,7 +73,7 @@ class IdentityPlus(Operator):
 
     @property
     def has_entries(self) -> bool:
-        """Whether the entries of R lie on one device, in rows."""
+        """True if the entries of R lie on one device, in rows."""
         return self.R.has_entries
 
     def as_it_stands(self) -> IdentityPlus:

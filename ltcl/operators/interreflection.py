@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From a measured T and its first bounce F to S = T F^-1 = I + R on a device (eq. 3 and 6)."""
+"""The interreflection S = T F^-1 = I + R from a measured T and its first bounce F (eq. 3 and 6)."""
 
 from __future__ import annotations
 
@@ -81,13 +81,13 @@ def underlying_system(matrix: Any) -> IdentityPlus | None:
 
 
 def _has_entries(matrix: Any) -> bool:
-    """Whether it is an array, a sparse matrix or a store."""
+    """True if it is an array, a sparse matrix or a store."""
     is_matrix = isinstance(matrix, (np.ndarray, scipy.sparse.csr_array))
     return is_matrix or hasattr(matrix, "row_blocks")
 
 
 def can_mask_pixels(matrix: Any) -> bool:
-    """Whether pixels may be dropped from it, which a LinearOperator would keep in its products."""
+    """True if pixels may be dropped from it, which a LinearOperator would keep in its products."""
     return _has_entries(matrix) or underlying_system(matrix) is not None
 
 

@@ -110,7 +110,7 @@ class Streamed(Parts, ReadableRows):
 
 
 def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
-    """Whether all `matrices` are on a disk, and their R in float32 would not fit device or host."""
+    """True if all `matrices` are on a disk, and their R in float32 would not fit device or host."""
     for matrix in matrices:
         is_mapped = isinstance(underlying_array(check_mapped_file(matrix)), np.memmap)
         if not is_mapped and not hasattr(matrix, "row_blocks"):

@@ -168,7 +168,7 @@ def _norms_of_changes(matrix: Any, changes: np.ndarray) -> tuple[float, float]:
 
 
 def _tile_leads(matrix: Any, width: int) -> np.ndarray:
-    """Which nonzeros open a tile, (nnz,) bool."""
+    """True for each nonzero that opens a tile, (nnz,) bool."""
     counts = np.diff(matrix.indptr)
     # Rows one behind the other, too far apart for a tile to reach the next.
     row_starts = np.arange(len(counts)) * (matrix.shape[1] + width)
@@ -278,7 +278,7 @@ def check_packed(packed: Packed, width: int) -> None:
 
 
 def _are_pointers(pointers: np.ndarray, rows: int, tiles: int) -> bool:
-    """Whether they are (rows + 1,) int64 from 0 to `tiles`, ascending."""
+    """True if they are (rows + 1,) int64 from 0 to `tiles`, ascending."""
     if pointers.dtype != np.int64 or pointers.shape != (rows + 1,):
         return False
     reaches_all = pointers[0] == 0 and pointers[-1] == tiles

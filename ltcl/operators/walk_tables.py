@@ -138,7 +138,7 @@ class Linked(Tables):
         checks.fits_host("tables of walks that channels share", LINKED_BYTES_PER_ENTRY * largest)
         channels: list[Any] = []
         for R in Rs:
-            matrix = scipy.sparse.csr_array(R.matrix()).astype(np.float64)
+            matrix: Any = scipy.sparse.csr_array(R.matrix()).astype(np.float64)
             matrix.eliminate_zeros()
             channels.append(matrix)
         P = _mean_squares(channels)
@@ -174,7 +174,7 @@ class Linked(Tables):
         return links
 
     def second_moments(self, R: CSR | Dense) -> list[Operator]:
-        """Of each channel R_ij^2 / p(j | i), (N, N); R is not looked at."""
+        """The same for each channel of the links, (N, N); R is not looked at."""
         assert self.links is not None  # noqa: S101 - made with the tables
         bits = self.links.get().T[1 : 1 + self.channels]
         moments: list[Operator] = []
@@ -185,8 +185,8 @@ class Linked(Tables):
         return moments
 
 
-def _mean_squares(channels: Sequence[Any]) -> scipy.sparse.csr_array:
-    """The sum over channels of (R_cij / |R_ci|)^2, (N, N)."""
+def _mean_squares(channels: Sequence[Any]) -> Any:
+    """The sum over channels of (R_cij / |R_ci|)^2, a csr_array (N, N)."""
     squares: Any = 0
     for R in channels:
         row_sums = abs(R).sum(axis=1)
