@@ -34,8 +34,9 @@ from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
 from ltcl.tasks.compensation import compensate, problem
 from ltcl.tasks.report import versions
+from ltcl.tasks.requirements import error_note, resolve_reference
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import Transport, error_note, require, resolve_reference
+from ltcl.transport.transport import Transport, check_transport
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -221,7 +222,7 @@ def _validate(
     T: Transport, gain: Any, loss: Any, functions: dict[str, Any], options: dict[str, Any]
 ) -> tuple[float, float]:
     """The bounds; refuses what `compensate` would, and pictures that are not for all frames."""
-    require(T, square=False)
+    check_transport(T, square=False)
     resolve_reference(T, options.get("exact"))
     problem.gain(gain, loss)
     for name, value in functions.items():

@@ -117,8 +117,13 @@ def _first_bounce(record: Record) -> np.ndarray | None:
     F = np.stack([T.diagonal() for T in matrices]) if F is None else F
     F, grid = np.atleast_2d(checks.finite("first_bounce", F)), record.grid or (1, columns)
     noise = lambda: record.noise or estimate(matrices, grid, record.camera_grid or grid)  # noqa: E731
-    dark = first_bounce.dark(matrices, first_bounce.DARK, noise, record.noise is not None, F)
-    return np.where(dark, 0.0, F)
+    rule = first_bounce.DarkRule(
+        matrices=matrices,
+        threshold=first_bounce.DARK_THRESHOLD,
+        noise=noise,
+        is_measured=record.noise is not None,
+    )
+    return np.where(rule.find_dark(F), 0.0, F)
 
 
 def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:

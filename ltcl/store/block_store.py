@@ -497,7 +497,7 @@ def _write_finished(
             start, stop = layout.span(number)
             V = variance if sigmas > 0 and variance is not None else np.zeros(T.nnz)
             V = scipy.sparse.csr_array((V, T.indices, T.indptr), shape=T.shape).diagonal(start)
-            F[channel, start:stop] = first_bounce.certain(T.diagonal(start), V, sigmas)
+            F[channel, start:stop] = first_bounce.drop_uncertain(T.diagonal(start), V, sigmas)
     if layout.kind == "blocks" and is_square:
         extras = {"first_bounce": F, **extras}
     for name, array in extras.items():

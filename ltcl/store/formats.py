@@ -33,8 +33,8 @@ from ltcl.files import (
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
-from ltcl.transport.first_bounce import DARK
-from ltcl.transport.transport import Transport, from_arrays, require, to_arrays
+from ltcl.transport.first_bounce import DARK_THRESHOLD
+from ltcl.transport.transport import Transport, check_transport
 
 COMPRESSED, INVERSE, RGB = "ltcl-compressed-1", "ltcl-inverse-1", "ltcl-rgb-csr-1"
 _INDICES = ("indices", "indptr", "row", "col", "coords", "offsets")
@@ -48,7 +48,7 @@ def load(
     camera_grid: tuple[int, int] | None = None,
     first_bounce: str | np.ndarray | None = None,
     on_dark: str = "mask",
-    dark: float = DARK,
+    dark_threshold: float = DARK_THRESHOLD,
     device: Any = None,
     noise: Any = None,
 ) -> Transport:
@@ -65,7 +65,7 @@ def load(
     grid, camera_grid
         (h, w) of projector and camera; needed where they are not in the file, and preferred to its
         own.
-    first_bounce, on_dark, dark, device, noise
+    first_bounce, on_dark, dark_threshold, device, noise
         As in `Transport`; None takes what is in the file, or else the diagonal, and noise is
         estimated.
 
@@ -82,7 +82,11 @@ def load(
     >>> ltcl.load(path, grid=(2, 3)).shape
     (6, 6)
     """
-    options: dict[str, Any] = {"first_bounce": first_bounce, "on_dark": on_dark, "dark": dark}
+    options: dict[str, Any] = {
+        "first_bounce": first_bounce,
+        "on_dark": on_dark,
+        "dark_threshold": dark_threshold,
+    }
     again = options | {
         "variable": variable,
         "grid": grid,
@@ -94,7 +98,7 @@ def load(
         if isinstance(content, Parts):
             if content.format == INVERSE:
                 raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
-            T = from_arrays(content.arrays, grid=grid or camera_grid, **options)
+            T = Transport.from_arrays(content.arrays, grid=grid or camera_grid, **options)
         else:
             M, N = content.shape
             grid = _grid("grid", grid or content.grid, N, "projector")
@@ -139,12 +143,12 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     >>> ltcl.load(path).grid
     (2, 3)
     """
-    if require(T, square=False).blocks is not None:
+    if check_transport(T, square=False).blocks is not None:
         raise InputTypeError(
             "T has 3 x 3 blocks between colours; only one matrix or three can be saved"
         )
     if not any(isinstance(M, Matrix) for M in T.matrices):
-        return write(path, Parts(to_arrays(T)))
+        return write(path, Parts(T.to_arrays()))
     matrices = [
         record.floats("T", check_mapped_file(M)) if isinstance(M, np.ndarray) else M
         for M in T.matrices

@@ -21,7 +21,7 @@ import scipy.sparse.linalg
 from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError, MemoryLimitError
 from ltcl.files import read_ahead
-from ltcl.transport import frames as layout
+from ltcl.transport.matrices import check_mixing
 from ltcl.transport.noise import Noise
 
 EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
@@ -189,7 +189,7 @@ class Record:
         if self.first_bounce is not None:
             checks.shape("first_bounce", self.first_bounce, (self.shape[1],), (3, self.shape[1]))
         if self.mixing is not None:
-            layout.mixing(self.mixing, len(self.matrices), None)
+            check_mixing(self.mixing, len(self.matrices), has_blocks=False)
 
     shape = property(
         lambda self: self.matrices[0].shape, doc="(M, N): camera pixels, projector pixels."
@@ -288,7 +288,7 @@ class Parts:
             if array.dtype.kind == "f" and not name.endswith(_MAYBE_INFINITE):
                 checks.finite(f"array {name!r}", array)
         if self.mixing is not None:
-            layout.mixing(self.mixing, len(F), None)
+            check_mixing(self.mixing, len(F), has_blocks=False)
 
     grid = property(
         lambda self: tuple(self.arrays["grid"].tolist()), doc="(h, w) of projector and camera."

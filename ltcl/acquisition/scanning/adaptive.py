@@ -224,7 +224,7 @@ def arrays(
     )
     result: dict[str, Any] = {
         "grid": cells.grid,
-        "first_bounce": first_bounce.certain(own, noise, sigmas),
+        "first_bounce": first_bounce.drop_uncertain(own, noise, sigmas),
     }
     result |= {"basis_0.name": "pyramid", "basis_0.grid": cells.grid}
     result |= {} if mixing is None else {"mixing": mixing}
