@@ -71,11 +71,12 @@ class Basis(Operator):
         return {"name": np.array(self.name), "grid": np.array(self.grid)}
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        a, b, y, c = epilogue.without_shift(x)
+        epilogue = epilogue.without_shift(x)
         if out.size:
-            self._transform(x, out, a, b, x if y is None else y, transpose)
-        if c:
-            vectors.axpy(c, x, out)
+            y = epilogue.operand(x)
+            self._transform(x, out, epilogue.a, epilogue.b, y, transpose)
+        if epilogue.c:
+            vectors.axpy(epilogue.c, x, out)
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
         """A kernel for k right-hand sides, and the number of pieces in which it takes them."""
@@ -84,11 +85,12 @@ class Basis(Operator):
         return kernel, -(-k // lanes)
 
 
-def launch_grid(kernel: Kernel, pieces: int, rows: int, columns: int, *arguments: Any) -> None:
+def launch_grid(kernel: Kernel, pieces: int, grid: tuple[int, int], **arguments: Any) -> None:
     """Queue a kernel that strides through rows and columns.
 
-    A CPU has an item for each row, a GPU one for each place.
+    A CPU has an item for each row of `grid`, a GPU one for each place.
     """
+    rows, columns = grid
     if kernel.device.is_cpu:
         across = 1
         group = 1
@@ -96,13 +98,13 @@ def launch_grid(kernel: Kernel, pieces: int, rows: int, columns: int, *arguments
         across = min(columns, MAX_STRIDING_ITEMS)
         group = GROUP_ITEMS
     items = (pieces, across, min(rows, MAX_STRIDING_ITEMS))
-    kernel(items, (1, group, 1), *arguments)
+    kernel(items, (1, group, 1), **arguments)
 
 
-def launch_group(kernel: Kernel, pieces: int, *arguments: Any) -> None:
+def launch_group(kernel: Kernel, pieces: int, **arguments: Any) -> None:
     """Queue a kernel of which one group does all: one item on a CPU, up to 16 x 16 on a GPU."""
     group = (1, 1, 1) if kernel.device.is_cpu else kernel.group((1, 16, 16))
-    kernel((pieces, *group[1:]), group, *arguments)
+    kernel((pieces, *group[1:]), group, **arguments)
 
 
 class SubsetBasis(Basis):
@@ -134,12 +136,12 @@ class SubsetBasis(Basis):
             raise InputError(
                 f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}"
             )
-        self.places = _check_places(places, h * w if of is None else of.shape[0])
+        self.places = _check_places(places, _count_coefficients((h, w), of))
         if isinstance(of, SubsetBasis):
             self.places = of.places[self.places]
             of = of.of
         self.of = of
-        count = h * w if of is None else of.shape[0]
+        count = _count_coefficients((h, w), of)
         inverse = np.full(count, -1)
         inverse[self.places] = np.arange(len(self.places))
         self._order = device.upload(self.places, np.int32)
@@ -176,7 +178,25 @@ class SubsetBasis(Basis):
         order = self._inverse_order if transpose else self._order
         kernel, pieces = self._kernel("ordered", "gather", x.columns)
         items = (pieces, min(order.size, MAX_STRIDING_ITEMS))
-        kernel(items, (1, GROUP_ITEMS), order.size, x.columns, a, b, order, x, y, out)
+        kernel(
+            items,
+            (1, GROUP_ITEMS),
+            rows=order.size,
+            k=x.columns,
+            a=a,
+            b=b,
+            order=order,
+            x=x,
+            y=y,
+            out=out,
+        )
+
+
+def _count_coefficients(grid: tuple[int, int], of: Basis | None) -> int:
+    """The pixels of a grid, or the coefficients of W."""
+    if of is None:
+        return grid[0] * grid[1]
+    return of.shape[0]
 
 
 def _check_places(places: Any, count: int) -> np.ndarray:

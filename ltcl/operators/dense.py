@@ -119,24 +119,23 @@ class Dense(RowOperator):
         else:
             group = 1
             chunks = 1
-        a, b, y, c = epilogue
         sums = out if chunks == 1 else self.device.empty((chunks, *out.shape))
         for offset, width in widths(x.columns):
             kernel = self.kernel("dense_rmatvec", width, x.columns)
             kernel(
                 (items, chunks),
                 (group, 1),
-                slab.rows,
-                slab.first,
-                x.columns,
-                offset,
-                a,
-                b,
-                c,
-                x,
-                out if y is None else y,
-                sums,
-                *slab.arguments.values(),
+                rows=slab.rows,
+                first=slab.first,
+                stride=x.columns,
+                offset=offset,
+                a=epilogue.a,
+                b=epilogue.b,
+                c=epilogue.c,
+                x=x,
+                y=epilogue.operand(out),
+                out=sums,
+                **slab.arguments,
             )
         if chunks > 1:
             self._queue_chunk_sum(sums, chunks, out)
@@ -149,16 +148,16 @@ class Dense(RowOperator):
         kernel(
             (out.size, 1),
             (64, 1),
-            chunks,
-            0,
-            1,
-            0,
-            1.0,
-            0.0,
-            0.0,
-            self._ones,
-            out,
-            out,
-            out.size,
-            sums,
+            rows=chunks,
+            first=0,
+            stride=1,
+            offset=0,
+            a=1.0,
+            b=0.0,
+            c=0.0,
+            x=self._ones,
+            y=out,
+            out=out,
+            width=out.size,
+            matrix=sums,
         )

@@ -25,6 +25,10 @@ class Epilogue(NamedTuple):
             return Epilogue(a=self.a, b=self.c, y=x)
         return self
 
+    def operand(self, unread: Array) -> Array:
+        """y, or an array that stands for it: kernels take one also where b is 0."""
+        return unread if self.y is None else self.y
+
     def added_to(self, out: Array) -> Epilogue:
         """The epilogue of a product that is added to what `out` already holds."""
         return Epilogue(a=self.a, b=1.0, y=out)

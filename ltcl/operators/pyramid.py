@@ -64,9 +64,19 @@ class Pyramid(Basis):
         """Queue the transpose: of each pixel, the sum of the cells that it lies in."""
         kernel, pieces = self._kernel("pyramid", "spread", x.columns)
         height, width = self.grid
-        levels = len(self.cells)
         launch_grid(
-            kernel, pieces, height, width, height, width, levels, x.columns, a, b, x, y, out
+            kernel,
+            pieces,
+            self.grid,
+            height=height,
+            width=width,
+            levels=len(self.cells),
+            k=x.columns,
+            a=a,
+            b=b,
+            x=x,
+            y=y,
+            out=out,
         )
 
     def _gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
@@ -74,26 +84,20 @@ class Pyramid(Basis):
         kernel, pieces = self._kernel("pyramid", "gather", x.columns)
         height, width = self.grid
         levels = len(self.cells)
-        # Wide loads reach a spare cell behind each level.
-        sums = self.device.empty((self.shape[0] + levels) * x.columns)
+        arguments = {
+            "height": height,
+            "width": width,
+            "k": x.columns,
+            "a": a,
+            "b": b,
+            "x": x,
+            # Wide loads reach a spare cell behind each level.
+            "sums": self.device.empty((self.shape[0] + levels) * x.columns),
+            "y": y,
+            "out": out,
+        }
         large = sum(rows * columns > SMALL_LEVEL_PIXELS for rows, columns in self.cells)
         for level in range(large):
-            rows, columns = self.cells[level]
-            launch_grid(
-                kernel,
-                pieces,
-                rows,
-                columns,
-                height,
-                width,
-                level,
-                level + 1,
-                x.columns,
-                a,
-                b,
-                x,
-                sums,
-                y,
-                out,
-            )
-        launch_group(kernel, pieces, height, width, large, levels, x.columns, a, b, x, sums, y, out)
+            cells = self.cells[level]
+            launch_grid(kernel, pieces, cells, first_level=level, end_level=level + 1, **arguments)
+        launch_group(kernel, pieces, first_level=large, end_level=levels, **arguments)

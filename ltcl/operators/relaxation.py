@@ -298,48 +298,52 @@ class Sweeps:
                 slabs.append((number, begin, end))
         return slabs
 
-    def _arguments(self, number: int, begin: int, end: int, start: int, offset: int) -> list[Any]:
+    def _arguments(
+        self, number: int, begin: int, end: int, start: int, offset: int
+    ) -> dict[str, Any]:
         """The arguments that both kernels share, for some rows of a slab."""
         relaxation = self.relaxation
         slab = relaxation.slabs[number]
         windows = relaxation.windows[number]
-        return [
-            begin,
-            end,
-            slab.first,
-            start,
-            self.x.columns,
-            offset,
-            relaxation.shift,
-            relaxation.scale,
-            *_entries(slab, windows).values(),
-            windows,
-            self.x,
-            self.b,
-            self.s,
-            self.r,
-            self.carry,
-        ]
+        return {
+            "begin": begin,
+            "end": end,
+            "first": slab.first,
+            "panel_start": start,
+            "stride": self.x.columns,
+            "offset": offset,
+            "shift": relaxation.shift,
+            "scale": relaxation.scale,
+            "windows": windows,
+            "x": self.x,
+            "b": self.b,
+            "s": self.s,
+            "r": self.r,
+            "carry": self.carry,
+            **_entries(slab, windows),
+        }
 
     def _queue_strips(self, start: int, offset: int, defines: dict[str, int]) -> None:
         """Queue a panel of many blocks on a CPU: a work-item takes a block of rows, a strip."""
         relaxation = self.relaxation
         kernel = relaxation.kernel("relax_strips", **defines)
         block = relaxation.block
+        omega = 1.0 if relaxation.omega is None else relaxation.omega
+        (weights,) = relaxation.weights
         for number, begin, end in self._panel_slabs(start):
             strips = -(-end // block) - begin // block
             kernel(
                 strips,
                 1,
-                *self._arguments(number, begin, end, start, offset),
-                strips,
-                self.x.shape[0],
-                block,
-                int(relaxation.inverses),
-                1.0 if relaxation.omega is None else relaxation.omega,
-                *relaxation.weights,
-                self._arrivals,
-                self.before,
+                strips=strips,
+                n=self.x.shape[0],
+                block=block,
+                by_inverses=int(relaxation.inverses),
+                omega=omega,
+                weights=weights,
+                arrivals=self._arrivals,
+                before=self.before,
+                **self._arguments(number, begin, end, start, offset),
             )
 
     def _queue_block(self, start: int, offset: int, defines: dict[str, int]) -> None:
@@ -351,24 +355,24 @@ class Sweeps:
         local = self.x.device.local(2 * defines["K"] * group)
         for number, begin, end in self._panel_slabs(start):
             arguments = self._arguments(number, begin, end, start, offset)
-            sums((end - begin) * group, group, *arguments, local)
+            sums((end - begin) * group, group, scratch=local, **arguments)
         rows = min(relaxation.block, self.x.shape[0] - start)
         correct(
             rows * group,
             group,
-            rows,
-            0,
-            self.x.columns,
-            start * self.x.columns + offset,
-            1.0,
-            1.0,
-            0.0,
-            self.s,
-            self.x,
-            self.x,
-            rows,
-            relaxation.weights[start // relaxation.block],
-            local,
+            rows=rows,
+            first=0,
+            stride=self.x.columns,
+            offset=start * self.x.columns + offset,
+            a=1.0,
+            b=1.0,
+            c=0.0,
+            x=self.s,
+            y=self.x,
+            out=self.x,
+            width=rows,
+            matrix=relaxation.weights[start // relaxation.block],
+            scratch=local,
         )
 
 
@@ -406,27 +410,31 @@ class Steps:
         kernel = _kernel(self.x.device, "southwell", "southwell_step", is_dense)
         group = kernel.group(self.group)
         groups = min(self.groups, self.parts)
+        picked, delta = self._picked
+        next_picked, next_delta = self._next
         for slab in self._slabs:
             is_last = slab is self._slabs[-1]
             kernel(
                 (groups * group, k),
                 (group, 1),
-                n,
-                self.parts,
-                self._pending,
-                int(picks and is_last),
-                k,
-                self.rows.shift,
-                self.rows.scale,
-                slab.rows,
-                slab.first,
-                *_entries(slab, self._inverse).values(),
-                self._inverse,
-                self.x,
-                self.r,
-                *self._picked,
-                *self._next,
-                self.x.device.local(group),
+                n=n,
+                parts=self.parts,
+                pending=self._pending,
+                picks=int(picks and is_last),
+                k=k,
+                shift=self.rows.shift,
+                scale=self.rows.scale,
+                rows=slab.rows,
+                first=slab.first,
+                inverse=self._inverse,
+                x=self.x,
+                r=self.r,
+                picked=picked,
+                delta=delta,
+                next_picked=next_picked,
+                next_delta=next_delta,
+                places=self.x.device.local(group),
+                **_entries(slab, self._inverse),
             )
         self._picked, self._next = self._next, self._picked
         self._pending = self.parts if picks else 0

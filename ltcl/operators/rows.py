@@ -271,22 +271,21 @@ class RowOperator(ReadableRows):
         offset, width = piece
         kernel = self.kernel(f"{self.file}_matvec{variant.suffix}", width, x.columns)
         items, group, local = variant.shape(kernel, slab.rows, width)
-        a, b, y, c = epilogue
         return kernel.bind(
             items,
             group,
-            slab.rows,
-            slab.first,
-            x.columns,
-            offset,
-            a * self.unit,
-            b,
-            c,
-            x,
-            out if y is None else y,
-            out,
-            *slab.arguments.values(),
-            local,
+            rows=slab.rows,
+            first=slab.first,
+            stride=x.columns,
+            offset=offset,
+            a=epilogue.a * self.unit,
+            b=epilogue.b,
+            c=epilogue.c,
+            x=x,
+            y=epilogue.operand(out),
+            out=out,
+            scratch=local,
+            **slab.arguments,
         )
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
@@ -416,22 +415,22 @@ class RowStepper(Stepper):
             launch = piece.kernel.bind(
                 piece.items,
                 piece.group,
-                piece.slab.rows,
-                piece.slab.first,
-                self.x.columns,
-                piece.offset,
-                self._a,
-                self._c,
-                0.0,
-                0.0,
-                piece.first_group,
-                d,
-                self.x,
-                self.r,
-                next_d,
-                self._partials,
-                *piece.slab.arguments.values(),
-                piece.local,
+                rows=piece.slab.rows,
+                first=piece.slab.first,
+                stride=self.x.columns,
+                offset=piece.offset,
+                a=self._a,
+                c=self._c,
+                keep=0.0,
+                gain=0.0,
+                first_group=piece.first_group,
+                x=d,
+                iterate=self.x,
+                r=self.r,
+                next_x=next_d,
+                partials=self._partials,
+                scratch=piece.local,
+                **piece.slab.arguments,
             )
             turn.append((launch, piece.first_group))
         return turn
@@ -439,9 +438,8 @@ class RowStepper(Stepper):
     def step(self, keep: float, gain: float) -> None:
         """Queue one step; see `Stepper.step`."""
         for launch, first_group in self._turns[0]:
-            launch.set(6, keep)
-            launch.set(7, gain)
-            launch.set(8, self.waiting * self._groups + first_group)
+            waiting_groups = self.waiting * self._groups
+            launch.set(keep=keep, gain=gain, first_group=waiting_groups + first_group)
             launch()
         self._turns.reverse()
         self.d, self.other = self.other, self.d

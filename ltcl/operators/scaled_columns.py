@@ -64,8 +64,7 @@ class ScaledColumns(Operator):
             product = self.device.empty(out.shape)
             self.A._queue_product(x, product, Epilogue(a), True)
             vectors.scale_rows(self._d, product, product)
-            added = product if y is None else y
-            vectors.axpby(1.0, product, b, added, out)
+            vectors.axpby(1.0, product, b, epilogue.operand(product), out)
         else:
             scaled = vectors.scale_rows(self._d, x, x.like())
             self.A._queue_product(scaled, out, Epilogue(a, b, y), False)

@@ -141,11 +141,10 @@ def _pack(matrix: Any, width: int, precision: str, unit: float | None = None) ->
     numbers[tile_of_nonzero, lanes] = matrix.data
     codes, scales, unit = quantize(numbers, precision, unit)
     tiles_before = np.concatenate([[0], np.cumsum(leads)])
-    column_type = np.uint16 if columns <= 1 << 16 else np.int32
     packed = Packed(
         shape=matrix.shape,
         pointers=tiles_before[matrix.indptr].astype(np.int64),
-        columns=starts.astype(column_type),
+        columns=starts.astype(_column_type(columns)),
         precision=precision,
         codes=codes,
         scales=scales,
@@ -154,6 +153,11 @@ def _pack(matrix: Any, width: int, precision: str, unit: float | None = None) ->
     )
     changes = np.abs(matrix.data - packed.decoded()[tile_of_nonzero, lanes])
     return dataclasses.replace(packed, difference=_norms_of_changes(matrix, changes))
+
+
+def _column_type(columns: int) -> Any:
+    """The type of column indices: 16 bits if they suffice."""
+    return np.uint16 if columns <= 1 << 16 else np.int32
 
 
 def _norms_of_changes(matrix: Any, changes: np.ndarray) -> tuple[float, float]:
@@ -253,11 +257,10 @@ def check_packed(packed: Packed, width: int) -> None:
     rows, columns = packed.shape
     tiles = len(packed.columns)
     scale_count = tiles if packed.precision == "int8" else 0
-    column_type = np.uint16 if columns <= 1 << 16 else np.int32
     numbers = [packed.unit, *packed.difference]
     fits = {
         "layout": width <= max(columns, 1),
-        "starts": packed.columns.dtype == column_type and packed.columns.ndim == 1,
+        "starts": packed.columns.dtype == _column_type(columns) and packed.columns.ndim == 1,
         "codes": packed.codes.dtype == PRECISIONS[packed.precision]
         and packed.codes.shape == (tiles, width),
         "scales": packed.scales.dtype == np.uint8 and packed.scales.shape == (scale_count,),

@@ -104,15 +104,15 @@ class Tables:
         kernel(
             rows,
             group,
-            rows,
-            first,
-            base,
-            width,
-            pointers,
-            columns,
-            values,
-            self.records,
-            self.entries,
+            rows=rows,
+            first=first,
+            base=base,
+            width=width,
+            pointers=pointers,
+            columns=columns,
+            values=values,
+            records=self.records,
+            entries=self.entries,
         )
 
     def _check_sums(self, name: str, rows: slice) -> None:

@@ -99,31 +99,30 @@ class Wavelet(Basis):
         pairs = CPU_PAIRS if k == 1 and self.device.is_cpu else 1
         taps = self._taps.shape[1]
         kernel, pieces = self._kernel("wavelet", name, k, TAPS=taps, PAIRS=pairs)
-        near = self.device.empty(self._scratch_size * k)
+        height, width = self.grid
+        arguments = {
+            "height": height,
+            "width": width,
+            "levels": self.levels,
+            "k": k,
+            "scale": a,
+            "add_scale": b,
+            "starts": self._starts,
+            "taps": self._taps,
+            "x": x,
+            "approximations": self.device.empty(self._scratch_size * k),
+            "add": y,
+            "out": out,
+        }
         launches = self._launches()
         if transpose:
             launches.reverse()
         for first, end in launches:
-            arguments = (
-                *self.grid,
-                first,
-                end,
-                self.levels,
-                k,
-                a,
-                b,
-                self._starts,
-                self._taps,
-                x,
-                near,
-                y,
-                out,
-            )
+            levels = {"first_level": first, "end_level": end}
             if end <= self._large_levels:
-                rows, columns = self._sides(end)
-                launch_grid(kernel, pieces, rows, columns, *arguments)
+                launch_grid(kernel, pieces, self._sides(end), **levels, **arguments)
             else:
-                launch_group(kernel, pieces, *arguments)
+                launch_group(kernel, pieces, **levels, **arguments)
 
     def _launches(self) -> list[tuple[int, int]]:
         """The levels first .. end - 1 of each launch: large ones one by one, then the others."""

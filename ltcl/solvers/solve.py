@@ -453,7 +453,9 @@ def _refine(method: Any, problem: _Problem, exact: Operator) -> tuple[np.ndarray
     S, b, rule = problem.S, problem.b, problem.rule
     right = S.device.upload(b)
     system = System(exact, right, vectors.norm(right), b)
-    system.fine = (exact.has_cheap_float64_product or problem.required < _FLOAT32) and system.times is not None
+    system.fine = (
+        exact.has_cheap_float64_product or problem.required < _FLOAT32
+    ) and system.times is not None
     x, r, norms = np.zeros(b.shape), right.copy(), system.norms
     if problem.x0 is not None:
         x = problem.x0.astype(np.float64)
