@@ -80,7 +80,13 @@ class Float64Form:
         multiply = getattr(self.matrix, "product", self.matrix.__matmul__)
         scale = np.reshape(self.scale, (-1, 1))
         shift = np.reshape(self.shift, (-1, 1))
-        return lambda x: multiply(scale * x).astype(np.float64) + shift * x
+
+        def product(x: np.ndarray) -> np.ndarray:
+            result = multiply(scale * x).astype(np.float64)
+            # Only a square operator has a shift.
+            return result + shift * x if np.any(shift) else result
+
+        return product
 
     def to_dense(self) -> np.ndarray:
         """The matrix (N, N) in float64."""
