@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.scanning.columns import all_but_one
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Log, Seen
 from ltcl.transport import first_bounce
