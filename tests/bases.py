@@ -7,8 +7,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.device import Array, Device
-from ltcl.operators import CSR, Compressed, Dense
-from ltcl.operators.base import Epilogue
+from ltcl.operators import CSR, Compressed, Dense, Epilogue
 from ltcl.operators.bases import Basis
 
 
@@ -22,8 +21,10 @@ class Given(Basis):
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
         self.isometric = bool(np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5))
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        self._on_device._product(x, out, epilogue, transpose)
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
+        self._on_device._queue_product(x, out, Epilogue(a, b, y), transpose)
 
 
 def rotation(n: int, seed: int = 0) -> np.ndarray:

@@ -12,18 +12,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ltcl import theory
 from ltcl.device import Array, Device, tuning, vectors
 from ltcl.errors import InputError, MemoryLimitError, ToleranceError
-from ltcl.operators import IdentityPlus, Operator
-from ltcl.operators.rows import RowOperator
-from ltcl.solvers import precision
+from ltcl.operators import Operator
 from ltcl.solvers.chebyshev import Chebyshev
-from ltcl.solvers.direct import Direct, factorizations
+from ltcl.solvers.direct import Direct
 from ltcl.solvers.krylov import CG, GMRES
 from ltcl.solvers.method import Method
 from ltcl.solvers.problem import LinearProblem
@@ -31,7 +28,7 @@ from ltcl.solvers.refinement import step_tolerance
 from ltcl.solvers.result import Solution
 from ltcl.solvers.stationary import Jacobi
 from ltcl.solvers.stopping import CountedOperator, Monitor
-from ltcl.solvers.survey import STEPS, Survey, has_survey, survey
+from ltcl.solvers.survey import STEPS, Survey, survey
 
 # A dense factorization of no more pixels takes less time than launching kernels.
 SMALL = 512
@@ -109,9 +106,6 @@ class GMRESTrial(GMRES):
         super().iterate(system, x, r, monitor)
 
 
-_tried: weakref.WeakSet[Operator] = weakref.WeakSet()
-
-
 def solve_automatically(problem: LinearProblem) -> Solution:
     """Return the solution of the first planned method that converges, else the best iterate.
 
@@ -143,7 +137,7 @@ class _Attempts:
         pixels = S.shape[0]
         if self.target >= PRECISE or pixels <= SMALL:
             return
-        if precision.product(S) is not None:
+        if S.product_float64() is not None:
             self.problem = dataclasses.replace(self.problem, exact=S)
             self.reasons.append(
                 f"refined in float64, since rtol={self.target:g} is below what float32 products reach"
@@ -212,8 +206,8 @@ def plan(
         yield PlannedMethod(method=Direct(), reason=reason)
         return
 
-    lowest_sum, _, highest_sum = theory.row_sum_range(S)
-    rho = max(highest_sum - 1.0, 1.0 - lowest_sum)
+    row_sums = S.row_sum_range()
+    rho = max(row_sums.largest - 1.0, 1.0 - row_sums.least)
     if not math.isfinite(rho):
         reason = "gmres: it needs no bounds, and row sums of S leave float32"
         yield PlannedMethod(method=GMRES(), reason=reason)
@@ -225,7 +219,7 @@ def plan(
         reason = f"{plain}, {free}; row sums of R are at most {rho:.2g}"
         yield PlannedMethod(method=plain.method, reason=reason)
     elif not is_refined and columns <= COLUMNS_OF_A_PRODUCT and not _was_solved(S):
-        _tried.add(S)
+        S.known.was_tried = True
         most = min(STEPS + int(free.products), GMRES.restart)
         reason = f"gmres: at most {most} products, without a survey at the first solve"
         yield PlannedMethod(method=GMRESTrial(most), reason=reason)
@@ -234,12 +228,13 @@ def plan(
 
 def _was_solved(S: Operator) -> bool:
     """Return whether S was solved before, so that a survey pays."""
-    return S in _tried or has_survey(S) or S in factorizations
+    known = S.known
+    return known.was_tried or known.survey is not None or known.factorization is not None
 
 
 def _plan_by_survey(S: Operator, rtol: float, columns: int) -> Iterator[PlannedMethod]:
     """Return the methods in the order of their estimated time, and two that need no bounds."""
-    made_before = has_survey(S)
+    made_before = S.known.survey is not None
     surveyed = survey(S)
     candidates = _candidates(S, rtol, columns, surveyed)
     bandwidth = _bandwidth(S.device)
@@ -273,8 +268,7 @@ def _candidates(S: Operator, rtol: float, columns: int, surveyed: Survey) -> lis
         products = theory.chebyshev_products(*surveyed.spectrum, rtol)
         chebyshev = Chebyshev(surveyed.spectrum)
         candidates.append(_iterative_candidate(S, columns, chebyshev, products))
-    stored = S.R if isinstance(S, IdentityPlus) else S
-    if S.shape[0] <= LARGEST_DIRECT and isinstance(stored, RowOperator):
+    if S.shape[0] <= LARGEST_DIRECT and S.has_entries:
         candidates.append(_direct_candidate(S, columns))
     return candidates
 
@@ -299,7 +293,7 @@ def _direct_candidate(S: Operator, columns: int) -> Candidate:
     """Return what a dense factorization, if it is not there yet, and its use need."""
     n = S.shape[0]
     operations = 4.0 * n * n * columns
-    if S not in factorizations:
+    if S.known.factorization is None:
         operations += 2.0 / 3.0 * n**3
     return Candidate(
         method=Direct(),

@@ -171,8 +171,7 @@ def tighten_bounds(bounds: Bounds, S: Operator, ritz: np.ndarray) -> Bounds:
     The mean row sum counts as one of them: it is near the eigenvalue that dominates R, which a
     picture may have no part of.
     """
-    _, mean_row_sum, _ = theory.row_sum_range(S)
-    values = _positive_parts(np.append(ritz, mean_row_sum))
+    values = _positive_parts(np.append(ritz, S.row_sum_range().mean))
     if len(ritz) < 2 or not len(values):
         return _widen(bounds, values)
     lowest = float(np.min(values))

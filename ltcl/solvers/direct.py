@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import weakref
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,9 +25,6 @@ from ltcl.solvers.problem import LinearProblem, unscale
 from ltcl.solvers.refinement import Correction, refine
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import CLAIM_LIMIT, relative_residual
-
-# Rounding of float64 products, as `precision.UNIT` for float32.
-ROUNDING_FLOAT64 = 4.0 * 2.0**-52
 
 _getrf, _gecon = scipy.linalg.get_lapack_funcs(("getrf", "gecon"), dtype=np.float64)
 
@@ -53,9 +49,6 @@ class DirectSolution:
     x: np.ndarray
     norms: np.ndarray
     hidden: np.ndarray
-
-
-factorizations: weakref.WeakKeyDictionary[Operator, Factorization] = weakref.WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -131,15 +124,19 @@ def substitute(S: Operator, b: np.ndarray) -> DirectSolution | None:
 
 
 def factorize(S: Operator) -> Factorization | None:
-    """Factorize S once in its life; None if it is singular to working precision."""
-    if S in factorizations:
-        return factorizations[S]
+    """Return the factors of S, computed once in its life; None if it is singular to working precision."""
+    if S.known.factorization is None:
+        S.known.factorization = _compute_factors(S)
+    return S.known.factorization
+
+
+def _compute_factors(S: Operator) -> Factorization | None:
     n = S.shape[0]
     nbytes = 3 * 8 * n * n
     purpose = f"method='direct' factorizes S densely, which for N = {n}"
     checks.fits_host(purpose, nbytes)
     try:
-        matrix, is_exact = precision.dense(S)
+        matrix, is_exact = S.matrix_float64()
         with np.errstate(all="ignore"):
             one_norm = np.linalg.norm(matrix, 1)
             inf_norm = np.linalg.norm(matrix, np.inf)
@@ -156,6 +153,5 @@ def factorize(S: Operator) -> Factorization | None:
         return None
     # Bounds of the 2-norm: the geometric mean of the 1-norm and the inf-norm, and Frobenius'.
     norm = min(math.sqrt(one_norm * inf_norm), float(np.linalg.norm(matrix)))
-    rounding = ROUNDING_FLOAT64 if is_exact else precision.UNIT
-    factorizations[S] = Factorization(matrix=matrix, lu=lu, pivots=pivots, hidden=rounding * norm)
-    return factorizations[S]
+    rounding = precision.UNIT_FLOAT64 if is_exact else precision.UNIT
+    return Factorization(matrix=matrix, lu=lu, pivots=pivots, hidden=rounding * norm)

@@ -1,107 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""S in float64 on the host, where its numbers are at hand: products, and what float32 products hide.
+"""What products in float32 hide of a residual.
 
-A residual b - S x in float32 deviates from the true one by at most about c eps || |S| || ||x||, eps = 2^-23
-(Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.5, with random signs in
-place of the worst case). A claim rests on a residual that is within the tolerance with this added;
-where it is not, S x is computed in float64 with the numbers that were given.
+A residual b - S x in float32 deviates from the true one by at most about c eps || |S| || ||x||,
+eps = 2^-23 (Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.5, with
+random signs in place of the worst case). A claim rests on a residual that is within the tolerance
+with this added; where it is not, S x is computed in float64 with the numbers that were given
+(`Operator.product_float64`).
 """
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable
-from typing import Any
-
-import numpy as np
-import scipy.sparse
-
-from ltcl import checks
-from ltcl.errors import MemoryLimitError
-from ltcl.operators import CSR, Dense, Host, IdentityPlus, Operator, RowBlocks, ScaledColumns, Tiles
-from ltcl.operators.base import Transposed
-from ltcl.operators.multi_device import MultiDevice
-from ltcl.operators.out_of_core import Streamed
-
-Product = Callable[[np.ndarray], np.ndarray]  # (N, k) float64 -> (M, k) float64
 EPS = 2.0**-23
-# c eps. Measured for rows of CSR, dense and tiles: at most 0.1 eps of random signs; of nonnegative
+
+# c eps. Measured for rows of CSR, dense and tiles: at most 0.1 eps for random signs; for nonnegative
 # numbers, whose sums grow on the way, 0.3 eps at 64 a row, 0.5 at 4096, 0.8 at 16384 and 1.5 at
 # 65536.
 UNIT = 4.0 * EPS
-_SMALL = (
-    4 << 20
-)  # bytes of S on the device, up to which a float64 product takes no longer than a few waits
-# What is known of operators, as long as they live; nothing in it may refer to its operator.
-_known: weakref.WeakKeyDictionary[Operator, tuple[Any, Any, Any]] = weakref.WeakKeyDictionary()
 
-
-def _numbers(S: Operator, read: bool = False) -> tuple[Any, Any, Any] | None:
-    """(A, d, e) with S = A diag(d) + diag(e), as they were given; None where only the device has them.
-
-    A is an array, a csr_array, a Host or Streamed; d and e are numbers or (N,). Blocks of a store
-    are read on demand.
-    """
-    if isinstance(S, IdentityPlus | ScaledColumns):
-        if (inner := _numbers(S.R if isinstance(S, IdentityPlus) else S.A, read)) is None:
-            return None
-        A, d, e = inner
-        if isinstance(S, IdentityPlus):
-            return A, S.sign * d, S.sign * e + 1.0
-        return A, d * S.d, e * S.d - S.shift
-    if isinstance(S, Dense | MultiDevice) and S.exact is not None:
-        A, d, e = S.exact
-        return (A, 1.0 / d, 0.0 - e) if np.all(np.abs(d) > 1e-300) else None
-    if isinstance(S, Dense) or (read and isinstance(S, RowBlocks | MultiDevice)):
-        A = S.to_dense()
-    elif isinstance(S, CSR) and not isinstance(S, RowBlocks):
-        A = scipy.sparse.csr_array((S.data, S.pattern.indices, S.pattern.indptr), shape=S.shape)
-    elif isinstance(S, Tiles):
-        A = S.matrix()
-    else:
-        A = S if isinstance(S, Host | Streamed) else None
-    return None if A is None else (A, 1.0, 0.0)
-
-
-def product(S: Operator) -> Product | None:
-    """x -> S x in float64; None where the numbers are on the device alone, or the host has no room."""
-    try:
-        numbers = _known[S] if S in _known else _numbers(S)
-    except MemoryLimitError:
-        return None
-    if numbers is None:
-        return None
-    A, d, e = numbers
-    multiply = A.product if isinstance(A, Host | Streamed) else A.__matmul__
-    if is_small(S) and A is not S:
-        _known[S] = numbers
-    d, e = np.reshape(d, (-1, 1)), np.reshape(e, (-1, 1))
-    return lambda x: multiply(d * x).astype(np.float64) + e * x
-
-
-def dense(S: Operator) -> tuple[np.ndarray, bool]:
-    """S as (N, N) float64, and whether its numbers are those that were given, not float32 products."""
-    n = S.shape[0]
-    checks.fits_host(f"a dense S of N = {n}", 8 * n**2)
-    if isinstance(S, Transposed):
-        matrix, is_exact = dense(S.base)
-        return matrix.T, is_exact
-    if (numbers := _numbers(S, read=True)) is None:
-        return S.to_dense(), False
-    A, d, e = numbers
-    A: Any = A.to_dense() if isinstance(A, Streamed) else A
-    A = (
-        A.product(np.eye(n))
-        if isinstance(A, Host)
-        else A.toarray()
-        if scipy.sparse.issparse(A)
-        else A
-    )
-    matrix = np.multiply(A, d, dtype=np.float64)
-    matrix[np.diag_indices(n)] += e
-    return matrix, True
-
-
-def is_small(S: Operator) -> bool:
-    """Whether a float64 product with S is cheap; one with a LinearOperator goes through the host anyway."""
-    return S.nbytes + S.bytes_read() <= _SMALL
+# c eps of float64.
+UNIT_FLOAT64 = 4.0 * 2.0**-52

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.operators import Dense, Operator, as_operator
+from ltcl.operators import Operator
+from ltcl.operators.conversion import as_exact_operator
 from ltcl.solvers.stopping import StoppingRule
 
 # Rows that are reduced side by side: NumPy reduces an axis of few columns slowly.
@@ -137,7 +137,7 @@ class LinearProblem:
             callback=settings.callback,
         )
         required_rtol = _required_rtol(b, rule, has_atol=bool(atol))
-        operator = _as_operator(S)
+        operator = S if isinstance(S, Operator) else as_exact_operator(S)
         if exact is not None:
             exact = _exact_operator(exact, operator)
         elif required_rtol < operator.solution_error:
@@ -227,21 +227,12 @@ def _required_rtol(b: np.ndarray, rule: StoppingRule, *, has_atol: bool) -> floa
     return float(np.min(targets / norms[is_lit], initial=np.inf))
 
 
-def _as_operator(S: Any, device: Device | None = None) -> Operator:
-    """Return S as an operator that remembers the numbers of an array before they became float32."""
-    operator = as_operator(S, device)
-    if isinstance(operator, Dense) and operator is not S:
-        rows, columns = operator.shape
-        operator.exact = np.asarray(S), np.ones(columns), np.zeros(rows)
-    return operator
-
-
 def _exact_operator(exact: Any, S: Operator) -> Operator:
     """Return `exact` as an operator on the device of S, checked."""
     shape = check_square("exact", exact)
     if shape != S.shape:
         raise InputError(f"exact has shape {shape}; it must be that of S, {S.shape}")
-    operator = _as_operator(exact, S.device)
+    operator = as_exact_operator(exact, S.device)
     if operator.device is not S.device:
         raise InputError(f"exact is on another device, {operator.device}; it must be on {S.device}")
     return operator

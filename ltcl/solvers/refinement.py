@@ -17,7 +17,6 @@ import numpy as np
 
 from ltcl.device import Array, vectors
 from ltcl.operators import Operator
-from ltcl.solvers.precision import is_small
 from ltcl.solvers.problem import LinearProblem, unscale
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import CountedOperator, Monitor
@@ -65,7 +64,7 @@ def refine(method: Corrector, problem: LinearProblem, exact: Operator) -> Soluti
     right = S.device.upload(b)
     norms = vectors.norm(right)
     system = CountedOperator(S=exact, b=right, norms=norms, host=b)
-    needs_float64 = is_small(exact) or problem.required_rtol < FLOAT32_FLOOR
+    needs_float64 = exact.has_cheap_float64_product or problem.required_rtol < FLOAT32_FLOOR
     system.in_float64 = needs_float64 and system.product_float64 is not None
 
     x = np.zeros(b.shape)

@@ -8,10 +8,8 @@ residual is within the tolerance after all that rounding may hide of it is added
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from ltcl.device import Array, vectors
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles
+from ltcl.operators import Operator
+from ltcl.operators.knowledge import Product
 from ltcl.solvers import precision
 from ltcl.solvers.result import Solution, Status
-from ltcl.theory import row_sum_range
 
 # Most steps between two readings of residuals.
 SLOTS = 8
@@ -51,10 +49,6 @@ CLAIM_LIMIT = 1.01
 
 # A solve stagnates after so many claims in a row that could not be confirmed.
 MAX_REFUSALS = 3
-
-_LARGEST = 1e18  # Frobenius norm whose square stays in float32
-_LEAST = 2.0**-63  # entries of S below have squares that are 0 on the device
-_norms: weakref.WeakKeyDictionary[Operator, float] = weakref.WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,11 +92,11 @@ class CountedOperator:
     products: int = 0
 
     @functools.cached_property
-    def product_float64(self) -> precision.Product | None:
+    def product_float64(self) -> Product | None:
         """Products by S in float64; None if the host does not have its numbers."""
         if self.on_coefficients:
             return None
-        return precision.product(self.S)
+        return self.S.product_float64()
 
     def residual(self, x: Any, r: Array) -> np.ndarray:
         """Compute r = b - S x by one product; return its norms (k,)."""
@@ -311,7 +305,7 @@ class Monitor:
             return norms, seems_solved
 
         # A residual by recursion is recomputed, unless float64 decides at once and at little cost.
-        is_cheap = precision.is_small(system.S) and system.product_float64 is not None
+        is_cheap = system.S.has_cheap_float64_product and system.product_float64 is not None
         decides_at_once = is_cheap and seems_solved and np.all(np.isfinite(self._travelled))
         if self._recursion_steps and not decides_at_once:
             self._restart_recursion()
@@ -343,12 +337,12 @@ class Monitor:
         """Return whether norms are within the tolerance with all that rounding may hide added."""
         if not np.all(norms <= self._target):
             return False
-        norm, is_bound = norm_bound(self.system.S)
-        if self._recursion_steps and not is_bound:
+        norm = self.system.S.norm_bound()
+        if self._recursion_steps and not norm.is_bound:
             return False
         size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
         way = size + self._travelled
-        hidden = precision.UNIT * norm * (self._recursion_steps + 1) * way
+        hidden = precision.UNIT * norm.value * (self._recursion_steps + 1) * way
         rounding_of_b = 0.5 * precision.EPS * self.system.norms
         return bool(np.all(norms + hidden + rounding_of_b <= CLAIM_LIMIT * self._target))
 
@@ -395,28 +389,3 @@ class Monitor:
 def relative_residual(residual_norms: np.ndarray, norms: np.ndarray) -> float:
     """Return the largest residual relative to its right-hand side; absolute where that is dark."""
     return float(np.max(residual_norms / np.where(norms > 0.0, norms, 1.0), initial=0.0))
-
-
-def norm_bound(S: Operator) -> tuple[float, bool]:
-    """A bound on the 2-norm of |S|, entry by entry, and whether it is one, computed once in the life of S.
-
-    The Frobenius norm of the numbers, between isometric bases that of the core; of other operators
-    the largest row sum, a bound of symmetric S >= 0, an estimate else.
-    """
-    if isinstance(S, IdentityPlus):
-        norm, is_bound = norm_bound(S.R)
-        return 1.0 + norm, is_bound
-    if isinstance(S, Compressed) and all(W is None or W.isometric for W in (S.out, S.into)):
-        return norm_bound(S.core)
-    if not isinstance(S, Tiles | CSR | Dense):
-        least, _, most = row_sum_range(S)
-        return max(1.0, most, -least), False
-    if S not in _norms:
-        if isinstance(S, Tiles):
-            norm = S.frobenius
-        else:
-            values = [slab.arguments[-1] for slab in S.slabs if slab.arguments[-1].size]
-            flat = [dataclasses.replace(array, shape=(array.size,)) for array in values]
-            norm = math.sqrt(math.fsum(float(vectors.dot(array, array)[0]) for array in flat))
-        _norms[S] = 1.01 * norm + _LEAST * max(S.shape) if norm < _LARGEST else math.inf
-    return _norms[S], True

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,18 +86,14 @@ class Survey:
         return f"{self.defect:.2g} of R is not self-adjoint, {spectrum} by {products} products"
 
 
-_surveys: weakref.WeakKeyDictionary[Operator, Survey] = weakref.WeakKeyDictionary()
-
-
-def has_survey(S: Operator) -> bool:
-    """Return whether S was surveyed before."""
-    return S in _surveys
-
-
 def survey(S: Operator) -> Survey:
     """Return the survey of S, which is made at the first call."""
-    if S in _surveys:
-        return _surveys[S]
+    if S.known.survey is None:
+        S.known.survey = _take_survey(S)
+    return S.known.survey
+
+
+def _take_survey(S: Operator) -> Survey:
     picture = np.random.default_rng(0).uniform(size=S.shape[0])
     start = S.device.upload(picture)
     space = KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0]))
@@ -108,13 +103,12 @@ def survey(S: Operator) -> Survey:
         is_invariant = bool(space.extend()[0])
         residuals.append(float(space.residuals[0]))
     ritz = space.ritz_values()
-    _surveys[S] = Survey(
+    return Survey(
         ritz=ritz,
         spectrum=tighten_bounds(theory.free_bounds(S), S, ritz),
         residuals=tuple(residuals),
         defect=_self_adjoint_defect(S, space),
     )
-    return _surveys[S]
 
 
 def _self_adjoint_defect(S: Operator, space: KrylovSpace) -> float:

@@ -66,6 +66,14 @@ def meets_twin(A: Operator, matrix: np.ndarray, *, transpose: bool = False) -> N
             close(out.get(), reference.dense_matvec(matrix, x, scale, y_term + x_term), error)
 
 
+def norms_match(A: Operator, matrix: np.ndarray, rtol: float = 1e-12) -> None:
+    """Assert that the norms of A are those of `matrix`, float64."""
+    norms = A.norms()
+    expected = [np.linalg.norm(matrix, order) for order in (1, np.inf, "fro")]
+    assert [norms.one, norms.inf, norms.frobenius] == pytest.approx(expected, rel=rtol)
+    assert norms.lowest == min(matrix.min(initial=0.0), 0.0)
+
+
 def operands(A: Operator, values: np.ndarray, kind: str | None) -> tuple[Array | None, Array]:
     if kind == "out":
         out = A.device.upload(values)

@@ -51,7 +51,7 @@ def matrix_of(launch: tuple[Device, int], form: str, name: str) -> tuple[CSR | D
 
 def sweeps_of(relax: Relaxation, k: int | None) -> tuple[Sweeps, np.ndarray, np.ndarray]:
     """Sweeps that start with NaN wherever nothing is read."""
-    n, device = relax.rows.M.shape[0], relax.rows.M.device
+    n, device = relax.n, relax.device
     x, b = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
     sweeps = Sweeps(
         relax, device.upload(x), device.upload(b), device.upload(np.full_like(x, np.nan))

@@ -194,7 +194,7 @@ def test_sums_are_those_of_the_twin_to_the_bit(shaped, name, k):
 def test_no_bit_depends_on_how_it_is_launched(device, shaped, monkeypatch, name, units, copies):
     b, pixels, lengths = gallery.vectors(29, 9), np.arange(29), Lengths.geometric(0.7, -1.0)
     wanted = Walker(tables_of(device, name), lengths, SEED).rows(device.upload(b), pixels, 200)
-    monkeypatch.setattr("ltcl.operators.walks._UNITS", units)
+    monkeypatch.setattr("ltcl.operators.walks.MAX_LAUNCH_CHUNKS", units)
     walker, b = Walker(tables_of(shaped, name), lengths, SEED), shaped.upload(b)
     many = np.tile(pixels, copies)
     same(walker.rows(b, many, 200), wanted.total[many], wanted.squares[many])
@@ -206,7 +206,7 @@ def test_no_bit_depends_on_how_it_is_launched(device, shaped, monkeypatch, name,
 @pytest.mark.parametrize("samples", [1000, 40_000])
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_walks_from_b_are_those_of_the_twin(shaped, monkeypatch, form, samples, records):
-    monkeypatch.setattr("ltcl.operators.walks._RECORDS", max(records, samples // 10))
+    monkeypatch.setattr("ltcl.operators.walks.MAX_LAUNCH_SAMPLES", max(records, samples // 10))
     b, made = (
         gallery.vectors(53, None),
         tables_of_columns(helpers.FORMATS[form](shaped, EMPTY_ROWS)),

@@ -30,8 +30,8 @@ rng = np.random.default_rng(5)
 
 def transforms(monkeypatch, W):
     """Those that are made from here on, one entry each."""
-    made, original = [], W._product
-    monkeypatch.setattr(W, "_product", lambda *arguments: made.append(original(*arguments)))
+    made, original = [], W._queue_product
+    monkeypatch.setattr(W, "_queue_product", lambda *arguments: made.append(original(*arguments)))
     return made
 
 
