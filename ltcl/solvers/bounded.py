@@ -350,7 +350,7 @@ class _Descent:
         rows = self.b.shape[0]
         self._slices = slices
         self._is_resting = np.zeros(k, bool)
-        self._rest = device.upload(self._is_resting, np.int32)
+        self._resting = device.upload(self._is_resting, np.int32)
         first_numbers = np.zeros((NUMBER_ROWS + 3 * slices, k))
         # The first alpha.
         first_numbers[0] = 1.0
@@ -364,32 +364,52 @@ class _Descent:
         Ad = self.b.like()
         sums = columns.sums(3)
         curvatures = columns.sums(1)
-        W = self._weights
-        weighted = int(is_weighted)
 
-        look_at = (lower, upper, self.x, self._q, self.g, h, numbers)
-        self._look_anew = columns.bind(_LOOK, 1, *look_at)
-        look = columns.bind(_LOOK, 0, *look_at)
-        to_d = (slices, self._rest, numbers, lower, upper, self.x, self.g, d, sums)
-        direction = columns.bind(_DIRECTION, *to_d, extra=2)
-        dots = columns.bind(_DOTS, 0, 0, weighted, W, Ad, Ad, Ad, curvatures, rows=rows)
-        to_x = (
-            weighted,
-            numbers,
-            sums,
-            curvatures,
-            lower,
-            upper,
-            d,
-            self.x,
-            W,
-            Ad,
-            self.r,
-            self._u,
+        box = {"lower": lower, "upper": upper}
+        looks = {"x": self.x, "q": self._q, "g": self.g, "h": h, "numbers": numbers}
+        self._look_anew = columns.bind(_LOOK, restart=1, **box, **looks)
+        look = columns.bind(_LOOK, restart=0, **box, **looks)
+        direction = columns.bind(
+            _DIRECTION,
+            extra=2,
+            slices=slices,
+            resting=self._resting,
+            numbers=numbers,
+            x=self.x,
+            g=self.g,
+            d=d,
+            sums=sums,
+            **box,
         )
+        dots = columns.bind(
+            _DOTS,
+            rows=rows,
+            first=0,
+            pairs=0,
+            weighted=int(is_weighted),
+            weights=self._weights,
+            a=Ad,
+            b=Ad,
+            c=Ad,
+            partials=curvatures,
+        )
+        moves = {
+            "extra": 4,
+            "height": rows,
+            "weighted": int(is_weighted),
+            "numbers": numbers,
+            "sums": sums,
+            "curvatures": curvatures,
+            "d": d,
+            "x": self.x,
+            "w": self._weights,
+            "Ad": Ad,
+            "r": self.r,
+            "u": self._u,
+        }
         # Without slices nothing moves, and r is weighted alone.
-        self._weigh_r = columns.bind(_MOVE, rows, 0, *to_x, extra=4)
-        move = columns.bind(_MOVE, rows, slices, *to_x, extra=4)
+        self._weigh_r = columns.bind(_MOVE, slices=0, **box, **moves)
+        move = columns.bind(_MOVE, slices=slices, **box, **moves)
         self._launches = (
             direction,
             self.A.bind(d, Ad),
@@ -412,7 +432,7 @@ class _Descent:
         """Lower the error in the columns `unsolved`: six launches."""
         if np.any(self._is_resting == unsolved):
             self._is_resting = ~unsolved
-            self._rest.set(self._is_resting)
+            self._resting.set(self._is_resting)
         for launch in self._launches:
             launch()
         self.products += 2

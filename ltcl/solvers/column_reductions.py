@@ -26,9 +26,6 @@ VALUES_PER_ITEM = 32
 # Most slices, of which each has a group.
 MAX_SLICES = 256
 
-# Argument of all kernels that update an iterate: the number of the step.
-_STEP = 3
-
 _OPERANDS = "abc"
 
 
@@ -84,23 +81,15 @@ class ColumnReductions:
         enough = -(-x.size // (VALUES_PER_ITEM * self.group))
         self.slices = max(1, min(enough, most))
 
-    def bind(
-        self,
-        name: str,
-        *arguments: object,
-        extra: int = 0,
-        across: int = 1,
-        rows: int | None = None,
-    ) -> Launch:
-        """Bind kernel `name` on `rows` rows, `across` times, with local memory for `extra` reals a column."""
+    def bind(self, name: str, /, *, extra: int = 0, across: int = 1, **arguments: object) -> Launch:
+        """Bind kernel `name`, `across` times, with local memory for `extra` reals a column.
+
+        `rows`, `k` and `scratch` are those of `x` when not given.
+        """
         scratch = self.device.local(self.group + extra * min(self.k, self.group))
+        shared = {"rows": self.rows, "k": self.k, "scratch": scratch}
         return self._kernels[name].bind(
-            self.items(across),
-            (self.group, 1, 1),
-            self.rows if rows is None else rows,
-            self.k,
-            *arguments,
-            scratch,
+            self.items(across), (self.group, 1, 1), **(shared | arguments)
         )
 
     def items(self, across: int) -> tuple[int, int, int]:
@@ -130,7 +119,7 @@ class ColumnReductions:
         """
         for step in steps:
             for update in updates:
-                update.set(_STEP, step)
+                update.set(iteration=step)
             for launch in launches:
                 launch()
         numbers = state.get().astype(np.float64)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
+from ltcl.device.kernels import Launch
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.operators import Operator
 from ltcl.solvers.column_reductions import STATE_ROWS, ColumnReductions, pair_codes
@@ -22,9 +23,6 @@ from ltcl.solvers.krylov_space import krylov_cycle
 from ltcl.solvers.method import IterativeMethod
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import CountedOperator, Monitor
-
-# Argument of the kernel krylov_cg: forget the last direction.
-_ANEW = 4
 
 
 @dataclass(frozen=True)
@@ -89,19 +87,40 @@ class _CGIteration:
         sums = columns.sums(2)
         self.unsolved = monitor.unsolved
         # Columns that rest, since they are solved.
-        self.rest = r.device.upload(~self.unsolved, np.int32)
+        self.resting = r.device.upload(~self.unsolved, np.int32)
 
         # Without weights the kernel does not read them.
-        is_weighted = weights is not None
         on_device = r
-        if is_weighted:
+        if weights is not None:
             on_device = self._upload_weights(weights)
-        r_r_and_w_r = pair_codes("aa", "ba")
+        # <r, r> and <w, r>.
         dots = columns.bind(
-            "vector_dots", 0, r_r_and_w_r, int(is_weighted), on_device, r, w, w, sums, across=2
+            "vector_dots",
+            across=2,
+            first=0,
+            pairs=pair_codes("aa", "ba"),
+            weighted=int(weights is not None),
+            weights=on_device,
+            a=r,
+            b=w,
+            c=w,
+            partials=sums,
         )
-        arguments = (columns.slices, 0, 1, self.rest, sums, self.state, w, p, q, x, r)
-        self.update = columns.bind("krylov_cg", *arguments, extra=2)
+        self.update = columns.bind(
+            "krylov_cg",
+            extra=2,
+            slices=columns.slices,
+            iteration=0,
+            restart=1,
+            resting=self.resting,
+            partials=sums,
+            state=self.state,
+            w=w,
+            p=p,
+            q=q,
+            x=x,
+            r=r,
+        )
         self.launches = [system.S.bind(r, w), dots, self.update, self._keep_direction]
 
     def _upload_weights(self, weights: Any) -> Array:
@@ -114,7 +133,7 @@ class _CGIteration:
         return r.device.upload(np.broadcast_to(relative, r.shape))
 
     def _keep_direction(self) -> None:
-        self.update.set(_ANEW, 0)
+        self.update.set(restart=0)
 
     def run(self) -> None:
         """Take steps until the monitor ends the solve, or no column has a next step."""
@@ -133,10 +152,10 @@ class _CGIteration:
                 return
             # The monitor may have recomputed r, to which the last direction does not belong.
             was_recomputed = not np.array_equal(monitor.norms, readings.norms[-1])
-            self.update.set(_ANEW, int(was_recomputed))
+            self.update.set(restart=int(was_recomputed))
             if (monitor.unsolved != self.unsolved).any():
                 self.unsolved = monitor.unsolved
-                self.rest.set(~self.unsolved)
+                self.resting.set(~self.unsolved)
 
 
 @dataclass(frozen=True)
@@ -183,7 +202,6 @@ class _BiCGStabIteration:
         S = system.S
         columns = ColumnReductions(r, "vector_dots", "krylov_half", "krylov_bicgstab")
         self.columns = columns
-        slices = columns.slices
         self.shadow = r.like()
         self.p = r.like()
         self.g = r.like()
@@ -195,22 +213,24 @@ class _BiCGStabIteration:
         five_sums = columns.sums(5)
 
         # <g, p> and <p, p>, or <r*, v> and <v, v> without a transpose.
-        ba_and_bb = pair_codes("ba", "bb")
-        self.dots_of_g = columns.bind(
-            "vector_dots", 0, ba_and_bb, 0, r, self.g, self.p, self.p, two_sums, across=2
-        )
-        self.dots_of_v = columns.bind(
-            "vector_dots", 0, ba_and_bb, 0, r, self.shadow, v, v, two_sums, across=2
-        )
+        self.dots_of_g = self._bind_dots(two_sums, "ba bb", a=self.g, b=self.p, c=self.p)
+        self.dots_of_v = self._bind_dots(two_sums, "ba bb", a=self.shadow, b=v, c=v)
         # <t, s>, <t, t>, <r*, s>, <r*, t> and <s, s>.
-        five_pairs = pair_codes("ab", "aa", "cb", "ca", "bb")
-        dots_of_t = columns.bind(
-            "vector_dots", 0, five_pairs, 0, r, t, half, self.shadow, five_sums, across=5
+        dots_of_t = self._bind_dots(five_sums, "ab aa cb ca bb", a=t, b=half, c=self.shadow)
+        shared = {"slices": columns.slices, "iteration": 0, "state": self.state, "r": r, "v": v}
+        to_half = columns.bind("krylov_half", extra=2, partials=two_sums, half_way=half, **shared)
+        to_next = columns.bind(
+            "krylov_bicgstab",
+            extra=5,
+            partials=five_sums,
+            next_partials=two_sums,
+            g=self.g,
+            half_way=half,
+            t=t,
+            p=self.p,
+            x=x,
+            **shared,
         )
-        to_half = columns.bind("krylov_half", slices, 0, two_sums, self.state, r, v, half, extra=2)
-        arguments = (slices, 0, five_sums, self.state, two_sums)
-        operands = (self.g, half, t, v, self.p, x, r)
-        to_next = columns.bind("krylov_bicgstab", *arguments, *operands, extra=5)
         self.updates = [to_half, to_next]
         # 4. to 9.
         self.launches = [S.bind(self.p, v), to_half, S.bind(half, t), dots_of_t, to_next]
@@ -219,6 +239,23 @@ class _BiCGStabIteration:
         self.phase = np.full(r.columns, self.WAITS)
         self.step = 0
         self.has_transpose = True
+
+    def _bind_dots(self, sums: Array, pairs: str, *, a: Array, b: Array, c: Array) -> Launch:
+        """Bind inner products of pairs of the arrays, as "ab bb"."""
+        names = pairs.split()
+        return self.columns.bind(
+            "vector_dots",
+            across=len(names),
+            first=0,
+            pairs=pair_codes(*names),
+            weighted=0,
+            # Not read.
+            weights=a,
+            a=a,
+            b=b,
+            c=c,
+            partials=sums,
+        )
 
     def run(self) -> None:
         """Take steps until the monitor ends the solve, or no column has a next step."""

@@ -21,9 +21,6 @@ CYCLE_REDUCTION = 2.0**-20
 # What the rotations leave of a column of H, or of H, is rounding of products below this part of it.
 SINGULAR = 2.0**-20
 
-# Argument of the kernel krylov_subtract: the number of directions.
-_COUNT = 2
-
 
 class KrylovSpace:
     """An orthonormal basis v_0, v_1, ... of the Krylov space of S and r (N, k), S V = V H, by columns.
@@ -73,18 +70,37 @@ class KrylovSpace:
         v = r.like()
         w = r.copy()
         sums = columns.sums(rows + 1)
-        h_first = columns.device.empty((rows + 1, columns.k))
-        h = columns.device.empty((rows + 1, columns.k))
-        self._h_first = h_first
-        self._h = h
+        self._first_h = columns.device.empty((rows + 1, columns.k))
+        self._h = columns.device.empty((rows + 1, columns.k))
         self._product = S.bind(v, w)
-        self._dots = columns.bind("vector_dots", 0, 0, 0, w, self.V, w, w, sums)
-        first_pass = (0, columns.slices, 0, 0, sums, h_first, h_first, self.V, w, w)
-        second_pass = (0, columns.slices, 1, 1, sums, h_first, h, self.V, w, v)
-        self._passes = [
-            columns.bind("krylov_subtract", *first_pass, extra=rows + 2),
-            columns.bind("krylov_subtract", *second_pass, extra=rows + 2),
-        ]
+        # <v_j, w> of all directions, and <w, w>.
+        self._dots = columns.bind(
+            "vector_dots",
+            first=0,
+            pairs=0,
+            weighted=0,
+            weights=w,
+            a=self.V,
+            b=w,
+            c=w,
+            partials=sums,
+        )
+        shared = {
+            "extra": rows + 2,
+            "count": 0,
+            "slices": columns.slices,
+            "partials": sums,
+            "first_pass": self._first_h,
+            "V": self.V,
+            "w": w,
+        }
+        first_pass = columns.bind(
+            "krylov_subtract", second_pass=0, unit_length=0, h=self._first_h, out=w, **shared
+        )
+        second_pass = columns.bind(
+            "krylov_subtract", second_pass=1, unit_length=1, h=self._h, out=v, **shared
+        )
+        self._passes = [first_pass, second_pass]
 
     def extend(self, active: np.ndarray | bool = True) -> np.ndarray:
         """Take one step of the `active` columns, (k,) bool; return those whose space is invariant.
@@ -146,8 +162,21 @@ class KrylovSpace:
         count = y.shape[1]
         # The kernel subtracts what sums of one slice say; the last of these is <w, w>, not used.
         minus_y = x.device.upload(np.pad(-y.T, ((0, 1), (0, 0))))
-        arguments = (count, 1, 0, 0, minus_y, self._h_first, self._h, self.V, x, x)
-        self._columns.bind("krylov_subtract", *arguments, extra=count + 2)()
+        subtract = self._columns.bind(
+            "krylov_subtract",
+            extra=count + 2,
+            count=count,
+            slices=1,
+            second_pass=0,
+            unit_length=0,
+            partials=minus_y,
+            first_pass=self._first_h,
+            h=self._h,
+            V=self.V,
+            w=x,
+            out=x,
+        )
+        subtract()
 
     def _orthogonalize(self) -> None:
         """Make the next direction of the last product."""
@@ -157,7 +186,7 @@ class KrylovSpace:
         passes = self._passes if self.count else self._passes[1:]
         for subtract in passes:
             self._dots()  # 4.
-            subtract.set(_COUNT, self.count)
+            subtract.set(count=self.count)
             subtract()  # 5. to 8.
 
 

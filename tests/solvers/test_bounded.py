@@ -74,13 +74,16 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     numbers, rest = device.upload(start), device.upload(np.zeros(k), np.int32)
     sums, squares = columns.sums(3), columns.sums(1)
 
-    columns.bind("bounded_look", 0, L, U, X, Q, G, H, numbers)()
+    box = {"lower": L, "upper": U, "x": X, "numbers": numbers}
+    columns.bind("bounded_look", restart=0, q=Q, g=G, h=H, **box)()
     new = np.stack([(-q - g) / start[2], -q])
     gap, zh = reference.bounded_look(lower, upper, x, new[1], new[0])
     looks = numbers.get()[4 : 4 + 2 * slices].reshape(slices, 2, k).sum(axis=0)
     np.testing.assert_allclose(looks, [gap, zh], rtol=0, atol=4 * tolerance)
 
-    columns.bind("bounded_direction", slices, rest, numbers, L, U, X, G, D, sums, extra=2)()
+    columns.bind(
+        "bounded_direction", extra=2, slices=slices, resting=rest, g=G, d=D, sums=sums, **box
+    )()
     step, (gd, dd, share) = reference.bounded_direction(
         start[0], -looks[1] / start[1], lower, upper, x, new[1], d
     )
@@ -89,13 +92,27 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     np.testing.assert_allclose(found[:, :2].sum(axis=0), [gd, dd], rtol=1e-3, atol=tolerance)
     np.testing.assert_allclose(found[:, 2].max(axis=0), share, rtol=1e-3)
 
-    columns.bind("vector_dots", 0, 0, 1, W, Y, Y, Y, squares)()
+    columns.bind(
+        "vector_dots", first=0, pairs=0, weighted=1, weights=W, a=Y, b=Y, c=Y, partials=squares
+    )()
     (curvature,) = reference.vector_dots([(Ad, Ad)], w)
     np.testing.assert_allclose(squares.get().sum(axis=0), curvature, rtol=1e-4)
 
     V = R.like()
     columns.bind(
-        "bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4
+        "bounded_move",
+        extra=4,
+        height=rows,
+        slices=slices,
+        weighted=1,
+        sums=sums,
+        curvatures=squares,
+        d=D,
+        w=W,
+        Ad=Y,
+        r=R,
+        u=V,
+        **box,
     )()
     with np.errstate(divide="ignore", invalid="ignore"):
         length = np.where(gd < 0, np.fmin(-gd / curvature, np.fmax(1 / share, 1)), 0.0)

@@ -220,7 +220,8 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     columns = ColumnReductions(W, "vector_dots", "krylov_subtract")
     tolerance = reference.gamma(rows + 40) * rows * 30
     sums = columns.sums(7)
-    columns.bind("vector_dots", 0, 0, 0, W, on_device, W, W, sums, across=7)()
+    plain = {"first": 0, "weighted": 0, "weights": W}
+    columns.bind("vector_dots", across=7, pairs=0, a=on_device, b=W, c=W, partials=sums, **plain)()
     found = sums.get().reshape(columns.slices, 7, k).sum(axis=0)
     np.testing.assert_allclose(
         found,
@@ -230,7 +231,18 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     )
 
     pairs = columns.sums(2)
-    columns.bind("vector_dots", 0, pair_codes("ab", "cc"), 1, weighing, W, U, U, pairs, across=2)()
+    columns.bind(
+        "vector_dots",
+        across=2,
+        first=0,
+        pairs=pair_codes("ab", "cc"),
+        weighted=1,
+        weights=weighing,
+        a=W,
+        b=U,
+        c=U,
+        partials=pairs,
+    )()
     found = pairs.get().reshape(columns.slices, 2, k).sum(axis=0)
     wanted = reference.vector_dots([(w, u), (u, u)], weights)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance)
@@ -239,11 +251,21 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     small = np.linspace(-1e-3, 1e-3, 7 * k).reshape(7, k).astype(np.float32)
     small[6] = 4.0  # <w, w>
     for again, finish in ((0, 0), (1, 1)):
-        out, arguments = (
-            W.like(),
-            (6, 1, again, finish, device.upload(small), before, h, on_device, W),
-        )
-        columns.bind("krylov_subtract", *arguments, out, extra=8)()
+        out = W.like()
+        columns.bind(
+            "krylov_subtract",
+            extra=8,
+            count=6,
+            slices=1,
+            second_pass=again,
+            unit_length=finish,
+            partials=device.upload(small),
+            first_pass=before,
+            h=h,
+            V=on_device,
+            w=W,
+            out=out,
+        )()
         wanted = reference.krylov_subtract(V, w, small[:6], small[6] if finish else None)
         np.testing.assert_allclose(out.get(), wanted, rtol=0, atol=1e-5)
         np.testing.assert_allclose(
@@ -287,7 +309,16 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     sums, partials = summed(0.9, 1.3)
     numbers, arrays = state(_0=2.0, _1=0.7), [device.upload(v) for v in vectors[:5]]
     resting = device.upload(rest, np.int32)
-    columns.bind("krylov_cg", slices, 0, 0, resting, partials, numbers, *arrays, extra=2)()
+    shared = {"slices": slices, "iteration": 0, "state": numbers}
+    columns.bind(
+        "krylov_cg",
+        extra=2,
+        restart=0,
+        resting=resting,
+        partials=partials,
+        **dict(zip("wpqxr", arrays, strict=True)),
+        **shared,
+    )()
     alpha, *wanted = reference.krylov_cg(sums, 2.0 * ones, 0.7 * ones, ~rest, *vectors[:5])
     for array, new in zip(arrays[1:], wanted, strict=True):
         np.testing.assert_allclose(array.get(), new, **close)
@@ -300,12 +331,13 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     R, V, H, T, P, X, G = (device.upload(u) for u in vectors)
     (sigma, _), two = summed(1.7, 2.0)
     numbers = state(_0=1.2, _9=3.0, _10=2.0)
-    columns.bind("krylov_half", slices, 0, two, numbers, R, V, H, extra=2)()
+    shared |= {"state": numbers, "r": R, "v": V, "half_way": H}
+    columns.bind("krylov_half", extra=2, partials=two, **shared)()
     half = reference.krylov_half(1.2 * ones, sigma, r, v)
     np.testing.assert_allclose(H.get(), half, **close)
     five, partials = summed(0.8, 1.1, 1.5, 0.6, 2.5)
-    arguments = (slices, 0, partials, numbers, two, G, H, T, V, P, X, R)
-    columns.bind("krylov_bicgstab", *arguments, extra=5)()
+    more = {"partials": partials, "next_partials": two, "g": G, "t": T, "p": P, "x": X}
+    columns.bind("krylov_bicgstab", extra=5, **more, **shared)()
     rho, *wanted = reference.krylov_bicgstab(five[:4], 1.2 * ones, 1.2 / sigma, half, t, v, p, x)
     np.testing.assert_allclose(numbers.get()[4], rho, rtol=1e-5)
     for array, new in zip((X, R, P), wanted, strict=True):
