@@ -126,7 +126,8 @@ def test_many_right_hand_sides_are_worth_a_factorization_and_one_is_not(device):
 
 
 def test_where_a_method_has_no_room_the_next_is_tried(device, monkeypatch):
-    S, b = system(device, ring(0.7, 1.0)), pictures()
+    S = system(device, ring(0.7, 1.0))
+    b = pictures()
     assert ltcl.solve(S, b).method == "gmres"
     monkeypatch.setattr(
         device, "memory", 40_000
@@ -150,11 +151,13 @@ def test_where_nothing_converges_it_raises_with_the_best_iterate(device, monkeyp
 @pytest.mark.parametrize("rho", [0.1, 0.5, 0.8, 4.0, 9.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_survey_of_a_diffuse_scene_holds_its_spectrum_and_foresees_gmres(device, seed, rho):
-    scene, b = lambertian(300, rho, seed, density=0.2), np.random.default_rng(6).uniform(size=300)
+    scene = lambertian(300, rho, seed, density=0.2)
+    b = np.random.default_rng(6).uniform(size=300)
     S, plain = (
         IdentityPlus(Dense(device, scene.R), weights=weights) for weights in (scene.weights, None)
     )
-    seen, eigenvalues = auto.survey(S), np.linalg.eigvals(scene.S).real
+    seen = auto.survey(S)
+    eigenvalues = np.linalg.eigvals(scene.S).real
     assert seen.spectrum[1] >= eigenvalues.max() * (1 - 1e-3)
     # Single ones a little below the rest may be missed: one product more, not a divergence.
     assert seen.spectrum[0] <= np.quantile(eigenvalues, 0.02)
@@ -169,6 +172,7 @@ def test_the_survey_of_a_diffuse_scene_holds_its_spectrum_and_foresees_gmres(dev
 def test_the_defect_is_the_part_that_turns(device, skew, defect):
     """(1 - s) M + s K of symmetric M and antisymmetric K of equal size."""
     random = np.random.default_rng(3).normal(size=(2, 300, 300)) / 300
-    M, K = random[0] + random[0].T, random[1] - random[1].T
+    M = random[0] + random[0].T
+    K = random[1] - random[1].T
     seen = auto.survey(IdentityPlus(Dense(device, (1 - skew) * M + skew * K)))
     assert seen.defect == pytest.approx(defect, abs=1e-3 if skew in (0.0, 1.0) else 0.3)

@@ -134,16 +134,15 @@ def product_of(result: Callable[[np.ndarray], Any]) -> LinearOperator:
     return by_products(2, lambda x: result(np.array([[2.0, 0.5], [0.5, 1.0]]) @ x))
 
 
-HALF, BLUE = (
-    IdentityPlus(as_operator(np.eye(3) / 2)),
-    np.pad(np.full((1, 3), np.nan), ((2, 0), (0, 0))),
-)
+HALF = IdentityPlus(as_operator(np.eye(3) / 2))
+BLUE = np.pad(np.full((1, 3), np.nan), ((2, 0), (0, 0)))
 ROWLESS = IdentityPlus(as_operator(aslinearoperator(np.eye(3) / 2)))
 PAIR = np.eye(5)  # has an inverse, its second block of two has none
 PAIR[2:4, 2:4] = [[1.0, 2.0], [2.0, 4.0]]
 PAIR[2, 4] = PAIR[4, 2] = 1.0
 HUGE = IdentityPlus(as_operator(np.outer([0.0, 0.0, 1.0], [2e38] * 3)))
-ONE, MC = np.ones(3), "monte_carlo"
+ONE = np.ones(3)
+MC = "monte_carlo"
 Row = tuple[Any, Any, str, dict[str, Any], type[LtclError], str]
 NO_STEPS: list[Row] = [
     *((S, np.ones(5), "block_gauss_seidel", {"block": 2}, InputError, "'block_gauss_seidel'.* 2 to 3 .*block")

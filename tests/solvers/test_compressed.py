@@ -30,7 +30,8 @@ rng = np.random.default_rng(5)
 
 def transforms(monkeypatch, W):
     """Those that are made from here on, one entry each."""
-    made, original = [], W._queue_product
+    made = []
+    original = W._queue_product
     monkeypatch.setattr(W, "_queue_product", lambda *arguments: made.append(original(*arguments)))
     return made
 
@@ -126,14 +127,16 @@ def test_auto_plans_in_pixels_and_runs_on_coefficients(device, basis, kind, colu
 def test_products_of_both_are_counted(device):
     made: list[np.ndarray] = []
     exact = by_products(N, lambda x: made.append(x) or EXACT @ x)
-    S, b = compressed(device)[0], rng.uniform(0.0, 1.0, (N, 2))
+    S = compressed(device)[0]
+    b = rng.uniform(0.0, 1.0, (N, 2))
     s = ltcl.solve(S, b, "chebyshev", rtol=1e-5, exact=exact)
     assert len(made) == s.iterations  # the start costs none
     assert s.products >= 2 * s.iterations
 
 
 def test_a_start_and_units_are_kept(device):
-    (S, _), b = compressed(device), rng.uniform(0.5, 1.0, (N, 2)) * (1e-30, 1e30)
+    (S, _) = compressed(device)
+    b = rng.uniform(0.5, 1.0, (N, 2)) * (1e-30, 1e30)
     x = np.linalg.solve(EXACT, b)
     s = ltcl.solve(S, b, "gmres", rtol=1e-5, exact=EXACT, x0=x)
     assert s.iterations == 0
@@ -179,7 +182,8 @@ def test_below_float32_it_refines_in_float64(device, kind, rtol):
 )
 @pytest.mark.parametrize("method", ["gmres", "auto"])
 def test_below_what_rounding_leaves_it_stagnates(device, make, rtol, most, method):
-    S, b = compressed(device)[0], rng.uniform(0.0, 1.0, N)
+    S = compressed(device)[0]
+    b = rng.uniform(0.0, 1.0, N)
     s = ltcl.solve(S, b, method, rtol=rtol, exact=make(device), throw=False)
     assert s.status is Status.STAGNATED
     assert s.residual < most

@@ -44,7 +44,8 @@ def test_columns_do_not_know_of_each_other(device, method, options):
 @pytest.mark.parametrize("method", ["cg", "bicgstab"])
 def test_a_broken_column_leaves_the_others_their_solution(device, method):
     first = np.zeros((1, 1)) if method == "cg" else [[0.0, 1.0], [-1.0, 0.0]]
-    S, n = scipy.linalg.block_diag(first, np.diag([1.0, 2.0, 4.0])), len(first)
+    S = scipy.linalg.block_diag(first, np.diag([1.0, 2.0, 4.0]))
+    n = len(first)
     b = np.stack([np.append(np.zeros(n), np.ones(3)), np.append(np.ones(n), np.zeros(3))], axis=1)
     s = ltcl.solve(as_operator(S, device), b, method, rtol=1e-5, throw=False)
     assert s.status is (Status.INDEFINITE if method == "cg" else Status.NO_STEP)
@@ -74,9 +75,12 @@ def least_residual(S: np.ndarray, b: np.ndarray, k: int, _: np.ndarray) -> np.nd
 
 def van_der_vorst(S: np.ndarray, b: np.ndarray, k: int, _: np.ndarray) -> np.ndarray:
     """BiCGStab from 0 with r_0* = b."""
-    x, r, p = np.zeros_like(b), b.copy(), b.copy()
+    x = np.zeros_like(b)
+    r = b.copy()
+    p = b.copy()
     for _step in range(k):
-        rho, v = r @ b, S @ p
+        rho = r @ b
+        v = S @ p
         alpha = rho / (v @ b)
         s = r - alpha * v
         t = S @ s
@@ -104,8 +108,10 @@ def test_iterates_are_those_of_the_textbook(device, method, rho, skew, steps):
         1
     )  # residuals fall at every step: the best iterate is the last one
     scene = lambertian(40, rho, 29)
-    S, b = scene.S + skew * random.normal(size=(40, 40)), random.normal(size=(40, 2))
-    weights, (iterate, products) = scene.weights, TEXTBOOKS[method]
+    S = scene.S + skew * random.normal(size=(40, 40))
+    b = random.normal(size=(40, 2))
+    weights = scene.weights
+    (iterate, products) = TEXTBOOKS[method]
     options: dict[str, Any] = {"weights": 2.0**200 * weights} if method == "cg" else {}
     s = ltcl.solve(
         as_operator(S, device), b, method, maxiter=steps, rtol=1e-6, throw=False, **options
@@ -122,7 +128,8 @@ def test_a_transport_brings_its_weights(device):
     scene = ltcl.scenes.box(6, sides=5, albedo=(0.1, 0.9, 0.3, 0.95, 0.6))
     T = scene.transport(device=device)
     (S,) = T.systems
-    dense, n = S.to_dense(), T.shape[1]
+    dense = S.to_dense()
+    n = T.shape[1]
     b = dense @ random.uniform(size=n)
     s = ltcl.solve(S, b, "cg", rtol=1e-4)
     assert residual(dense, s.x, b) <= 1e-4 * (1 + 1e-2)
@@ -174,9 +181,14 @@ def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k
     launches, waits, options = STEPS[method]
     Q = rotation(200)
     S = IdentityPlus(Dense(device, (Q * np.logspace(0, 3, 200)) @ Q.T - np.eye(200)))
-    b, weights = random.normal(size=(200, k)), random.uniform(0.5, 1.5, (200, k))
-    waited, taken, counts = [], [], []
-    read, write, empty = Array.get, Array.set, type(device).empty
+    b = random.normal(size=(200, k))
+    weights = random.uniform(0.5, 1.5, (200, k))
+    waited = []
+    taken = []
+    counts = []
+    read = Array.get
+    write = Array.set
+    empty = type(device).empty
     monkeypatch.setattr(Array, "get", lambda array: waited.append(array) or read(array))
     monkeypatch.setattr(
         Array, "set", lambda array, values: waited.append(array) or write(array, values)
@@ -216,7 +228,9 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     V = np.stack([gallery.vectors(rows, k, seed) for seed in range(6)])
     w, u, weights = (gallery.vectors(rows, k, seed) for seed in range(6, 9))
     on_device = device.upload(np.concatenate([V.reshape(6, -1), np.zeros((1, rows * k))]))
-    W, U, weighing = device.upload(w), device.upload(u), device.upload(weights)
+    W = device.upload(w)
+    U = device.upload(u)
+    weighing = device.upload(weights)
     columns = ColumnReductions(W, "vector_dots", "krylov_subtract")
     tolerance = reference.gamma(rows + 40) * rows * 30
     sums = columns.sums(7)
@@ -285,7 +299,9 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     columns = ColumnReductions(
         device.upload(vectors[0]), "krylov_cg", "krylov_half", "krylov_bicgstab"
     )
-    slices, rest, ones = columns.slices, np.arange(k) % 3 == 1, np.ones(k)
+    slices = columns.slices
+    rest = np.arange(k) % 3 == 1
+    ones = np.ones(k)
     close: dict[str, Any] = {"rtol": 1e-5, "atol": 1e-4}
 
     def summed(*totals: float) -> tuple[np.ndarray, Array]:
@@ -307,7 +323,8 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
         return numbers.get()[STATE_ROWS : STATE_ROWS + slices].sum(axis=0)
 
     sums, partials = summed(0.9, 1.3)
-    numbers, arrays = state(_0=2.0, _1=0.7), [device.upload(v) for v in vectors[:5]]
+    numbers = state(_0=2.0, _1=0.7)
+    arrays = [device.upload(v) for v in vectors[:5]]
     resting = device.upload(rest, np.int32)
     shared = {"slices": slices, "iteration": 0, "state": numbers}
     columns.bind(

@@ -77,7 +77,8 @@ def test_every_method_on_every_operator(device, method, name, columns):
     """S^-1 removes all bounces and (I - A)^-1 adds them: the same call (eq. 4 and 7)."""
     make, slack = SYSTEMS[name]
     A, S, options = make(device)
-    options, b = {"rtol": 1e-4} | options, random.uniform(0.0, 1.0, (N, *columns))
+    options = {"rtol": 1e-4} | options
+    b = random.uniform(0.0, 1.0, (N, *columns))
     if method in READS_ROWS and "host" in name:
         refused(f"'{method}'.*Host", A, b, method)
         return
@@ -102,10 +103,8 @@ def test_every_method_on_every_operator(device, method, name, columns):
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e25])
 def test_units_of_light_do_not_matter(device, method, scale):
     """Squares of these values leave float32; each column keeps its own tolerance, and a dark one is dark."""
-    S, b = (
-        as_operator(SCENE.S, device),
-        random.uniform(0.5, 1.0, (N, 4)) * (1.0, 1e-5, 1e5, 0.0) * scale,
-    )
+    S = as_operator(SCENE.S, device)
+    b = random.uniform(0.5, 1.0, (N, 4)) * (1.0, 1e-5, 1e5, 0.0) * scale
     s = ltcl.solve(S, b, method, rtol=1e-4)
     assert residual(SCENE.S, s.x.astype(np.float64) / scale, b / scale) <= 1e-4 * (1 + 1e-3)
     assert not s.x[:, 3].any()

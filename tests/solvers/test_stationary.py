@@ -66,7 +66,8 @@ def test_past_radius_one_it_diverges_with_its_best_iterate(device, method, optio
 def test_a_closed_room_takes_no_more_products_than_the_bound(device, method, seed, rho, rtol):
     """S is symmetric with spectrum in [1 / (1 + m), 1 + rho], so the bound on the residual is strict."""
     scene = enclosure(40, rho / (1 + rho), seed)
-    S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=(scene.n, 3))
+    S = IdentityPlus(Dense(device, scene.R))
+    b = random.normal(size=(scene.n, 3))
     s = ltcl.solve(S, b, method, rtol=rtol)
     assert residual(scene.S, s.x, b) <= rtol * (1 + 1e-3)
     foreseen = theory.chebyshev_products if method == "chebyshev" else theory.richardson_products
@@ -90,7 +91,8 @@ def test_residuals_that_swing_are_not_taken_for_trouble(device, seed, rho, rtol)
 
 def test_true_bounds_help(device):
     scene = enclosure(30, 0.9)
-    S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=scene.n)
+    S = IdentityPlus(Dense(device, scene.R))
+    b = random.normal(size=scene.n)
     spectrum = np.linalg.eigvalsh(scene.S)
     b -= b.mean()  # nothing of the dominant eigenvector, whose eigenvalue is ten times the next
     free = ltcl.solve(S, b, "chebyshev", rtol=1e-3)
@@ -105,7 +107,8 @@ def test_true_bounds_help(device):
 def test_a_few_arnoldi_steps_lose_no_products(device, arnoldi, rho, rtol):
     """They solve as well as they measure."""
     scene = lambertian(60, rho, 9, density=0.3)
-    S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(size=(60, 2))
+    S = IdentityPlus(Dense(device, scene.R))
+    b = random.uniform(size=(60, 2))
     free = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=0)
     refined = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=arnoldi)
     assert residual(scene.S, refined.x, b) <= rtol * (1 + 1e-2)
@@ -154,7 +157,8 @@ def test_every_method_passes_both_ways(device, method, dual, albedo, sides, boun
     """Chebyshev by at most half as many products again as with the true spectrum, and two to learn
     by; wrong bounds are repaired, and not slower than plain damping by far."""
     S, (least, most) = room(albedo, dual, sides)
-    options, A = {} if bounds is None else {"spectrum": bounds}, as_operator(S, device)
+    options = {} if bounds is None else {"spectrum": bounds}
+    A = as_operator(S, device)
     budget = (
         theory.richardson_products(least, 2.0 * most, 1e-3) + 3
     )  # the slowest, to a tenth of rtol
