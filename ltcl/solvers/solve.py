@@ -421,9 +421,9 @@ def _iterate(
     """
     W, right = None, b
     weighted = isinstance(method, krylov.CG) and method.inner(S) is not None
-    between = None if weighted else S.on_coefficients()
-    if between is not None:
-        S, W = between
+    if S.coefficient_basis is not None and not weighted:
+        W = S.coefficient_basis
+        S = S.on_coefficients()
     if W is None:
         norms = vectors.norms(b)
     else:

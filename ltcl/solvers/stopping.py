@@ -59,7 +59,7 @@ class System:
     products: int = 0
 
     @functools.cached_property
-    def times(self) -> precision.Product | None:
+    def times(self) -> Callable[[np.ndarray], np.ndarray] | None:
         """Products by S in float64, None where its numbers are not at hand on the host."""
         return None if self.on_coefficients else self.S.product_float64()
 
