@@ -55,6 +55,8 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     weights : (N,) float64 or None
         Weights of an inner product <x, y> = sum_i w_i x_i y_i in which the operator should be
         self-adjoint, if one is known.
+    coefficient_basis : Basis or None
+        The isometric basis W of an operator W^T C W, or I + W^T C W.
     known : Knowledge
         Facts that are found once in the life of the operator.
     """
@@ -63,6 +65,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     solution_error: float = 0.0
     error_bound: float = 0.0
     weights: np.ndarray | None = None
+    coefficient_basis: Basis | None = None
 
     def __init__(
         self, device: Device, shape: tuple[int, int], *parts: Operator | Array | None
@@ -115,12 +118,9 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
         """True if its entries lie on one device, in rows."""
         return False
 
-    def on_coefficients(self) -> tuple[Operator, Basis] | None:
-        """The same square system between the coefficients of one isometric basis, and that basis.
-
-        None if the operator has no such form.
-        """
-        return None
+    def on_coefficients(self) -> Operator:
+        """The same operator between the coefficients of `coefficient_basis`."""
+        raise InputError(f"{type(self).__name__} is not between the coefficients of one basis")
 
     # Memory.
 

@@ -63,6 +63,8 @@ class Compressed(Operator):
         self.out = out
         self.into = into
         self.two_sided = out is into and out is not None and out.isometric
+        if self.two_sided:
+            self.coefficient_basis = into
         if error is not None:
             self.error = checks.number("error", error, least=0.0)
         elif core.error and not self._keeps_norms:
@@ -103,11 +105,9 @@ class Compressed(Operator):
             return self.core.norm_bound()
         return super().norm_bound()
 
-    def on_coefficients(self) -> tuple[Operator, Basis] | None:
-        """C and W if R = W^T C W in an isometric basis."""
-        if not self.two_sided or self.into is None:
-            return None
-        return self.core, self.into
+    def on_coefficients(self) -> Operator:
+        """The core C, where R = W^T C W in an isometric basis."""
+        return self.core if self.two_sided else super().on_coefficients()
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         first, last = (self.out, self.into) if transpose else (self.into, self.out)

@@ -15,7 +15,6 @@ from ltcl import checks
 from ltcl.device import Array
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
-from ltcl.operators.bases import Basis
 from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.knowledge import Float64Form, NormBound
 from ltcl.operators.stepper import Stepper
@@ -56,6 +55,7 @@ class IdentityPlus(Operator):
         super().__init__(R.device, R.shape, R)
         self.R = R
         self.sign = float(sign)
+        self.coefficient_basis = R.coefficient_basis
         self.error = R.error
         self.solution_error = float(solution_error)
         self.error_bound = self.solution_error
@@ -82,19 +82,15 @@ class IdentityPlus(Operator):
             return self
         return IdentityPlus(self.R, self.sign, self.weights)
 
-    def on_coefficients(self) -> tuple[Operator, Basis] | None:
-        """I + sign C and W, if R = W^T C W in an isometric basis W; made once."""
-        inner = self.R.on_coefficients()
-        if inner is None:
-            return None
-        core, basis = inner
+    def on_coefficients(self) -> Operator:
+        """I + sign C, where R = W^T C W in an isometric basis W; made once."""
         if self.known.coefficient_system is None:
-            system = IdentityPlus(core, self.sign)
+            system = IdentityPlus(self.R.on_coefficients(), self.sign)
             # Weights and row sums in pixels bound the spectrum.
             system.weights = self.weights
             system.known.row_sums = self.row_sums()
             self.known.coefficient_system = system
-        return self.known.coefficient_system, basis
+        return self.known.coefficient_system
 
     def stepper(
         self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0

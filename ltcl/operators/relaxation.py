@@ -186,8 +186,10 @@ class Relaxation:
 
     def _block_rows(self, nbytes: int, block: int | None) -> int:
         n = max(1, self.n)
-        if not block:
-            block = INVERTED if self.inverses else STRIP_BYTES * n // max(1, nbytes)
+        if not block and self.inverses:
+            block = INVERTED
+        elif not block:
+            block = STRIP_BYTES * n // max(1, nbytes)
         return max(1, min(block, n))
 
     def _panel_rows(self, nbytes: int) -> int:

@@ -52,7 +52,7 @@ class Slab:
 
     @property
     def arrays(self) -> list[Array]:
-        """Its arrays on the device."""
+        """All its arrays on the device."""
         return [value for value in self.arguments.values() if isinstance(value, Array)]
 
     @property
@@ -343,7 +343,7 @@ class SparseRows(RowOperator):
 
 @dataclass(frozen=True, kw_only=True)
 class StepPiece:
-    """One launch of a step: a slab, a piece of right-hand sides, and the groups before its own."""
+    """A launch of a step: a slab, a piece of right-hand sides, and the groups before its own."""
 
     kernel: Kernel
     items: int

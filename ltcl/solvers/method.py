@@ -104,10 +104,9 @@ class IterativeMethod(Method):
         with_residual: bool = False,
     ) -> IterationResult:
         """Iterate on S x = b, from zero if `start` is None; `host_b` is b before it became float32."""
-        inner = None if self.needs_pixels(S) else S.on_coefficients()
-        if inner is not None:
-            operator, basis = inner
-            space = CoefficientSpace(basis=basis, operator=operator)
+        basis = S.coefficient_basis
+        if basis is not None and not self.needs_pixels(S):
+            space = CoefficientSpace(basis=basis, operator=S.on_coefficients())
             return self._run_on_coefficients(space, b, rule, start, with_residual)
         norms = vectors.norms(b)[0]
         system = CountedOperator(S=S, b=b, norms=norms, host=host_b)

@@ -85,16 +85,13 @@ def test_sides_and_bytes_of_compressed_operators(device):
 def test_systems_between_coefficients(device):
     R = two_sided(device, gallery.bounces(N, 0.5))
     S = IdentityPlus(R, -1, weights=np.ones(N))
-    between = S.on_coefficients()
-    assert between is not None
-    system, W = between
-    assert W is R.into
+    assert S.coefficient_basis is R.into
+    system = S.on_coefficients()
     np.testing.assert_allclose(system.to_dense(), np.eye(N) - R.core.to_dense(), atol=1e-6)
     # What is learnt of the system serves all solves; row sums in pixels bound its spectrum.
-    again = S.on_coefficients()
-    assert again is not None
-    assert again[0] is system
+    assert S.on_coefficients() is system
     assert system.row_sums() is S.row_sums()
-    one_sided = Compressed(R.core, R.out, None)
-    assert IdentityPlus(one_sided).on_coefficients() is None
-    assert IdentityPlus(R.core).on_coefficients() is None
+    for other in (Compressed(R.core, R.out, None), R.core):
+        assert IdentityPlus(other).coefficient_basis is None
+        with pytest.raises(InputError, match="one basis"):
+            IdentityPlus(other).on_coefficients()

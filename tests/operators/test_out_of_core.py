@@ -113,7 +113,7 @@ def test_a_file_that_changes_is_refused(tmp_path, device):
 
 
 def test_a_file_that_is_cut_before_its_first_use_is_refused(tmp_path, no_room):
-    """Its size is compared: reading what is mapped there ends the process, by SIGBUS."""
+    """The size is compared: reading what is mapped there ends the process, by SIGBUS."""
     np.save(tmp_path / "T.npy", transport())
     T = ltcl.load(tmp_path / "T.npy", grid=GRID)
     os.truncate(tmp_path / "T.npy", 5000)

@@ -16,9 +16,8 @@ from tests.operators import helpers
 
 def doubling(**methods: Any) -> scipy.sparse.linalg.LinearOperator:
     """2 I of 3 pixels, with a product alone and some more methods."""
-    return scipy.sparse.linalg.LinearOperator(
-        shape=(3, 3), matvec=lambda x: 2.0 * x, dtype=float, **methods
-    )
+    methods |= {"shape": (3, 3), "matvec": lambda x: 2.0 * x, "dtype": float}
+    return scipy.sparse.linalg.LinearOperator(**methods)
 
 
 def test_operators_may_lack_a_transpose(device):
