@@ -26,7 +26,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -148,50 +147,6 @@ def minimise(
         saturated=search.saturated,
         gap=float(np.max(search.excess / search.scale)),
     )
-
-
-def least_squares(
-    A: Operator,
-    b: np.ndarray,
-    free: np.ndarray,
-    weights: np.ndarray,
-    *,
-    rtol: float,
-    maxiter: int = 100,
-) -> np.ndarray:
-    """Find the x (N, ...), 0 but where `free`, for which w A x is nearest to w b (M, ...).
-
-    Conjugate gradients on the normal equations (Saad, Iterative Methods for Sparse Linear Systems,
-    2nd ed., algorithm 8.4, whose names these are). Each column has free entries and weights of its
-    own, which broadcast to x and b. Done when the gradient of every column is at most rtol times
-    the first one, or after `maxiter` steps of two products.
-    """
-
-    def product(matrix: Any, a: np.ndarray) -> np.ndarray:
-        columns = a.reshape(len(a), -1).astype(np.float32)
-        return (matrix @ columns).reshape(-1, *b.shape[1:])
-
-    x = np.zeros((A.shape[1], *b.shape[1:]))
-    p = x
-    r = b
-    z_squared = np.ones(b.shape[1:])
-    first_squared = z_squared
-    for step in range(maxiter):
-        z = free * product(A.T, weights**2 * r)
-        previous = z_squared
-        z_squared = np.sum(z**2, axis=0)
-        if step == 0:
-            first_squared = z_squared
-        if (z_squared <= rtol**2 * first_squared).all():
-            break
-        beta = safe_ratio(z_squared, previous, previous > 0.0)
-        p = z + beta * p
-        w = product(A, p)
-        curvature = np.sum((weights * w) ** 2, axis=0)
-        alpha = safe_ratio(z_squared, curvature, curvature > 0.0)
-        x = x + alpha * p
-        r = r - alpha * w
-    return x
 
 
 def round_inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
