@@ -51,7 +51,7 @@ TIMED_LAUNCHES = 16
 
 @dataclass(frozen=True, kw_only=True)
 class StepCost:
-    """What a method needs between two products: vectors read or written, launches and waits."""
+    """The needs of a method between two products: vectors read or written, launches and waits."""
 
     vectors: int
     launches: int
@@ -97,7 +97,7 @@ class PlannedMethod:
 
 
 class GMRESTrial(GMRES):
-    """One cycle of GMRES, however many steps the caller allows."""
+    """A single cycle of GMRES, however many steps the caller allows."""
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, for one cycle."""
@@ -140,7 +140,8 @@ class _Attempts:
         if S.product_float64() is not None:
             self.problem = dataclasses.replace(self.problem, exact=S)
             self.reasons.append(
-                f"refined in float64, since rtol={self.target:g} is below what float32 products reach"
+                f"refined in float64, since rtol={self.target:g} is below what float32 products "
+                "reach"
             )
         elif pixels > LARGEST_DIRECT:
             raise ToleranceError(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Least squares within bounds: min ||w (A x - b)|| over lower <= x <= upper, by products with A and A^T.
+"""Least squares within bounds: min ||w (A x - b)|| over lower <= x <= upper.
 
-A is (M, N), x (N, k), b and w (M, k). Projected conjugate directions: with r = w (b - A x),
-g = -A^T w r, and z = -g but for what the bounds forbid,
+Only products with A and A^T are needed. A is (M, N), x (N, k), b and w (M, k). Projected conjugate
+directions: with r = w (b - A x), g = -A^T w r, and z = -g but for what the bounds forbid,
 
     p = z + beta d,   d' = clip(x + alpha p) - x,   x' = x + lambda d'
 
@@ -404,12 +404,12 @@ class _Descent:
         return np.sqrt(squares.sum(axis=0)), gaps.sum(axis=0)
 
     def rounding(self) -> np.ndarray:
-        """Return what rounding of w A x hides of the errors, if columns of A have size 1 at most."""
+        """Return what rounding hides of the errors, if columns of A have size 1 at most."""
         size = np.asarray(vectors.norm(self.x))
         return ROUNDING_SHARE * self._largest_weight * size
 
     def saturated(self, x: np.ndarray) -> np.ndarray:
-        """Return the entries that a step along -g takes beyond a bound; some do not touch it yet."""
+        """Return the entries that a step along -g takes beyond a bound, touched or not."""
         lower, upper = _as_columns(self._box)
         stepped = x - self._alpha * self.g.get()
         return (lower < upper) & ((stepped < lower) | (stepped > upper))

@@ -30,7 +30,7 @@ from ltcl.solvers.stopping import CountedOperator, Monitor
 
 @dataclass(frozen=True, kw_only=True)
 class BoundsSearch:
-    """How bounds on the spectrum are tightened, judged and repaired."""
+    """Parameters by which bounds on the spectrum are tightened, judged and repaired."""
 
     # Steps of GMRES before the iteration, and of each repair.
     first_steps: int = 2
@@ -56,7 +56,7 @@ Bounds = tuple[float, float]
 
 
 def chebyshev_steps(lower: float, upper: float) -> Iterator[tuple[float, float]]:
-    """Return (keep, gain) of one step after the other, for a spectrum of S in [lower, upper], 0 < lower.
+    """Return (keep, gain) of one step after the other, for a spectrum in [lower, upper], 0 < lower.
 
     With lower = upper it is Richardson's iteration, with both 1 the Neumann series.
 
@@ -152,7 +152,7 @@ class Chebyshev(IterativeMethod):
         r: Array,
         monitor: Monitor,
     ) -> bool:
-        """Iterate with these bounds; return whether residuals grew beyond `limit` times the theory's."""
+        """Iterate with these bounds; return whether residuals grew beyond `limit` times theory."""
         start = monitor.iterations
         initial = max(monitor.residuals[-1], monitor.lowest)
         monitor.factor = chebyshev_rate(*bounds)

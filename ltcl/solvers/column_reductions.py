@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Sums over each column of (N, k) arrays, between two products, that stay on the device.
 
-A kernel leaves partial sums of each column in a few slices of the rows (`kernels/common/columns.h`);
-a group of the next kernel adds them up and computes the coefficients of its columns. So several
-steps can be queued between two readings.
+A kernel leaves partial sums of each column in a few slices of the rows
+(`kernels/common/columns.h`); a group of the next kernel adds them up and computes the coefficients
+of its columns. So several steps can be queued between two readings.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def safe_ratio(numerator: np.ndarray, denominator: np.ndarray, where: np.ndarray
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StepReadings:
-    """Numbers of the state after some steps, (STATE_ROWS, k), and residual norms of each, (steps, k)."""
+    """Numbers of the state after some steps, (STATE_ROWS, k), and residual norms, (steps, k)."""
 
     state: np.ndarray
     norms: np.ndarray
 
 
 class ColumnReductions:
-    """How the kernels of files that include `common/columns.h` run on arrays like `x`, (N,) or (N, k)."""
+    """Kernels of files that include `common/columns.h`, for arrays like `x`, (N,) or (N, k)."""
 
     def __init__(self, x: Array, *kernels: str) -> None:
         self.device = x.device

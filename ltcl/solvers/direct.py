@@ -124,7 +124,7 @@ def substitute(S: Operator, b: np.ndarray) -> DirectSolution | None:
 
 
 def factorize(S: Operator) -> Factorization | None:
-    """Return the factors of S, computed once in its life; None if it is singular to working precision."""
+    """Return the factors of S, computed once; None if S is singular to working precision."""
     if S.known.factorization is None:
         S.known.factorization = _compute_factors(S)
     return S.known.factorization

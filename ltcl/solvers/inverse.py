@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""S^-1 = I - A, prepared once: a solution is one product, x = b - A b, and its error is bounded in advance.
+"""S^-1 = I - A, prepared once: a solution is one product, x = b - A b, with a known error bound.
 
 A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ...; `ltcl.invert`
 computes it.
@@ -119,7 +119,7 @@ class Inverse:
 
     @property
     def A(self) -> Operator | tuple[Operator, ...]:
-        """One bounce: the operator itself, or three of them in colour."""
+        """The first bounce: the operator itself, or three of them in colour."""
         bounces = tuple(system.R for system in self.systems)
         return bounces[0] if self.channels == 1 else bounces
 
@@ -171,7 +171,7 @@ class Inverse:
         background: float = 0.0,
         gain: float = 1.0,
     ) -> np.ndarray:
-        """Compute the projector pattern for a picture or frames of a video, by one product a channel.
+        """Compute the projector pattern for a picture or a video, by one product a channel.
 
         l_in = F^-1 (b - A b) for b = gain * desired - background, float32, clamped to the bounds.
         Other pixels do not make up for what the bounds cut; `ltcl.compensate`, whose options these
@@ -194,7 +194,7 @@ class Inverse:
         return shape.pack(patterns, self.grid)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return plain arrays by name, as files hold them; `from_arrays` restores them to the bit."""
+        """Return plain arrays by name, as files hold them; `from_arrays` restores every bit."""
         values = (self.grid, self._F, self.errors, self.confidence)
         arrays = {name: np.array(value) for name, value in zip(_ARRAYS, values, strict=True)}
         if self.mixing is not None:

@@ -27,7 +27,7 @@ from ltcl.solvers.stopping import CountedOperator, Monitor
 
 @dataclass(frozen=True)
 class CG(IterativeMethod):
-    """Conjugate gradients, the fewest products where S is self-adjoint. Option: ``weights``, of <x, y>.
+    """Conjugate gradients, the fewest products for a self-adjoint S. Option: ``weights`` of <x, y>.
 
     S of a Lambertian scene is self-adjoint in <x, y> = sum_i w_i x_i y_i with w = area / albedo, by
     reciprocity: with pixels of equal area w = 1 / F, the default if S = T F^-1 comes from a
@@ -176,10 +176,10 @@ class BiCGStab(IterativeMethod):
 
 
 class _BiCGStabIteration:
-    """The state of one solve with BiCGStab, whose names are Saad's: shadow is r*, half is s, g = S^T r*.
+    """The state of one solve with BiCGStab; in Saad's names shadow is r*, half is s; g = S^T r*.
 
-    State rows of the kernels, for even and for odd steps: rho and the phase of a column; then, once:
-    alpha, |r*|^2, and the square that <r*, v> is compared with, |S^T r*|^2 or |r*|^2.
+    State rows of the kernels, for even and for odd steps: rho and the phase of a column; then, only
+    once: alpha, |r*|^2, and the square that <r*, v> is compared with, |S^T r*|^2 or |r*|^2.
     """
 
     RHO = 0, 4
@@ -326,7 +326,9 @@ class _BiCGStabIteration:
 
 @dataclass(frozen=True)
 class GMRES(IterativeMethod):
-    """The least residual for any S, in m + 1 pictures of memory. Option: ``restart``, m, steps of a cycle.
+    """The least residual for any S, in m + 1 pictures of memory. Option: ``restart``, m.
+
+    m is the number of steps of a cycle.
 
     Step j makes 2 j + 1 inner products: where products are cheap Chebyshev takes less time. x is
     formed at the end of a cycle, with its residual V (beta e_1 - H y).

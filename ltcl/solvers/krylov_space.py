@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Arnoldi's process for (N, k) right-hand sides, column by column: an orthonormal basis of a Krylov space.
+"""Arnoldi's process for (N, k) right-hand sides, column by column.
 
 Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 6.2 in
 blocks and 6.9, section 6.5.3 for the rotations. Gram-Schmidt is done twice, which is enough for
@@ -23,7 +23,7 @@ SINGULAR = 2.0**-20
 
 
 class KrylovSpace:
-    """An orthonormal basis v_0, v_1, ... of the Krylov space of S and r (N, k), S V = V H, by columns.
+    """An orthonormal basis v_0, v_1, ... of the Krylov space of S and r (N, k), with S V = V H.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class KrylovSpace:
         return active & (below == 0.0)
 
     def improve(self, x: Array, r: Array) -> np.ndarray:
-        """Move x to the least residual in the space, and r with it; return the lengths (k,) of the way."""
+        """Move x to the least residual in the space, and r with it; return how far, (k,)."""
         steps = self.count
         H = self.H[:, : steps + 1, :steps]
         used = H * self._is_step[:, None, :steps]
@@ -193,7 +193,7 @@ class KrylovSpace:
 def krylov_cycle(
     system: CountedOperator, x: Array, r: Array, monitor: Monitor, steps: int
 ) -> KrylovSpace:
-    """Improve `x` and its residual `r`, whose norms the monitor knows, by up to so many steps of GMRES."""
+    """Improve `x` and its residual `r`, whose norms the monitor knows, by a few steps of GMRES."""
     beta = monitor.norms
     active = monitor.unsolved
     left = monitor.rule.maxiter - monitor.iterations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The whole inverse as a series of matrices, term by term: N^3 operations each. The paper's baseline.
+"""The whole inverse as a series of matrices, the paper's baseline: N^3 operations a term.
 
     S^-1 = I - R + R^2 - ...   (eq. 10),      (I - A)^-1 = I + A + A^2 + ...   (eq. 8)
 

@@ -103,7 +103,7 @@ class IterativeMethod(Method):
         host_b: np.ndarray | None = None,
         with_residual: bool = False,
     ) -> IterationResult:
-        """Iterate on S x = b, from zero if `start` is None; `host_b` is b before it became float32."""
+        """Iterate on S x = b from `start`, or zero; `host_b` is b before it became float32."""
         basis = S.coefficient_basis
         if basis is not None and not self.needs_pixels(S):
             space = CoefficientSpace(basis=basis, operator=S.on_coefficients())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Monte Carlo (section 7 of the paper): every pixel of S^-1 b on its own, by random walks over the rows of R.
+"""Monte Carlo (section 7 of the paper): every pixel of S^-1 b by random walks over the rows of R.
 
     l_d(i) = l_out(i) + sum over k >= 1 and paths of (-1)^k R_i i1 R_i1 i2 ... l_out(ik)    (eq. 23)
 
@@ -310,7 +310,7 @@ class _Stages:
         self.spent[active] += needed
 
     def _next_samples(self, active: np.ndarray, least: np.ndarray) -> np.ndarray:
-        """Return the samples n with a / n + b / n^2 <= 1, in units of the target, and some to spare."""
+        """Return the samples n with a / n + b / n^2 <= 1, and some to spare."""
         with np.errstate(over="ignore", divide="ignore"):
             a = self.samples[active, None] * (self.spread[active] / self.target) ** 2
             b = (self.unmet[active] / self.target) ** 2

@@ -179,7 +179,7 @@ def check_square(name: str, S: Any) -> tuple[int, ...]:
 
 
 def scale_rhs(b: Any, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return b, (rows,) or (rows, k), in units near the largest value of each column, and the units.
+    """Return b, (rows,) or (rows, k), in units near the largest value of each column, and these.
 
     float32 stays float32.
     """
@@ -195,7 +195,7 @@ def scale_rhs(b: Any, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unscale(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return x times its unit: float32 if x is, and if float32 holds all of the product; else float64."""
+    """Return x times its unit: float32 if x is and float32 holds the product, else float64."""
     if x.dtype == np.float32 and np.all(unit >= SMALLEST_NORMAL_FLOAT32):
         with np.errstate(all="ignore"):
             product = x * unit.astype(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Gauss-Seidel, SOR, block Gauss-Seidel and Southwell relax one row or block of rows after the other.
+"""Gauss-Seidel, SOR, block Gauss-Seidel and Southwell: relaxation of rows, or blocks of rows.
 
     row after row i:       l_i += omega (l_out_i - sum_(j<i) S_ij l_j^(k+1)
                                          - sum_(j>=i) S_ij l_j^(k)) / S_ii
@@ -49,7 +49,7 @@ class BlockGaussSeidel(IterativeMethod):
             checks.number("omega", self.omega, above=0.0, below=2.0)
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
-        """Improve `x`, whose residual is `r`, until the monitor ends it with one of the iterates."""
+        """Improve `x`, whose residual is `r`, until the monitor ends it with an iterate."""
         how = relaxation(system.S, self.name, self.block, self.omega)
         sweeps = Sweeps(how, x, system.b, r)
         sweeps.sweep()
@@ -80,7 +80,7 @@ class SOR(GaussSeidel):
 
 @dataclass(frozen=True)
 class Southwell(IterativeMethod):
-    """Southwell's relaxation. Option: ``rows`` relaxed in one step; a 64th of the picture when not given.
+    """Southwell's relaxation. Option: ``rows`` relaxed in one step, or a 64th of the picture.
 
     With ``rows=1`` it converges for every self-adjoint S. With more, as many equal pieces of the
     picture relax their largest residuals at once, which may diverge. An iteration relaxes N rows:
@@ -119,7 +119,7 @@ def _repeat(
     r: Array,
     monitor: Monitor,
 ) -> None:
-    """Queue iterations, each of which leaves the residual of `x` in `r`, until the monitor ends the solve."""
+    """Queue iterations, which leave the residual of `x` in `r`, until the solve ends."""
     squares = x.device.empty((SLOTS, x.columns))
     while True:
         ahead = monitor.steps_ahead()

@@ -16,10 +16,13 @@ SERIES_METHODS = ("jacobi", "neumann", "matrix_series")
 
 
 class Status(enum.Enum):
-    """How a solve ended; the value says why, and most say what to try next."""
+    """The end of a solve; the value says why, and most say what to try next."""
 
     CONVERGED = "the true residual is within the tolerance"
-    MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
+    MAXITER = (
+        "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another "
+        "method"
+    )
     DIVERGED = "the residual grew"
     STAGNATED = (
         "the residual stopped falling, or rounding may hide more than the tolerance; loosen rtol"
@@ -55,7 +58,8 @@ class Solution:
         Products with S, including those of checks. "auto" counts all methods that it tried, and
         the survey in the solve that made it, but not the product for the row sums of an operator.
     residuals : tuple of float
-        ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
+        ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand
+        sides.
     seconds : float
         Wall time, including transfers.
     method, reason : str
@@ -91,7 +95,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether the tolerance was met, by a true residual or by a bound on the error of x."""
+        """True if the tolerance was met, by a true residual or by a bound on the error of x."""
         return self.status in (Status.CONVERGED, Status.PRECOMPUTED)
 
     @property
@@ -111,7 +115,8 @@ class Solution:
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.x.shape))
-        end = f"{self.status.name.lower()} after {self.products} products, residual {self.residual:.2g}"
+        name = self.status.name.lower()
+        end = f"{name} after {self.products} products, residual {self.residual:.2g}"
         return f"<ltcl Solution of {shape} values by {self.method}: {end}>"
 
     def _outcome(self) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the methods that draw random numbers share: options, channels that share walks, results.
+"""The common part of methods that draw random numbers: options, channels, results.
 
 Right-hand sides share their walks, and so do three colours if that leaves a finite variance. If
 not, each channel takes walks of its own.
@@ -157,7 +157,7 @@ class Sampler(Method):
         return solutions
 
     def _sample(self, channels: Channels, callback: Callback | None) -> list[Solution]:
-        """Return one estimate a channel; the callback is called at the start, at each step, and at the end."""
+        """Return one estimate a channel; call the callback at the start, each step, and the end."""
         numbers = itertools.count()
 
         def report(residual: float) -> None:

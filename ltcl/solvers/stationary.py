@@ -87,7 +87,7 @@ class Neumann(Jacobi):
 
 @dataclass(frozen=True)
 class Richardson(Jacobi):
-    """Richardson's iteration. Option: ``omega``, the damping; the best one for the free bounds of S."""
+    """Richardson's iteration. Option: ``omega``, the damping; the best for the free bounds."""
 
     name: ClassVar[str] = "richardson"
     omega: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]

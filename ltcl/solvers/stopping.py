@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The stopping rule of all methods, and the system that it judges.
 
-``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2) for each column of b. CONVERGED is claimed only if a
-residual is within the tolerance after all that rounding may hide of it is added
+``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2) for each column of b. CONVERGED is claimed only if
+a residual is within the tolerance after all that rounding may hide of it is added
 (`ltcl.solvers.precision`); it is recomputed from x where needed.
 """
 
@@ -168,7 +168,7 @@ class Monitor:
         return max(0, len(self.residuals) - 1)
 
     def steps_ahead(self) -> int:
-        """Return how many steps to queue before residuals are read: half of those that seem missing.
+        """Return the steps to queue before residuals are read: half of those that seem missing.
 
         They are at most as many as were made so far: a product in vain costs more than a reading.
         """
@@ -226,7 +226,7 @@ class Monitor:
         return self.status is not None
 
     def above(self, norms: np.ndarray) -> np.ndarray:
-        """Return the columns, (k,) bool, whose residuals of these norms exceed the tolerance or are NaN."""
+        """Return the columns, (k,) bool, whose residual norms exceed the tolerance or are NaN."""
         return ~(norms <= self._target)
 
     def needs_iterate(self, norms: np.ndarray) -> bool:
@@ -295,7 +295,7 @@ class Monitor:
             return digits / -np.log(factor)
 
     def _confirm(self, x: Any, r: Array, norms: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return norms (k,) of the newest residual, as exact as needed, and whether they solve the system."""
+        """Return norms (k,) of the newest residual, as exact as needed, and whether x solves."""
         system = self.system
         seems_solved = bool(np.all(norms <= self._target))
         seems_recursive = self._recursion_steps > 0 and np.all(norms <= self._recursion_limit)
@@ -325,7 +325,7 @@ class Monitor:
         return norms, False
 
     def _refuse(self, norms: np.ndarray) -> None:
-        """Count a claim that was not confirmed; a better one than those before starts the count anew."""
+        """Count a claim that was not confirmed; one better than those before restarts the count."""
         worst = float(np.max(norms / self._scale))
         if worst > PROGRESS_FACTOR * self._lowest_refused:
             self._refusals += 1

@@ -52,14 +52,14 @@ class Survey:
 
     @property
     def in_an_interval(self) -> bool:
-        """Whether all eigenvalues seem to lie near some interval of positive numbers."""
+        """True if all eigenvalues seem to lie near some interval of positive numbers."""
         smallest = float(np.min(np.real(self.ritz), initial=np.inf))
         largest_imaginary = np.max(np.abs(np.imag(self.ritz)), initial=0.0)
         return smallest > 0.0 and bool(largest_imaginary <= MAX_IMAGINARY_RATIO * smallest)
 
     @property
     def self_adjoint(self) -> bool:
-        """Whether cg will work as in theory."""
+        """True if cg will work as in theory."""
         return self.defect <= MAX_SELF_ADJOINT_DEFECT
 
     def krylov_products(self, rtol: float) -> float:

@@ -45,7 +45,7 @@ def slow_cases(*values: Any) -> list[Any]:
 
 
 def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
-    """Options with which a method takes steps even where N is small: one block of all rows solves at once."""
+    """Options for a small N, of which one block of all rows would be solved at once."""
     return {"block": block} if method == "block_gauss_seidel" else {}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`auto` picks a method before the first step and says why; what its survey of three products tells of S."""
+"""`auto` chooses a method before the first step and says why; its survey shows the spectrum."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_the_choice_and_its_reason(device, case):
 
 
 def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device):
-    """Three products of a survey count in the solve that made it, and no other; factors live as long as S."""
+    """The products of a survey count in the solve that made it alone; factors live as long as S."""
     S = system(device, ring(0.5))
     first, second, third = (ltcl.solve(S, pictures()) for _ in range(3))
     assert (first.method, first.products) == ("gmres", ltcl.solve(S, pictures(), "gmres").products)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Least squares within bounds: as `scipy.optimize.lsq_linear` finds them, and no certificate that lies."""
+"""Least squares within bounds against `scipy.optimize.lsq_linear`, and certificates that hold."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_it_finds_the_least_squares(rho, weighted, bright, seed):
     scale=st.sampled_from([1e-12, 1.0, 1e9]),
 )
 def test_never_above_the_start_and_never_certified_too_low(seed, shape, k, scale):
-    """Of any matrix: each certificate holds, at whatever step the solve is cut off."""
+    """Each certificate holds for any matrix, at whatever step the solve is cut off."""
     rng = np.random.default_rng(seed)
     A = rng.normal(size=shape).astype(np.float32)
     b = scale * rng.normal(size=(shape[0], k))
@@ -189,7 +189,7 @@ def test_never_above_the_start_and_never_certified_too_low(seed, shape, k, scale
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_bent_direction_starts_conjugacy_anew(seed):
-    """Without, some of these take ten times as many steps, or none of all that are allowed helps."""
+    """Otherwise some of these take ten times as many steps, or do not converge."""
     S = enclosure(60, 0.8, seed=seed).S.astype(np.float32)
     b = S @ np.random.default_rng(seed).uniform(-1, 2, (60, 1))
     assert within(S, b, 0, 1, 0.5, rtol=1e-4, maxiter=40).converged
@@ -239,7 +239,7 @@ def test_what_ends_a_solve():
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_column_that_float32_has_lost_is_not_certified(device, seed):
-    """S = T F^-1 with F far above T: of x = F p, rounding of (I + R) x hides more than the residual."""
+    """S = T F^-1 with F far above T: for x = F p, rounding of S x hides more than the residual."""
     rng = np.random.default_rng(seed)
     T = rng.uniform(0.0, 0.3, (2, 2)) + np.diag(rng.uniform(0.2, 1.0, 2))
     F = np.diagonal(T) * (1e6, 1e-6)

@@ -169,7 +169,7 @@ def no_room(*_: Any) -> None:
 
 @pytest.mark.parametrize("largest", [auto.LARGEST_DIRECT, auto.SMALL])
 def test_auto_refines_where_it_cannot_factorize(device, monkeypatch, largest):
-    """In float64 by the numbers of S, or it says what the least tolerance is."""
+    """It refines in float64 by the numbers of S, or says what the least tolerance is."""
     monkeypatch.setattr(scipy.linalg, "lu_solve", no_room)
     monkeypatch.setattr(auto, "LARGEST_DIRECT", largest)
     n = auto.SMALL + 8
@@ -187,7 +187,7 @@ def test_auto_refines_where_it_cannot_factorize(device, monkeypatch, largest):
 
 
 def test_a_transpose_that_does_not_fit_keeps_the_best_iterate(device, monkeypatch):
-    """Of a one-way ring, which no polynomial in S solves."""
+    """No polynomial in S solves a one-way ring."""
     monkeypatch.setattr(auto, "LARGEST_DIRECT", auto.SMALL)
     n = auto.SMALL + 8
     S = by_products(n, lambda x: x + 3.0 * np.roll(x, 1, axis=0), rmatvec=no_room)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Solves on coefficients of a compressed S; refinement, where it makes the steps and the exact S judges."""
+"""Solves on coefficients of a compressed S, and refinement judged by the exact S."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ rng = np.random.default_rng(5)
 
 
 def transforms(monkeypatch, W):
-    """Those that are made from here on, one entry each."""
+    """The list of transforms from here on, one entry each."""
     made = []
     original = W._queue_product
     monkeypatch.setattr(W, "_queue_product", lambda *arguments: made.append(original(*arguments)))
@@ -78,7 +78,7 @@ def test_residuals_are_relative_to_the_whole_of_b(device, method):
 
 
 def test_cg_keeps_its_inner_product(device, monkeypatch):
-    """diag(w) in pixels is W diag(w) W^T in coefficients: no diagonal, so cg stays in pixels there."""
+    """diag(w) in pixels is not diagonal in coefficients, W diag(w) W^T: cg stays in pixels."""
     S, truth = compressed(device, SKEW, keep=1.0, weights=SKEW.weights)
     b = rng.uniform(0.0, 1.0, (N, 3))
     made = transforms(monkeypatch, S.R.into)  # pyright: ignore[reportAttributeAccessIssue]
@@ -91,7 +91,7 @@ def test_cg_keeps_its_inner_product(device, monkeypatch):
 
 @pytest.mark.parametrize("method", ["chebyshev", "gmres"])
 def test_a_compressed_operator_without_identity_stays_in_pixels(device, method):
-    """W^T C W is singular if W leaves coefficients out: no light of these is claimed to be solved."""
+    """W^T C W is singular if W leaves coefficients out; their light is not claimed as solved."""
     S, _ = subset(device)
     b = rng.uniform(0.5, 1.0, N)
     s = ltcl.solve(S.R, b, method, rtol=1e-2, throw=False)

@@ -61,7 +61,7 @@ def krylov_basis(S: np.ndarray, b: np.ndarray, k: int) -> np.ndarray:
 
 
 def least_energy(S: np.ndarray, b: np.ndarray, k: int, weights: np.ndarray) -> np.ndarray:
-    """The iterate of CG: its error is orthogonal to the space in <x, S y> with weights (Saad, 6.7)."""
+    """The iterate of CG: its error is orthogonal to the space in <x, S y> (Saad, section 6.7)."""
     V = krylov_basis(S, b, k)
     left = V.T * weights
     return V @ np.linalg.solve(left @ S @ V, left @ b)
@@ -100,8 +100,8 @@ TEXTBOOKS: dict[str, tuple[Callable[..., np.ndarray], int]] = {  # products of a
 
 @pytest.mark.parametrize("steps", [1, 2, 4])
 @pytest.mark.parametrize(("method", "rho", "skew"), [
-    ("cg", 0.8, 0.0), ("cg", 4.0, 0.0), ("gmres", 4.0, 0.0), ("gmres", 0.5, 1 / 8), ("bicgstab", 4.0, 0.0),
-    ("bicgstab", 4.0, 0.1),
+    ("cg", 0.8, 0.0), ("cg", 4.0, 0.0), ("gmres", 4.0, 0.0), ("gmres", 0.5, 1 / 8),
+    ("bicgstab", 4.0, 0.0), ("bicgstab", 4.0, 0.1),
 ])  # fmt: skip
 def test_iterates_are_those_of_the_textbook(device, method, rho, skew, steps):
     random = np.random.default_rng(

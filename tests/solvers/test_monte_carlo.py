@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Methods that sample: Monte Carlo is unbiased with true standard errors, hybrid is Jacobi in the mean.
+"""Monte Carlo is unbiased with true standard errors; hybrid is Jacobi in the mean.
 
 Systems without a finite variance are refused. Three S share one walk a sample, and have walks of
 their own where sharing does not help.
@@ -109,7 +109,7 @@ NAMES = [
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_mean_of_many_runs_is_the_solution_of_every_channel(device, name, variant):
-    """Within 4 standard errors at every pixel, and these are as large as the runs' own spread says."""
+    """It is within 4 standard errors at every pixel, which agree with the spread of the runs."""
     S, dense = system(device, name)
     is_colour = dense.ndim == 3
     count = 24 if is_colour else 48
@@ -214,7 +214,7 @@ def test_a_target_error_is_in_the_units_of_x_and_reached_in_every_channel(device
 
 
 def test_stopping_by_the_spread_leaves_no_bias(device):
-    """Skewed scores: where few have met light, those with the smallest spread have the smallest mean."""
+    """Scores are skewed: if few have met light, the smallest spread has the smallest mean."""
     scene = lambertian(20, rho=0.5)
     S = IdentityPlus(Dense(device, scene.R))
     b = np.eye(20)[7]
@@ -319,7 +319,7 @@ def test_the_true_residual_decides(method):
 
 @pytest.mark.parametrize("options", WAYS)
 def test_noise_is_that_of_what_the_start_leaves(options):
-    """Of the solution itself nothing but rounding, and of no light nothing."""
+    """A start at the solution leaves only rounding, and no light leaves nothing."""
     b = np.random.default_rng(6).random((N, 2))
     exact = np.linalg.solve(SCENE.S, b)
     s = sample(SCENE.S, b, x0=exact, samples=16, **options)
@@ -349,7 +349,7 @@ VARIANCES = [(0.98, None, True), (1.02, None, False), (0.5, 0.34, True), (0.5, 0
 @pytest.mark.parametrize("form", ["csr", "dense"])
 @pytest.mark.parametrize("adjoint", [False, True])
 def test_a_variance_is_finite_where_moments_grow_less_than_walks_end(device, adjoint, form):
-    """rho(Q) below q, which is sqrt(rho(Q)) or m / (1 - m); walks over columns by their own moments."""
+    """rho(Q) must be below q, sqrt(rho(Q)) or m / (1 - m); walks over columns have own moments."""
     R = gallery.sparse(37, 37, 0.7).toarray().astype(float)
     R[3] *= 5.0
     R /= np.sqrt(radius(drawn(R.T if adjoint else R)))
@@ -423,7 +423,7 @@ def test_noise_falls_with_samples_and_with_final_gather():
 
 
 def test_iterations_are_those_of_jacobi_and_too_few_are_told():
-    """And light of one sign needs one sample: rho(Q) is about rho(R)^2, and nothing is to be refused."""
+    """Light of one sign needs one sample: rho(Q) is about rho(R)^2, and nothing is refused."""
     S = lambertian(N, rho=0.9).S
     b = np.random.default_rng(1).random(N)
     count = int(np.ceil(np.log(1e-6) / np.log(0.9)))
@@ -443,7 +443,7 @@ def signed(n: int, norm: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("form", "R"), [("csr", signed(13, 0.75)), ("dense", signed(11, 0.8))])
 def test_it_refuses_samples_with_which_noise_may_grow_and_names_what_does_not(device, form, R):
-    """By the map of all covariances, C' = R C R^T + diag(Q diag C - diag(R C R^T)) / s, N^2 x N^2."""
+    """The map of all covariances decides, C' = R C R^T + diag(Q diag C - diag(R C R^T)) / s."""
     n = len(R)
     S = operator(device, R, form)
     b = np.random.default_rng(0).standard_normal(n)
@@ -502,7 +502,7 @@ def test_the_largest_residual_is_told_and_all_products_are_counted(device, optio
 
 
 def test_where_shared_walks_have_no_variance_channels_have_their_own(device):
-    """Channels lit from places of their own, row sums of 0.8: moments of up to three times their square."""
+    """Channels are lit from different places: moments are up to three times those of one."""
     Rs = np.zeros((3, N, N))
     b = pictures(np.zeros((3, N, N)))
     for c, R in enumerate(Rs):

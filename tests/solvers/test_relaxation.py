@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Relaxation is that of the textbook, row by row and block by block, and converges where Jacobi does not."""
+"""Relaxation is the textbook's, by rows and by blocks, and converges where Jacobi does not."""
 
 from __future__ import annotations
 

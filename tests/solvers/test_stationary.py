@@ -30,7 +30,7 @@ random = np.random.default_rng(3)
 )
 @PLAIN
 def test_k_steps_are_k_terms(device, method, options, matrix, sign, terms):
-    """Of I - R + R^2 - ... (eq. 10) on S = I + R, and of I + A + A^2 + ... (eq. 4) on I - A."""
+    """The series are I - R + R^2 - ... (eq. 10) and, on I - A, I + A + A^2 + ... (eq. 4)."""
     b = random.uniform(0.0, 1.0, (SCENE.n, 2))
     S = IdentityPlus(Dense(device, matrix), sign)
     s = ltcl.solve(S, b, method, rtol=1e-6, maxiter=terms, throw=False, **options)
@@ -64,7 +64,7 @@ def test_past_radius_one_it_diverges_with_its_best_iterate(device, method, optio
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("method", ["richardson", "chebyshev"])
 def test_a_closed_room_takes_no_more_products_than_the_bound(device, method, seed, rho, rtol):
-    """S is symmetric with spectrum in [1 / (1 + m), 1 + rho], so the bound on the residual is strict."""
+    """S is symmetric with spectrum in [1 / (1 + m), 1 + rho], so that the bound is strict."""
     scene = enclosure(40, rho / (1 + rho), seed)
     S = IdentityPlus(Dense(device, scene.R))
     b = random.normal(size=(scene.n, 3))
@@ -80,7 +80,7 @@ def test_a_closed_room_takes_no_more_products_than_the_bound(device, method, see
 @pytest.mark.parametrize("rho", [50.0, 200.0])
 @pytest.mark.parametrize("seed", range(8))
 def test_residuals_that_swing_are_not_taken_for_trouble(device, seed, rho, rtol):
-    """Up to an albedo of 0.995; a residual close to 0 by chance is neither a floor nor a start of growth."""
+    """A residual close to 0 by chance is neither a floor nor a start of growth."""
     scene = lambertian(60, rho, seed, density=0.3)
     S = IdentityPlus(Dense(device, scene.R))
     b = scene.S @ random.uniform(0.0, 1.0, scene.n)

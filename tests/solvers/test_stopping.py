@@ -159,7 +159,7 @@ def test_it_ends_with_an_x_no_worse_than_none_and_what_it_advises_works(device, 
 @pytest.mark.parametrize("signs", [1.0, (-1.0) ** np.arange(8)], ids=["Inf", "NaN"])
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_overflow_is_divergence(device, method, signs):
-    """Products that leave float32 give Inf, or Inf - Inf, which no comparison may take for small."""
+    """Products beyond float32 give Inf, or Inf - Inf, which no comparison may take for small."""
     S = np.where(np.eye(8) == 1, 1.0, 3e38 * signs * np.ones((8, 8)))
     options = small_blocks(method, 1)  # of two rows and more, blocks are singular in float64
     s = ltcl.solve(as_operator(S, device), np.full(8, 1.9), method, throw=False, **options)
@@ -171,7 +171,7 @@ def test_overflow_is_divergence(device, method, signs):
 
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_overflow_midway_leaves_the_best_iterate(device, method):
-    """The second step multiplies the first by 3.3e38: the residual falls to a half, then leaves float32."""
+    """The second step multiplies the first by 3.3e38, so that the residual leaves float32."""
     S = np.eye(8)
     S[1, 2] = 0.9
     S[0, 1] = 3.3e38
