@@ -163,7 +163,7 @@ class GainTrials:
         problem = self.problem
         limits = problem.limits
         scale = problem.systems[index].scale
-        target = problem.missing_light(gain)[index]
+        target = problem.light_to_add(gain)[index]
         is_lit = (scale > 0.0) & ~limits.masked
         T = (self.matrices[index] * scale)[:, is_lit]
         columns = target.shape[1]
@@ -223,7 +223,7 @@ class GainTrials:
         problem = self.problem
         missing = []
         for b, A, system, p in zip(
-            problem.missing_light(gain), self.matrices, problem.systems, light, strict=True
+            problem.light_to_add(gain), self.matrices, problem.systems, light, strict=True
         ):
             missing.append(b - A @ (system.scale[:, None] * p))
         return problem.weighted(missing)

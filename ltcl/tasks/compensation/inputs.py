@@ -49,7 +49,7 @@ MIN_LOSS = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Request:
+class CompensationRequest:
     """The checked inputs of `compensate`.
 
     Attributes
@@ -107,7 +107,7 @@ def check_inputs(
     inverse: Inverse | None,
     clamp: bool,
     options: dict[str, Any],
-) -> Request:
+) -> CompensationRequest:
     """Refuse bad inputs before anything is uploaded, and set up the problem."""
     check_transport(T, square=False)
     bounds = checks.interval("bounds", bounds)
@@ -143,7 +143,7 @@ def check_inputs(
     first_bounce = np.zeros((T.channels, 0))
     if T.is_square:
         first_bounce = np.atleast_2d(T.first_bounce)
-    return Request(
+    return CompensationRequest(
         T=T,
         reference=reference,
         problem=problem,

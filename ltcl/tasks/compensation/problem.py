@@ -145,7 +145,7 @@ class CompensationProblem:
             return self.desired
         return multiply(gain, self.desired)
 
-    def missing_light(self, gain: float) -> Columns:
+    def light_to_add(self, gain: float) -> Columns:
         """gain * desired - background: the light that the projector has to add."""
         target = self.target(gain)
         if not self.has_background:
@@ -184,7 +184,7 @@ class CompensationProblem:
         upper = (free_scale * limits.high).astype(np.float32)
         solution = minimise(
             A,
-            self.missing_light(gain)[index],
+            self.light_to_add(gain)[index],
             lower[:, 0],
             upper[:, 0],
             scale[:, None] * start,

@@ -30,7 +30,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.batch import cluster
 from ltcl.device import Device
-from ltcl.errors import ConvergenceError, InputError, InputTypeError, ToleranceError
+from ltcl.errors import ConvergenceError, InputError, ToleranceError
 from ltcl.operators import Compressed, IdentityPlus, ScaledColumns, Tiles
 from ltcl.tasks.compression import losses
 from ltcl.tasks.compression.coefficients import INVERSE_NAMES, Bases, Coefficients, basis_names
@@ -48,6 +48,7 @@ from ltcl.tasks.compression.sources import (
     validate_inputs,
     window_of,
 )
+from ltcl.tasks.requirements import check_progress
 from ltcl.theory import TwoNorm, two_norm
 from ltcl.transport.transport import Transport, check_transport
 
@@ -236,7 +237,7 @@ def compress(
     budget = None if budget is None else checks.count("budget", budget)
     memory = None if memory is None else checks.count("memory", memory)
     names = basis_names(INVERSE_NAMES if basis is None else basis)
-    note = validate_progress(progress)
+    note = check_progress(progress)
     if client is not None:
         cluster.require(client)
     with memory_errors("compress", T):
@@ -274,13 +275,6 @@ def validate_rtol(rtol: Any, least: float) -> float:
         )
         raise ToleranceError(message)
     return rtol
-
-
-def validate_progress(progress: Note | None) -> Note:
-    """`progress`, or in its place a function that does nothing."""
-    if progress is not None and not callable(progress):
-        raise InputTypeError(f"progress is {progress!r}; it must be callable(text, share), or None")
-    return progress or (lambda text, share: None)
 
 
 def compress_inputs(

@@ -53,7 +53,6 @@ from ltcl.tasks.compression.compress import (
     Goal,
     Note,
     compress_inputs,
-    validate_progress,
     validate_rtol,
 )
 from ltcl.tasks.compression.losses import (
@@ -65,6 +64,7 @@ from ltcl.tasks.compression.losses import (
     fresh_starts,
 )
 from ltcl.tasks.compression.sources import memory_errors, of_transport
+from ltcl.tasks.requirements import check_progress
 from ltcl.theory import two_norm
 from ltcl.transport.transport import Transport, check_transport
 
@@ -141,7 +141,7 @@ def invert(
             f"{checks.upwards(T.error)}; ask for more than that, or invert what T was compressed from"
         )
     names = basis_names(basis, for_inverse=True)
-    note, starts = validate_progress(progress), fresh_starts("invert")
+    note, starts = check_progress(progress), fresh_starts("invert")
     bounces, errors = [], []
     try:
         with memory_errors("invert", T):
