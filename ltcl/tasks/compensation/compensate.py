@@ -243,7 +243,7 @@ def _solve_channels(request: CompensationRequest, targets: Columns) -> tuple[Sol
         for channel, target in enumerate(targets):
             solutions.append(request.inverse.solve(target, channel))
         return tuple(solutions)
-    rtol = request.problem.rules.rtol
+    rtol = request.problem.settings.rtol
     return solve_each(
         T.systems,
         targets,
@@ -285,8 +285,8 @@ def _bring_within_bounds(request: CompensationRequest, start: StartingLight) -> 
         is_clipped = limits.exceeded(unbounded)
         is_best = start.is_on_target and is_clipped is None
         if not is_best and not request.clamp:
-            nearest, solution = problem.nearest(index, start.gain, nearest, problem.rules)
-            if request.throw and solution.status is Status.MAXITER:
+            nearest, solution = problem.nearest(index, start.gain, nearest, problem.settings)
+            if problem.settings.throw and solution.status is Status.MAXITER:
                 raise ConvergenceError(str(solution), solution)
             solves.append(solution)
             is_at_bound = (nearest <= limits.low) | (nearest >= limits.high)
@@ -325,7 +325,7 @@ def _judge(
         solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=bounded.solves,
         transport_error=request.transport_error,
-        rtol=problem.rules.rtol,
+        rtol=problem.settings.rtol,
         _evidence=evidence,
     )
 
@@ -409,7 +409,7 @@ def _explained_values(problem: CompensationProblem, target_norms: list[np.ndarra
     pixels = problem.desired[0].shape[0]
     explained = []
     for norms in target_norms:
-        tolerance = np.maximum(problem.rules.rtol * norms, problem.rules.atol)
+        tolerance = np.maximum(problem.settings.rtol * norms, problem.settings.atol)
         explained.append(EXPLAINED_DEVIATIONS * tolerance / np.sqrt(pixels))
     return explained
 
