@@ -14,7 +14,6 @@ from ltcl.device import Array, vectors
 from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
 
-)
 # Steps of the power iteration.
 MAX_STEPS = 200
 # Least value of a positive vector, to its largest: far above an underflow.
