@@ -57,7 +57,9 @@ def test_closed_rooms_lose_no_light(edges: list[Vector], n: int) -> None:
     np.testing.assert_allclose(area[:, None] * F, (area[:, None] * F).T, rtol=1e-14)
     if n < 9:  # pairs of a list take outlines, however far
         i, j = np.nonzero(F)
-        np.testing.assert_allclose(form_factors_of_pairs(cut(walls, n), i, j), F[i, j], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            form_factors_of_pairs(cut(walls, n), i, j), F[i, j], rtol=1e-6, atol=1e-12
+        )
 
 
 # No edge in common with the others, cut by their planes and not square.
@@ -79,7 +81,8 @@ def test_a_long_wedge_takes_what_its_opening_lets_go() -> None:
     ]
     for angle in (20, 60, 90, 150):
         short, long = (
-            exchange_of_walls(slope(angle, width=f.right[1]), f, 1).item() / f.right[1] for f in floors
+            exchange_of_walls(slope(angle, width=f.right[1]), f, 1).item() / f.right[1]
+            for f in floors
         )
         edge = 2 * long - short
         assert edge == pytest.approx(1 - np.sin(np.radians(angle / 2)), abs=2e-4)

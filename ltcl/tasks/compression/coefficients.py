@@ -221,9 +221,7 @@ def _dense_coefficients(
     m, n = R.shape
     C = np.empty((m, n), np.float32)
 
-    def transform_rows(
-        place: slice, rows: np.ndarray, value: Any
-    ) -> tuple[slice, np.ndarray]:
+    def transform_rows(place: slice, rows: np.ndarray, value: Any) -> tuple[slice, np.ndarray]:
         return place, _transformed(into, rows.T).T
 
     for place, rows in R.each(transform_rows):

@@ -71,10 +71,11 @@ def compress(
     budget : int, optional
         Bytes that the cores of all channels may take together on the device.
     norm : "pictures" or "worst"
-        What the error bound covers, pictures or any light; `rtol` limits it, and the result's
-        `error` states it. That of pictures is the largest loss of 256 fresh random ones, a quarter each of 1 / f spectra (amplitudes f^-0.8 to f^-1.4,
-        log-normal values), straight edges, strokes as of text, and one lit rectangle, half of these
-        a single pixel. A picture p may lose ``||E x|| / ||S x||`` of its appearance T p and
+        Light that the error bound covers, pictures or any; `rtol` limits this error, and the
+        result's `error` states it. The error of pictures is the largest loss of 256 fresh random
+        ones, a quarter each of 1 / f spectra (amplitudes f^-0.8 to f^-1.4, log-normal values),
+        straight edges, strokes as of text, and one lit rectangle, half of these a single pixel. A
+        picture p may lose ``||E x|| / ||S x||`` of its appearance T p and
         ``||S~^-1 E x|| / ||x||`` of its direct light x = F p, where E was dropped of R; every other
         picture is a target, x the light that compensates for it. At least 95 % of such pictures
         lose no more, with 99 % confidence, whatever the distribution of losses. In `compensate`

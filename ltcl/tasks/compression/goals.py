@@ -360,9 +360,7 @@ class ToleranceFitting:
         of_rounding = measured.least_error - fit.numbers.dropped * fit.inverse
         return fit.R.core.precision == "float32" and of_rounding > self.goal.rtol
 
-    def _gather_finer(
-        self, candidates: Coefficients, inverse: float, share: float
-    ) -> Coefficients:
+    def _gather_finer(self, candidates: Coefficients, inverse: float, share: float) -> Coefficients:
         """More candidates, where some were dropped."""
         if not candidates.dropped:
             return candidates

@@ -143,7 +143,7 @@ def _inputs_of_rows(
             f"first_bounce is {first_bounce!r}, but T is rows; give an array (N,), or None"
         )
     F = "diagonal" if first_bounce is None else first_bounce
-    F, _ = transport_first_bounce.find(rows, F, lambda: device)
+    F, _ = transport_first_bounce.find_first_bounce(rows, F, lambda: device)
     F, *_ = transport_first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
     problems = []
     for channel, f in zip(rows, F, strict=True):

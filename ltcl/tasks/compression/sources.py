@@ -205,9 +205,7 @@ def _check_source(name: str, matrix: Any) -> None:
         )
 
 
-def _fetcher(
-    name: str, matrix: Any, client: Any, workers_fetch: bool
-) -> Callable[[int, int], Any]:
+def _fetcher(name: str, matrix: Any, client: Any, workers_fetch: bool) -> Callable[[int, int], Any]:
     """Function that reads rows of a matrix of any kind."""
     if hasattr(matrix, "rows"):
         return lambda start, stop: matrix.rows(start, stop)

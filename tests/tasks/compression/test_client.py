@@ -118,7 +118,7 @@ def test_numbers_of_rows_larger_than_memory_are_those_of_the_serial_ones(
     monkeypatch.setattr(
         checks, "host_memory", lambda: 4 * N * N
     )  # half of it is too little for all
-    monkeypatch.setattr("ltcl.compression.sources._ITEMS", 3)  # several blocks in each
+    monkeypatch.setattr("ltcl.tasks.compression.sources.MAX_ITEMS", 3)  # several blocks in each
     W = CoefficientAnalysis(Wavelet(device, GRID, "db2"))
     out = W if sides == 2 else None
     serial = coefficients(source("T", matrix, SMALLEST), out, W, **limits)
