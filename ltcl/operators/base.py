@@ -55,8 +55,11 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     weights : (N,) float64 or None
         Weights of an inner product <x, y> = sum_i w_i x_i y_i in which the operator should be
         self-adjoint, if one is known.
+    core_basis : Basis or None
+        The isometric basis W of an operator W^T C W.
     coefficient_basis : Basis or None
-        The isometric basis W of an operator W^T C W, or I + W^T C W.
+        The isometric basis W of an operator I + W^T C W, which can be solved on coefficients. On the
+        coefficients that W leaves out it is the identity, as W^T C W itself is not.
     known : Knowledge
         Facts that are found once in the life of the operator.
     """
@@ -65,6 +68,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     solution_error: float = 0.0
     error_bound: float = 0.0
     weights: np.ndarray | None = None
+    core_basis: Basis | None = None
     coefficient_basis: Basis | None = None
 
     def __init__(
@@ -119,7 +123,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
         return False
 
     def on_coefficients(self) -> Operator:
-        """The same operator between the coefficients of `coefficient_basis`."""
+        """The same operator between the coefficients of its basis."""
         raise InputError(f"{type(self).__name__} is not between the coefficients of one basis")
 
     # Memory.

@@ -64,7 +64,7 @@ class Compressed(Operator):
         self.into = into
         self.two_sided = out is into and out is not None and out.isometric
         if self.two_sided:
-            self.coefficient_basis = into
+            self.core_basis = into
         if error is not None:
             self.error = checks.number("error", error, least=0.0)
         elif core.error and not self._keeps_norms:

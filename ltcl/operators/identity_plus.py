@@ -55,7 +55,7 @@ class IdentityPlus(Operator):
         super().__init__(R.device, R.shape, R)
         self.R = R
         self.sign = float(sign)
-        self.coefficient_basis = R.coefficient_basis
+        self.coefficient_basis = R.core_basis
         self.error = R.error
         self.solution_error = float(solution_error)
         self.error_bound = self.solution_error

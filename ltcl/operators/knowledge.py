@@ -111,11 +111,11 @@ class Knowledge:
     norm_bound : NormBound
     float64_form : Float64Form
         Kept where a product by it is cheap.
-    survey : ltcl.solvers.auto.Survey
+    survey : ltcl.solvers.survey.Survey
         What three steps of GMRES show of the spectrum.
     was_tried : bool
         Whether "auto" has tried a method without a survey.
-    factorization : ltcl.solvers.precision.Factorization
+    factorization : ltcl.solvers.direct.Factorization
     coefficient_system : Operator
         The same system between the coefficients of its basis.
     relaxations : dict
