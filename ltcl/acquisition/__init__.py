@@ -27,9 +27,19 @@ from ltcl.acquisition.rigs import (
     camera_map,
 )
 from ltcl.acquisition.scanning.report import Report
+from ltcl.acquisition.settings import ScanSettings
 from ltcl.acquisition.task import acquire, finalize
 
-__all__ = ["Calibration", "Correspondence", "Project", "Report", "Rig", "Setup", "Shots"]
+__all__ = [
+    "Calibration",
+    "Correspondence",
+    "Project",
+    "Report",
+    "Rig",
+    "ScanSettings",
+    "Setup",
+    "Shots",
+]
 __all__ += [
     "Display",
     "FolderRig",

@@ -40,7 +40,7 @@ _RANGE = 0.95  # of saturation; above, pixels may be clipped
 _SIGMAS = 5.0  # below saturation, of pixels that must not be saturated
 _SUSPECTS = 4  # photographs with the largest scores
 _PIXELS = 1 << 13  # of a photograph, at most
-ROUGH = NoiseModel(electrons=500.0, read=0.01)
+ROUGH_NOISE = NoiseModel(electrons=500.0, read=0.01)
 """Noise of a camera that is not measured yet: more than most have."""
 ADVICE = "photographs must be in the order of the list, exposed as listed, and the set-up must not change"
 
@@ -48,11 +48,11 @@ Name = Callable[[int], str]
 name_number: Name = "photograph {}".format
 
 
-class Sensor(NamedTuple):
+class CameraModel(NamedTuple):
     """What is known of a camera: response, noise, linear value without light (a float, or one a channel)."""
 
     response: Response
-    noise: NoiseModel = ROUGH
+    noise: NoiseModel = ROUGH_NOISE
     offset: Any = 0.0
 
 
@@ -84,7 +84,7 @@ def sample(image: np.ndarray, pixels: np.ndarray | None = None) -> np.ndarray:
 def find_deviation(
     samples: Sequence[np.ndarray],
     seconds: Sequence[float],
-    sensor: Sensor,
+    sensor: CameraModel,
     known: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Deviation | None:
     """Which photographs of one pattern deviate, if any; each is its codes at the same pixels (`sample`).
@@ -98,7 +98,7 @@ def find_deviation(
     )
 
 
-class Record:
+class AgreementRecord:
     """Photographs of a calibration, at some pixels, to be compared when its noise is known."""
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class Record:
         for key in (codes.tobytes(), seconds):
             self._groups[key].append((codes, seconds, sample(image), number))
 
-    def check(self, sensor: Sensor, name: Name = name_number) -> None:
+    def check(self, sensor: CameraModel, name: Name = name_number) -> None:
         """Raise AcquisitionError where photographs of a pattern, or of it and its inverse, deviate.
 
         It names the photograph, or the few of which one must be wrong; of several, the first.
@@ -134,7 +134,7 @@ class Record:
 
 
 def _in_inverses(
-    codes: Sequence[np.ndarray], samples: Sequence[np.ndarray], sensor: Sensor
+    codes: Sequence[np.ndarray], samples: Sequence[np.ndarray], sensor: CameraModel
 ) -> Deviation | None:
     """Which photographs of a pattern of 0 and 1 and its inverse, at one exposure, do not add up as others."""
     first = [
@@ -169,7 +169,7 @@ class _Light(NamedTuple):
 
     @classmethod
     def of(
-        cls, samples: Sequence[np.ndarray], seconds: Any, sensor: Sensor, L: Any = None
+        cls, samples: Sequence[np.ndarray], seconds: Any, sensor: CameraModel, L: Any = None
     ) -> _Light:
         """`L`: radiance (n, c), where it is known; that of all photographs determines their noise if not.
 

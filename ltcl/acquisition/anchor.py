@@ -19,7 +19,7 @@ from typing import Self
 
 import numpy as np
 
-from ltcl.acquisition.agreement import Deviation, Sensor, find_deviation, sample, spread
+from ltcl.acquisition.agreement import CameraModel, Deviation, find_deviation, sample, spread
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.radiometry import Radiance
 
@@ -56,7 +56,7 @@ class Anchor:
         pixels = spread(seen[sample(shown.valid, seen).all(axis=1)])
         return cls(pixels, sample(shown.value, pixels), sample(shown.variance, pixels))
 
-    def deviation(self, image: np.ndarray, seconds: float, sensor: Sensor) -> Deviation | None:
+    def deviation(self, image: np.ndarray, seconds: float, sensor: CameraModel) -> Deviation | None:
         """Whether a photograph (H, W[, c]) of the pattern deviates from that of the calibration."""
         known = self.value, self.variance
         return find_deviation([sample(image, self.pixels)], [seconds], sensor, known)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ltcl.acquisition import agreement, anchor, radiometry
-from ltcl.acquisition.agreement import Sensor
+from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
@@ -135,7 +135,7 @@ _AUTOMATIC = _Effort(8, 1 << 14, tuple((np.arange(16) + 0.3) / 16))
 _BY_HAND = _Effort(5, 1 << 10, (0.07, 0.2, 0.38, 0.68, 0.9))
 
 
-def photographs(
+def expected_photographs(
     grid: tuple[int, int],
     channels: int = 1,
     frames: int = 16,
@@ -146,7 +146,7 @@ def photographs(
 
     `by_hand`: by a person, with at least three camera pixels to a side of one of the projector's.
 
-    >>> photographs((8, 16)), photographs((8, 16), by_hand=True)
+    >>> expected_photographs((8, 16)), expected_photographs((8, 16), by_hand=True)
     (147, 37)
     """
     effort, camera_pixels = _BY_HAND if by_hand else _AUTOMATIC, 1 if aligned else _CAMERA_PIXELS
@@ -172,7 +172,7 @@ def measure(
     progress: Progress = lambda step, done, total: None,
     log: ArrayLog | None = None,
 ) -> Calibration:
-    """Measure a set-up, with as many photographs as `photographs` says.
+    """Measure a set-up, with as many photographs as `expected_photographs` says.
 
     The camera must resolve blocks of `side`; `log` has photographs of an earlier run; the others,
     and errors, are as in `ltcl.acquire`.
@@ -186,7 +186,10 @@ def measure(
     """
     by_hand, aligned = getattr(shots.rig, "keeps_photographs", False), geometry == "aligned"
     options = {"channels": shots.channels, "frames": frames, "aligned": aligned, "by_hand": by_hand}
-    expected, effort = photographs(shots.grid, **options), _BY_HAND if by_hand else _AUTOMATIC
+    expected, effort = (
+        expected_photographs(shots.grid, **options),
+        _BY_HAND if by_hand else _AUTOMATIC,
+    )
     session = CaptureSession(
         shots, log, lambda done: progress("calibration", done, max(done, expected))
     )
@@ -345,7 +348,7 @@ def _response(
         response, session.hot = _ramps(session, effort, seconds)
     else:
         session.hot = _hot_pixels(session.photograph(0 * full, seconds))
-    session.sensor = Sensor(response)
+    session.sensor = CameraModel(response)
     level = _brightness(session.photograph(full, seconds), session.hot)
     shots.digest.clear()  # of probes; photographs at the exposure of white tell rigs apart
     return nearest(shots.exposures, seconds * _WHITE / max(level, 0.01))
@@ -463,7 +466,9 @@ def _check_black(session: CaptureSession, photographs: list[Photograph]) -> None
         )
 
 
-def _sensor(session: CaptureSession, dark: list[Photograph], bright: list[Photograph]) -> Sensor:
+def _sensor(
+    session: CaptureSession, dark: list[Photograph], bright: list[Photograph]
+) -> CameraModel:
     """Noise, and the linear value without light: 0 where one exposure cannot tell it from ambient light."""
     response, levels = session.sensor.response, session.shots.levels
     groups = [(each, t) for each in (dark, bright) for t in sorted({p.seconds for p in each})]
@@ -477,12 +482,12 @@ def _sensor(session: CaptureSession, dark: list[Photograph], bright: list[Photog
     noise = replace(noise, read=max(noise.read, _QUIETEST))
     times = [p.seconds for p in dark]
     if min(times) == max(times):
-        return Sensor(response, noise, np.zeros(session.shots.channels))
+        return CameraModel(response, noise, np.zeros(session.shots.channels))
     with acquisition_error("black"):
         offset = radiometry.black_level(
             [p.image for p in dark], times, response, noise, levels=levels
         )
-    return Sensor(response, noise, offset)
+    return CameraModel(response, noise, offset)
 
 
 def _check_uniform(
@@ -519,7 +524,9 @@ def _check_uniform(
         below, last = g, name
 
 
-def _check_light(scan: tuple[float, ...], white: Radiance, R: Resampling, sensor: Sensor) -> None:
+def _check_light(
+    scan: tuple[float, ...], white: Radiance, R: Resampling, sensor: CameraModel
+) -> None:
     """Refuse a projector without light; exposures that saturate lit pixels, or show noise alone."""
     if white.value.sum() <= _SIGNIFICANT * math.sqrt(white.variance[white.valid].sum()):
         raise AcquisitionError(

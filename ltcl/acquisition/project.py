@@ -29,14 +29,14 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import rigs
-from ltcl.acquisition.calibrate import expected_exposures, photographs
+from ltcl.acquisition.calibrate import expected_exposures, expected_photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
 from ltcl.acquisition.rigs.virtual import CURVES, Sensor
 from ltcl.acquisition.scanning.plan import Light, measured
-from ltcl.acquisition.task import Settings, acquire
+from ltcl.acquisition.settings import ScanSettings
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
 from ltcl.store import BlockStore, Parts, formats, load
@@ -105,7 +105,7 @@ class Project:
         if table["kind"] == "live":
             table["camera"] = _check(path, "rig.camera", table["camera"], _CAMERAS)
             table["display"] = _check(path, "rig.display", table["display"], rigs.Display)
-        settings = _check(path, "acquire", content.get("acquire", {}), acquire)
+        settings = _check(path, "acquire", content.get("acquire", {}), ScanSettings)
         project = cls(folder, table, settings)
         if (name := settings.get("response")) is not None:
             with project.naming("acquire"):
@@ -160,14 +160,12 @@ class Project:
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.folder / FILE}: [{table}] {error}") from None
 
-    def outlook(self) -> tuple[Settings, dict[str, Any]]:
+    def outlook(self) -> tuple[ScanSettings, dict[str, Any]]:
         """Settings as `acquire` checks them, and facts for `scanning.plan.plans`, measured or guessed."""
-        arguments = {name: p.default for name, p in inspect.signature(acquire).parameters.items()}
-        own = {name: value for name, value in arguments.items() if name not in _OBJECTS}
         with self.rig(closed=True) as rig:
             shots, light = Shots(rig), Light()
             with self.naming("acquire"):
-                settings = Settings.of(shots, **(own | self.settings))
+                settings = ScanSettings(**self.settings).for_rig(shots)
             noise = NoiseModel(levels=1 << rig.bits if rig.bits else 0)
             if (sensor := getattr(rig, "sensor", None)) is not None:
                 noise = replace(noise, electrons=sensor.gain or _NOISELESS, read=sensor.read)
@@ -184,7 +182,7 @@ class Project:
             known = Calibration.of(self.store)
             facts |= {"exposures": known.exposures, "noise": known.noise, "light": measured(known)}
         ways = {"aligned": settings.geometry == "aligned", "by_hand": self.kind == "folder"}
-        facts["calibration"] = photographs(
+        facts["calibration"] = expected_photographs(
             facts["grid"], facts["channels"], settings.frames, **ways
         )
         return settings, facts | {

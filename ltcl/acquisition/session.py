@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ltcl.acquisition import agreement
-from ltcl.acquisition.agreement import Sensor
+from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.radiometry import Radiance, Response, merge
 from ltcl.acquisition.rig import Shots, shot_key
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
@@ -51,8 +51,8 @@ class CaptureSession:
     """
 
     def __init__(self, shots: Shots, log: ArrayLog | None, progress: Callable[[int], None]) -> None:
-        self.sensor, self.hot = Sensor(Response.identity()), np.zeros((1, 1), bool)
-        self.shots, self.record = shots, agreement.Record()
+        self.sensor, self.hot = CameraModel(Response.identity()), np.zeros((1, 1), bool)
+        self.shots, self.record = shots, agreement.AgreementRecord()
         self._log, self._progress = log, progress
         self._uniform: dict[str, Photograph] = {}
 

@@ -13,7 +13,8 @@ import logging
 import math
 import os
 import tempfile
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,10 +28,11 @@ from ltcl.acquisition.calibrate import Progress
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
-from ltcl.acquisition.rig import Rig, Shots, exact
+from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.scanning import adaptive, columns, plan
 from ltcl.acquisition.scanning.pictures import Log, Picture, Pictures
 from ltcl.acquisition.session import check_same, check_same_rig
+from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, ScanRefused
 from ltcl.files import as_path
 from ltcl.store import BlockStore, Parts, StoredRows, load
@@ -42,82 +44,21 @@ _REFUSED = 0.3  # of white: relative deviation of row sums
 _SAME_VIEW = 0.03  # of full scale, mean over the cells of a digest: lamps and exposures vary less
 
 
-@dataclass(frozen=True)
-class Settings:
-    """The arguments of `acquire` that decide on photographs and T."""
-
-    geometry: Any
-    strategy: str
-    exposures: tuple[float, ...] | None
-    response: Response | None
-    frames: int
-    block: int
-    order: int
-    threshold: float
-    sigmas: float
-
-    @classmethod
-    def of(cls, shots: Shots, *values: Any, **named: Any) -> Settings:
-        """Checked for the rig of `shots`; errors as of `acquire`."""
-        settings = cls(*values, **named)
-        geometry, response, times = settings.geometry, settings.response, settings.exposures
-        if not isinstance(geometry, Correspondence) and str(geometry) not in (
-            "graycode",
-            "aligned",
-        ):
-            text = "it must be 'graycode', 'aligned' or a Correspondence"
-            raise InputError(f"geometry is {checks.shown(geometry)}; {text}")
-        if not isinstance(response, Response | None):
-            raise InputTypeError(
-                f"response is a {type(response).__name__}; it must be a Response, or None"
-            )
-        if response is None and shots.exposures is not None and len(shots.exposures) == 1:
-            raise InputError(
-                "rig.exposures has one exposure, which determines no response; give response="
-            )
-        if times is not None:
-            seconds = checks.finite("exposures", checks.real("exposures", times))
-            if seconds.ndim != 1 or seconds.size == 0 or seconds.min() <= 0:
-                raise InputError(
-                    f"exposures is {times!r}; it must be a sequence of positive seconds"
-                )
-            times = tuple(
-                exact("exposures", t, shots.exposures) for t in seconds.astype(float).tolist()
-            )
-        if checks.count("order", settings.order) & (settings.order + 1):
-            raise InputError(f"order is {settings.order}; it must be 2^k - 1: 1, 3, 7, 15, ...")
-        checks.one_of("strategy", settings.strategy, ("auto", *plan.STRATEGIES))
-        return replace(
-            settings,
-            exposures=times,
-            frames=checks.count("frames", settings.frames),
-            block=checks.count("block", settings.block, least=2),
-            threshold=checks.number("threshold", settings.threshold, above=0.0, below=1.0),
-            sigmas=checks.number("sigmas", settings.sigmas, least=0.0),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON without the response; of a Correspondence nothing but that there was one."""
-        named = {name: value for name, value in vars(self).items() if name != "response"}
-        named["geometry"] = self.geometry if isinstance(self.geometry, str) else "given"
-        return named | {"exposures": self.exposures and list(self.exposures)}
-
-
 def acquire(
     rig: Rig,
     *,
-    geometry: str | Correspondence = "graycode",
-    strategy: str = "auto",
+    geometry: str | Correspondence = ScanSettings.geometry,
+    strategy: str = ScanSettings.strategy,
     store: str | os.PathLike[str] | None = None,
     resume: bool = True,
     progress: Progress | None = None,
-    exposures: Any = None,
-    response: Response | None = None,
-    frames: int = 16,
-    block: int = 2,
-    order: int = 63,
-    threshold: float = plan.THRESHOLD,
-    sigmas: float = 3.0,
+    exposures: Sequence[float] | None = ScanSettings.exposures,
+    response: Response | None = ScanSettings.response,
+    frames: int = ScanSettings.frames,
+    block: int = ScanSettings.block,
+    order: int = ScanSettings.order,
+    threshold: float = ScanSettings.threshold,
+    sigmas: float = ScanSettings.sigmas,
     device: Any = None,
 ) -> Transport:
     """Measure the transport of what a projector lights and a camera sees; or go on where that was stopped.
@@ -192,9 +133,17 @@ def acquire(
             f"progress is {progress!r}; it must be a function of (str, int, int), or None"
         )
     progress, shots = progress or (lambda step, done, total: None), Shots(rig)
-    settings = Settings.of(
-        shots, geometry, strategy, exposures, response, frames, block, order, threshold, sigmas
-    )
+    settings = ScanSettings(
+        geometry=geometry,
+        strategy=strategy,
+        exposures=exposures,
+        response=response,
+        frames=frames,
+        block=block,
+        order=order,
+        threshold=threshold,
+        sigmas=sigmas,
+    ).for_rig(shots)
     if device is not None:
         device = Transport(np.eye(1), (1, 1), device=device).device
     if store is None:
@@ -246,7 +195,7 @@ def finalize(store: str | os.PathLike[str], progress: Progress | None = None) ->
 
     grid, channels = Calibration.of(opened).resampling.grid, opened.layout.channels
     rig: Any = SimpleNamespace(projector_grid=grid, channels=channels, photograph=photograph)
-    settings = Settings(**opened.attributes["settings"], response=None)
+    settings = ScanSettings.from_json(opened.attributes["settings"])
     scan(opened, Shots(rig), settings, progress or (lambda step, done, total: None))
 
 
@@ -266,11 +215,11 @@ def _open(path: Path, resume: bool) -> BlockStore | None:
     return store if "strategy" in store.attributes else None
 
 
-def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
+def _check_begun(store: BlockStore, shots: Shots, settings: ScanSettings) -> None:
     """Refuse to go on with another rig or other settings; without `describe()` black and white are shown."""
     facts, path, described = store.attributes, store.path, store.provenance["acquisition"]
     before = facts.get("settings")
-    if facts["strategy"] not in plan.STRATEGIES or not isinstance(before, dict):
+    if facts["strategy"] not in STRATEGIES or not isinstance(before, dict):
         scan = f"{facts['strategy']!r:.40} of {before!r:.40}"
         raise FileError(f"{path}: its scan is {scan}; ltcl makes none such")
     for name, value in settings.to_json().items():
@@ -291,7 +240,7 @@ def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
 
 
 def _calibrate(
-    path: Path, shots: Shots, settings: Settings, log: Any, progress: Progress
+    path: Path, shots: Shots, settings: ScanSettings, log: Any, progress: Progress
 ) -> BlockStore:
     """Measure the set-up, choose a strategy, and make the store."""
     side = settings.block if settings.strategy == "block" else 1
@@ -328,7 +277,7 @@ def _calibrate(
     return store  # which is resumed from here on
 
 
-def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress) -> None:
+def scan(store: BlockStore, shots: Shots, settings: ScanSettings, progress: Progress) -> None:
     """Photograph what is missing in a store with its calibration, and make the transport of it."""
     calibration, strategy = Calibration.of(store), store.attributes["strategy"]
     pictures = Pictures(shots, calibration, settings.block if strategy == "block" else 1)

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.acquisition.rig import fingerprint
 from ltcl.errors import InputError
 from ltcl.files import input_file, replace_file
 from ltcl.store.record import about
 from ltcl.tasks import report
+from ltcl.transport.fingerprint import fingerprint
 from ltcl.transport.transport import Transport
 
 NAME = "frames.json"

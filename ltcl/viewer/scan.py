@@ -20,8 +20,8 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition import Calibration, Project, Setup
-from ltcl.acquisition.agreement import Sensor, find_deviation, sample
-from ltcl.acquisition.calibrate import photographs
+from ltcl.acquisition.agreement import CameraModel, find_deviation, sample
+from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.rig import to_unit
 from ltcl.acquisition.rigs.folder import Shot, read_photograph
 from ltcl.acquisition.session import calibration_folder
@@ -74,7 +74,9 @@ class Scan(Scene):
                 "aligned": settings.geometry == "aligned",
                 "by_hand": self.project.kind == "folder",
             }
-            self._total = photographs(facts["grid"], facts["channels"], settings.frames, **ways)
+            self._total = expected_photographs(
+                facts["grid"], facts["channels"], settings.frames, **ways
+            )
             self.pixels = int(np.prod(facts["grid"]))
 
     def scan(self, seen: Any) -> Reply:
@@ -199,7 +201,7 @@ class Scan(Scene):
         numbers, taken = zip(*sorted(self._samples[shot.pattern].items()), strict=True)
         seconds, samples = zip(*taken, strict=True)
         self._warnings.pop(shot.pattern, None)
-        sensor = Sensor(c.response, c.noise, c.offset)
+        sensor = CameraModel(c.response, c.noise, c.offset)
         if len({*seconds}) > 1 and (found := find_deviation(samples, seconds, sensor)):
             self._warnings[shot.pattern] = found.describe(numbers)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition.agreement import ROUGH, Record, Sensor
+from ltcl.acquisition.agreement import ROUGH_NOISE, AgreementRecord, CameraModel
 from ltcl.acquisition.calibrate import measure
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
@@ -22,7 +22,7 @@ from .stopping import Unplugged
 
 random = np.random.default_rng(0)
 WHITE = np.ones((2, 2), np.float32)
-SENSOR = Sensor(Response.identity(), NoiseModel(1000.0, 0.003, levels=256), 0.02)
+SENSOR = CameraModel(Response.identity(), NoiseModel(1000.0, 0.003, levels=256), 0.02)
 
 
 def photograph(light: np.ndarray, seconds: float = 1.0, electrons: float = 1000.0) -> np.ndarray:
@@ -33,9 +33,9 @@ def photograph(light: np.ndarray, seconds: float = 1.0, electrons: float = 1000.
     return np.rint(np.clip(0.02 + value, 0, 1) * 255) / 255
 
 
-def deviating(images: Any, seconds: Any, codes: Any = None, sensor: Sensor = SENSOR) -> str:
+def deviating(images: Any, seconds: Any, codes: Any = None, sensor: CameraModel = SENSOR) -> str:
     """What a calibration says of photographs 11, 12, ..., of one pattern or of `codes`; "" if nothing."""
-    record = Record()
+    record = AgreementRecord()
     for number, (image, t) in enumerate(zip(images, seconds, strict=True), 11):
         record.add(WHITE if codes is None else codes[number - 11], t, image, number)
     try:
@@ -58,13 +58,16 @@ def test_noise_deviates_from_nothing(shape: tuple[int, ...], most: float) -> Non
         for _ in range(25):
             light = most * random.random(shape) ** random.choice([0.5, 1, 6])
             images = [photograph(light, t, electrons) for t in times]
-            for noise in (ROUGH, NoiseModel(electrons, 0.003, levels=256)):
+            for noise in (ROUGH_NOISE, NoiseModel(electrons, 0.003, levels=256)):
                 assert not deviating(images, times, sensor=SENSOR._replace(noise=noise))
 
 
 def test_few_photons_deviate_from_nothing() -> None:
     """Dark pixels get no photon in most photographs, and hardly any other noise."""
-    sensor, times = Sensor(Response.identity(), NoiseModel(100.0, 1e-4)), (0.25, 1.0, 1.0, 1.0, 4.0)
+    sensor, times = (
+        CameraModel(Response.identity(), NoiseModel(100.0, 1e-4)),
+        (0.25, 1.0, 1.0, 1.0, 4.0),
+    )
     for light in 0.2 * random.random((20, 32, 32)) ** 3:
         images = [np.minimum(random.poisson(100.0 * light * t) / 100.0, 1.0) for t in times]
         assert not deviating(images, times, sensor=sensor)
@@ -106,7 +109,7 @@ def test_an_exposure_that_dim_pixels_alone_show(gain: float) -> None:
     """Of two, 64 times apart: what one shows well the other does not, or it is saturated."""
     light, sensor = (
         random.random((60, 60)) ** 4,
-        Sensor(Response.identity(), NoiseModel(20000.0, 0.001)),
+        CameraModel(Response.identity(), NoiseModel(20000.0, 0.001)),
     )
     codes = [
         x + random.normal(0, 0.001, x.shape) for x in (gain * light, np.minimum(64 * light, 1.0))

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.rig import LONGEST, SHORTEST, Closing, exact, load_extra
+from ltcl.acquisition.rig import LONGEST, SHORTEST, Closing, load_extra, offered_exposure
 from ltcl.acquisition.rigs.folder import read_photograph
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
@@ -94,7 +94,7 @@ class OpenCVCamera(Closing):
 
     def expose(self, seconds: float) -> None:
         """Set the exposure; AcquisitionError where the camera sets another."""
-        seconds = exact("seconds", seconds, self.exposures)
+        seconds = offered_exposure("seconds", seconds, self.exposures)
         actual = self._set_exposure(seconds) if self.exposures is None else seconds
         if abs(actual / seconds - 1.0) > _TOLERANCE:
             raise AcquisitionError(
@@ -184,7 +184,7 @@ class GPhoto2Camera(Closing):
 
     def expose(self, seconds: float) -> None:
         """Set the shutter, and read it back; InputError for another than `exposures`."""
-        offered = exact("seconds", seconds, self.exposures)
+        offered = offered_exposure("seconds", seconds, self.exposures)
         choice = self._choices[offered]
         with self._naming(f"set {self._shutter}"):
             widget = self._camera.get_single_config(self._shutter)

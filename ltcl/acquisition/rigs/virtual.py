@@ -30,10 +30,11 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.acquisition.rig import as_codes, as_exposures, fingerprint, shot_key
+from ltcl.acquisition.rig import as_codes, as_exposures, shot_key
 from ltcl.errors import InputError
 from ltcl.images import from_srgb, to_srgb
 from ltcl.transport import frames as layout
+from ltcl.transport.fingerprint import fingerprint
 
 Curve = Callable[[np.ndarray], np.ndarray]
 Place = Callable[[np.ndarray, np.ndarray], tuple[Any, Any]]

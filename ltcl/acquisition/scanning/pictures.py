@@ -21,7 +21,14 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition import anchor
-from ltcl.acquisition.agreement import ADVICE, Deviation, Sensor, find_deviation, sample, spread
+from ltcl.acquisition.agreement import (
+    ADVICE,
+    CameraModel,
+    Deviation,
+    find_deviation,
+    sample,
+    spread,
+)
 from ltcl.acquisition.calibration import Calibration, Setup
 from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.radiometry import Radiance, merge
@@ -117,7 +124,7 @@ class Pictures(Seen):
     def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
         super().__init__(calibration, side)
         self.shots = shots
-        self._sensor = Sensor(calibration.response, calibration.noise, calibration.offset)
+        self._sensor = CameraModel(calibration.response, calibration.noise, calibration.offset)
         self._pixels = spread(np.unique(calibration.resampling.weights.indices))
 
     def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:

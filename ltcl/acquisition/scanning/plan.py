@@ -25,15 +25,14 @@ from datetime import timedelta
 
 import numpy as np
 
-from ltcl.acquisition.calibrate import photographs
+from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import adaptive, columns
+from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 
-STRATEGIES = ("adaptive", "pixel", "block", "hadamard")
 _MANY = 2048  # pixels from which one at a time, or as many patterns, take too long
-THRESHOLD = 0.004  # of what a camera pixel sees, for which a cell is divided
 _INDIRECT = 0.25  # of what a camera pixel sees under white, unless it is measured: a white corner
 _SYSTEMATIC = 0.002  # relative error of T p by the calibration: response and white
 _SIMILAR = 1.5  # times the smallest error: fewer photographs count more
@@ -80,9 +79,9 @@ def plans(
     light: Light | None = None,
     *,
     channels: int = 1,
-    block: int = 2,
-    order: int = 63,
-    threshold: float = THRESHOLD,
+    block: int = ScanSettings.block,
+    order: int = ScanSettings.order,
+    threshold: float = ScanSettings.threshold,
     overhead: float = 0.0,
     calibration: int | None = None,
 ) -> dict[str, Plan]:
@@ -104,7 +103,7 @@ def plans(
         light.direct + light.indirect,
         np.array(exposures),
     )
-    before = photographs(grid, channels=channels) if calibration is None else calibration
+    before = expected_photographs(grid, channels=channels) if calibration is None else calibration
 
     def variance(radiance: float) -> float:
         x = (radiance + light.ambient) * times

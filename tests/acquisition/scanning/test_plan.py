@@ -10,7 +10,7 @@ import pytest
 
 import ltcl
 from ltcl.acquisition import camera_map
-from ltcl.acquisition.calibrate import photographs
+from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import Hadamard, Light, Pixels, plans
 from ltcl.acquisition.scanning.plan import choose
@@ -96,7 +96,7 @@ def test_photographs_are_all_counted(by_hand: bool, strategy: str) -> None:
     camera.keeps_photographs = by_hand
     geometry, channels = ("graycode", 1) if by_hand else ("aligned", 3)
     ltcl.acquire(camera, geometry=geometry, strategy=strategy, exposures=[0.1, 3.0])
-    count = photographs(grid, channels=channels, aligned=not by_hand, by_hand=by_hand)
+    count = expected_photographs(grid, channels=channels, aligned=not by_hand, by_hand=by_hand)
     plan = plans(grid, (0.1, 3.0), channels=channels, calibration=count)[strategy]
     assert plan.photographs == pytest.approx(camera.count, rel=0.02)
 
