@@ -38,8 +38,9 @@ from _harness import Options, options
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.scenes import landscape
-from ltcl.show.window import Window, play
-from ltcl.viewer.answers import Scene
+from ltcl.show.player import play
+from ltcl.show.window import Window
+from ltcl.viewer.answers import ViewerScene
 
 FLAGS = ["--headless=new", "--remote-debugging-port=0", "--window-size=1280,900", "--no-sandbox"]
 FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
@@ -218,7 +219,7 @@ def playing(page: Chromium, T: ltcl.Transport, folder: Path, given: Options) -> 
     with Window("film", open_browser=False) as window:
         page.open(f"{window.url}#projector")
         return play(
-            Scene(T, "T", {}, None), open_frames(folder / "film.mkv"), window, 1.0, nothing, **rules
+            ViewerScene(T, "T", {}, None), open_frames(folder / "film.mkv"), window, 1.0, nothing, **rules
         )
 
 

@@ -84,9 +84,7 @@ def _shared_options(
     ] = False,
     verbose: Annotated[
         bool,
-        typer.Option(
-            "--verbose", help="Print each step, too.", rich_help_panel=SHARED_PANEL
-        ),
+        typer.Option("--verbose", help="Print each step, too.", rich_help_panel=SHARED_PANEL),
     ] = False,
 ) -> None:
     """Options of every command."""

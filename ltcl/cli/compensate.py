@@ -61,9 +61,7 @@ def sharing_options(
     ] = None,
     workers: Annotated[
         int | None,
-        option(
-            "Number of processes of --cluster local.", metavar="N", min=1, panel=SHARING_PANEL
-        ),
+        option("Number of processes of --cluster local.", metavar="N", min=1, panel=SHARING_PANEL),
     ] = None,
 ) -> None:
     """How the work is shared."""
@@ -149,7 +147,7 @@ def compensate_pictures(
     )
     sheet = []
     rows = []
-    with pictures.fill(out, report) as folder:
+    with pictures.fill(out) as folder:
         for name, path in zip(context.progress.each([*desired]), paths, strict=True):
             try:
                 result = compensate_picture(job.T, desired[name], **job.settings)
@@ -162,6 +160,7 @@ def compensate_pictures(
             rows.append(_table_row(path, name, entry))
             _note_out_of_reach(path, entry)
         panels.contact_sheet(sheet[:MAX_SHEET_ROWS]).save(folder / "compensate.png")
+        pictures.write_report(folder, report)
     lines = [
         table(COLUMNS, rows),
         f"\npatterns, appearances and what is out of reach as .exr and .png in {out}",

@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from ltcl.cli import loading, options, pictures
+import typer
+
+from ltcl.cli import loading, pictures
 from ltcl.cli.command import Context
 from ltcl.cli.options import file_option, option
+from ltcl.cli.reports.pictures import PatternCodes
 from ltcl.errors import InputError
 from ltcl.tasks import compensation
 from ltcl.transport.transport import Transport
@@ -17,11 +20,36 @@ from ltcl.transport.transport import Transport
 PROJECTOR_PANEL = "Projector and target"
 
 
+def parse_gain(text: str) -> float | str:
+    """Parse a number, or auto."""
+    if text == "auto":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a gain; write a number, or auto") from None
+
+
+Gain = Annotated[
+    str | None,
+    option(
+        "Factor between the picture and what the scene shall show; auto: the largest within "
+        "reach. Default: 1; auto if T was measured.",
+        parser=parse_gain,
+        metavar="FACTOR",
+        panel=PROJECTOR_PANEL,
+    ),
+]
+
+
 def target_options(
-    gain: options.Gain = None,
+    gain: Gain = None,
     loss: Annotated[
         float | None,
-        option("Error that --gain auto may add. Default: none.", panel=PROJECTOR_PANEL),
+        option(
+            "Relative error that the gain may cost with --gain auto. Default: the least possible.",
+            panel=PROJECTOR_PANEL,
+        ),
     ] = None,
     low: Annotated[float, option("Darkest light of the projector.", panel=PROJECTOR_PANEL)] = 0.0,
     high: Annotated[
@@ -67,7 +95,7 @@ class CompensationJob:
     notes: list[str | None] = field(default_factory=list)
 
     @property
-    def pattern_codes(self) -> str:
+    def pattern_codes(self) -> PatternCodes:
         """Encoding of a pattern's .png."""
         return "sRGB" if self.setup is None else "codes of the measured projector"
 

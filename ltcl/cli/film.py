@@ -75,17 +75,13 @@ def cluster_options(
     ] = None,
     workers: Annotated[
         int | None,
-        option(
-            "Number of processes of --cluster local.", metavar="N", min=1, panel=CLUSTER_PANEL
-        ),
+        option("Number of processes of --cluster local.", metavar="N", min=1, panel=CLUSTER_PANEL),
     ] = None,
 ) -> None:
     """Where the work is done."""
 
 
-@command(
-    frame_options, compensation.target_options, *options.TASK_OPTIONS, cluster_options
-)
+@command(frame_options, compensation.target_options, *options.TASK_OPTIONS, cluster_options)
 def film(
     context: Context,
     transport: options.TransportFile,

@@ -16,6 +16,7 @@ from ltcl.cli import (
     analyze,
     compensate,
     convert,
+    demo,
     doctor,
     film,
     info,
@@ -41,7 +42,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 PANELS: dict[str, list[Any]] = {
-    "First steps": [doctor.demo, doctor.devices, doctor.doctor],
+    "First steps": [demo.demo, doctor.devices, doctor.doctor],
     "Pictures and films": [
         compensate.compensate,
         film.film,

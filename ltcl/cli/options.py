@@ -53,16 +53,6 @@ def parse_method(name: str) -> str:
     return name
 
 
-def parse_gain(text: str) -> float | str:
-    """Parse a number, or auto."""
-    if text == "auto":
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not a gain; write a number, or auto") from None
-
-
 def check_writable(place: Path, folder: Path) -> Path:
     """Return `place`, a file or folder in `folder`, or `folder` itself.
 
@@ -162,15 +152,6 @@ Variable = Annotated[
         "Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME", panel=TRANSPORT_PANEL
     ),
 ]
-Gain = Annotated[
-    str | None,
-    option(
-        "Factor between the picture and what the scene shall show; auto: the largest within "
-        "reach. Default: 1; auto if T was measured.",
-        parser=parse_gain,
-        metavar="FACTOR",
-    ),
-]
 
 
 def file_options(
@@ -180,9 +161,7 @@ def file_options(
     ] = None,
     camera_grid: Annotated[
         tuple | None,
-        grid_option(
-            "Camera pixels, if they differ from the projector's.", panel=TRANSPORT_PANEL
-        ),
+        grid_option("Camera pixels, if they differ from the projector's.", panel=TRANSPORT_PANEL),
     ] = None,
     variable: Variable = None,
 ) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
@@ -138,9 +137,7 @@ def write_first_bounces(
         contact_sheet(rows).save(temporary, "PNG")
 
 
-def _first_bounce_panel(
-    name: str, first_bounce: np.ndarray, grid: tuple[int, int]
-) -> Image.Image:
+def _first_bounce_panel(name: str, first_bounce: np.ndarray, grid: tuple[int, int]) -> Image.Image:
     is_dark = np.any(np.atleast_2d(first_bounce) <= 0.0, axis=0)
     picture = first_bounce.T.reshape(*grid, *first_bounce.shape[:-1])
     codes = to_srgb(picture, exposure(first_bounce))

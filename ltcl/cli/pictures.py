@@ -17,22 +17,23 @@ from ltcl.tasks import report
 
 
 @contextmanager
-def fill(out: Path, text: Any) -> Iterator[Path]:
-    """Fill a folder and write its report, named after the command; one run at a time.
-
-    `text` is the report, whose `files` are set at the end; its `folder` is not written.
-    """
+def fill(out: Path) -> Iterator[Path]:
+    """Fill a folder whole or not at all; one run at a time."""
     with locked(out, wait=False), fill_folder(out) as folder:
         yield folder
-        name = f"{text.command}.json"
-        files = []
-        for file in folder.rglob("*"):
-            if file.is_file():
-                files.append(file.relative_to(folder).as_posix())
-        text.files = [*sorted(files), name]
-        document = text.document()
-        del document["folder"]
-        report.write(folder / name, document)
+
+
+def write_report(folder: Path, text: Any) -> None:
+    """Write a report, named after its command, without its `folder`; set its `files` before."""
+    name = f"{text.command}.json"
+    files = []
+    for file in folder.rglob("*"):
+        if file.is_file():
+            files.append(file.relative_to(folder).as_posix())
+    text.files = [*sorted(files), name]
+    document = text.document()
+    del document["folder"]
+    report.write(folder / name, document)
 
 
 def read(
@@ -52,8 +53,9 @@ def read(
     from ltcl import images
 
     encoding = context.options["encoding"]
-    holds_codes = setup is not None and encoding == "auto" and _has_integers(path)
-    if holds_codes:
+    projector = None
+    if setup is not None and encoding == "auto" and _has_integers(path):
+        projector = setup
         encoding = "linear"
     picture = images.read(path, encoding=encoding, upright=upright)
     if context.options["resize"]:
@@ -64,7 +66,7 @@ def read(
         raise InputError(
             f"{path}: has {size} pixels, but {owner} has {needed}; --resize scales the picture"
         )
-    return setup.light(picture) if holds_codes else picture
+    return picture if projector is None else projector.light(picture)
 
 
 def _has_integers(path: Path) -> bool:

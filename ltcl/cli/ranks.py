@@ -40,9 +40,7 @@ def run_on_every_rank(run: Callable[[list[str]], int], words: list[str]) -> int:
     return code
 
 
-def _run_silently(
-    run: Callable[[list[str]], int], words: list[str]
-) -> tuple[int, io.StringIO]:
+def _run_silently(run: Callable[[list[str]], int], words: list[str]) -> tuple[int, io.StringIO]:
     """Run with results in a temporary folder; return the exit code and what stderr would show."""
     errors = io.StringIO()
     with (

@@ -44,7 +44,7 @@ def relight(
         pictures=[],
     )
     rows = []
-    with pictures.fill(out, report) as folder:
+    with pictures.fill(out) as folder:
         for (name, picture), path in zip(relit.items(), pattern, strict=True):
             panel = panels.linear_panel(picture, f"{path.name}, relit", report.exposure)
             files = panels.write(folder, f"{name}_relit", picture, panel)
@@ -53,6 +53,7 @@ def relight(
             )
             report.pictures.append(entry)
             rows.append((path.name, entry.brightest, entry.exr))
+        pictures.write_report(folder, report)
     lines = [
         table(("pattern", "brightest in picture", "picture"), rows),
         f"\npictures as .exr and .png in {out}",

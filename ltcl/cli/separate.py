@@ -53,12 +53,13 @@ def separate(
         has_std=loading.has_std(T, settings),
         has_folders=len(photographs) > 1,
     )
-    with pictures.fill(out, report) as folder:
+    with pictures.fill(out) as folder:
         for name, path in zip(context.progress.each([*photographs]), picture, strict=True):
             result = separation.separate(T, photographs[name], bounces, **settings)
             entry = writer.write(folder, name, path, photographs[name], result)
             report.pictures.append(entry)
         panels.contact_sheet(writer.sheet).save(folder / "separate.png")
+        pictures.write_report(folder, report)
     lines = [
         table(COLUMNS, _table_rows(report)),
         f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}",

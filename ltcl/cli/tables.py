@@ -12,6 +12,8 @@ from rich.cells import cell_len
 from ltcl.transport.verdict import Verdict
 
 DIVERGES = "diverges"
+# Names of colour channels, by their number.
+COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
 
 
 def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
@@ -53,6 +55,11 @@ def percent(share: float | None, digits: int = 3) -> str | None:
 def size_text(size: tuple[int, int] | None) -> str:
     """Format height and width."""
     return "unknown" if size is None else "{} x {}".format(*size)
+
+
+def interval_text(lowest: float, highest: float) -> str:
+    """Format the ends of an interval."""
+    return f"{lowest:.4g} .. {highest:.4g}"
 
 
 def verdict_lines(verdicts: Mapping[str, Verdict]) -> list[str]:

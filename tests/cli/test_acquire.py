@@ -116,7 +116,7 @@ def test_run_goes_on_from_wherever_the_folder_stands(program, scan, acquired, mo
         )
         assert program("acquire", "run", scan).code == 130
     end(monkeypatch, 1, OSError("there is no rig"))
-    assert program("acquire", "finalize", scan, "--json").code == 0  # a name of earlier versions
+    assert program("acquire", "run", scan, "--json").code == 0
     ours, whole = (BlockStore.open(each / "transport.zarr") for each in (scan, acquired))
     for b in range(whole.layout.blocks()):
         np.testing.assert_array_equal(

@@ -27,6 +27,8 @@ USAGE = [
     ("info {nothing}", ["path is empty"]),
     ("demo --out {nothing}", ["--out", "path is empty"]),
     ("compensate a.npz b.png --out c --exact {nothing}", ["--exact", "path is empty"]),
+    ("compensate a.npz b.png --out c --resume", ["--resume"]),
+    ("film a.npz b.mp4 --out c --mpi", ["--mpi"]),
 ]
 COMPENSATE = [  # after: compensate
     ("{transport} {large}", ["20 x 30", "5 x 10", "--resize"]),
@@ -35,8 +37,8 @@ COMPENSATE = [  # after: compensate
     ("{transport} {picture} --weights {large}", ["large.png", "20 x 30", "--resize"]),
     ("{transport} {picture} --inverse {transport}", ["corner.npz: "]),
     ("{compressed} {picture} --exact {other}", ["other.npz: ", "TRANSPORT"]),
-    ("{transport} {film} {picture}", ["film.avi: ", "1 more"]),
-    ("{transport} {picture} --resume", ["--resume", "sky.exr"]),
+    ("{transport} {film} {picture}", ["film.avi: ", "ltcl film"]),
+    ("{transport} {picture} --cluster local", ["--cluster", "--transports"]),
 ]
 OTHERS = [
     ("separate {tall} {picture} --grid 2x5 --camera-grid 5x10 --out {out}", ["relight"]),
@@ -52,10 +54,12 @@ OTHERS = [
     ("simulate dihedral --grid 4x8 --out {out}", ["--grid", "(4, 8)"]),
     ("simulate mitsuba:dihedral --ambient 0.1 --out {out}", ["--ambient", "mitsuba"]),
     ("simulate {nan} --grid 3x3 --out {out}", ["--grid is 3 x 3"]),
-    ("acquire resume {empty}", ["acquisition.toml: ", "ltcl simulate"]),
+    ("film {transport} {picture} --out {out}", ["FILM is ", "sky.exr", "ltcl compensate"]),
+    ("film {transport} {film} --workers 2 --out {out}", ["--workers is 2", "--cluster"]),
+    ("acquire run {empty}", ["acquisition.toml: ", "ltcl simulate"]),
     ("compensate {store} {picture} --resize --high 2 --out {out}", ["--high is 2", "0 to 1"]),
-    ("compensate --transports {nan} {film} --out {out}", ["--transports", "film.avi holds frames"]),
-    ("compensate --transports {nan} {empty} --out {out}", ["--transports", "empty holds frames"]),
+    ("compensate --transports {nan} {film} --out {out}", ["film.avi: holds frames"]),
+    ("compensate --transports {nan} {empty} --out {out}", ["empty: holds frames"]),
     (
         "compensate --transports {store} {picture} --out {store}",
         ["--out is", "where transports are"],
@@ -73,7 +77,7 @@ OTHERS = [
         ["nan.npy.x, and there is no such file"],
     ),
     ("compensate {store} {picture} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
-    ("compensate {store} {film} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
+    ("film {store} {film} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
     (
         "separate {store} {picture} --out {store}/new",
         ["--out is", "new, which is TRANSPORT itself or in it"],
@@ -131,7 +135,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(program, names, tmp_path, 
 
 PLACES = [
     ("compensate nowhere.npz a.png --out", "file"),
-    ("compensate nowhere.npz a.mp4 --out {}/out --video", "file/a.mp4"),
+    ("film nowhere.npz a.mp4 --out {}/out --video", "file/a.mp4"),
     ("separate nowhere.npz a.png --out", "file/out"),
     ("simulate dihedral --out", "file"),
     ("demo --out", "file/out"),

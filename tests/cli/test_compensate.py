@@ -150,8 +150,8 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_second_run_in_a_folder_is_refused_at_once(program, transport, picture, film, tmp_path):
-    for source in (picture, film):
-        arguments = ["compensate", transport, source, "--out", tmp_path / "out"]
+    for command, source in (("compensate", picture), ("film", film)):
+        arguments = [command, transport, source, "--out", tmp_path / "out"]
         with locked(tmp_path / "out"):  # as the first one does
             program(*arguments).refused("out: another run")
         assert not (tmp_path / "out").exists()
@@ -253,7 +253,7 @@ def test_patterns_of_a_folder_are_listed_and_kept_after_ctrl_c(
         return solve(*arguments, **options)
 
     common, listed = (
-        ["compensate", transport, film, "--out", tmp_path, "--batch", "3"],
+        ["film", transport, film, "--out", tmp_path, "--batch", "3"],
         tmp_path / "frames.json",
     )
     with monkeypatch.context() as patch:
@@ -276,14 +276,14 @@ def test_patterns_of_a_folder_are_listed_and_kept_after_ctrl_c(
     assert report["worst"]["error"] == max(frame["error"] for frame in report["frames"])
     assert json.loads(listed.read_text())["frames"] == report["frames"]
     assert program(*common, "--resume").out.splitlines()[1].split()[:3] == [str(COUNT), "0", "-"]
-    advice = program("compensate", transport, film, "--out", tmp_path / "b", "--gain", "2").err
+    advice = program("film", transport, film, "--out", tmp_path / "b", "--gain", "2").err
     assert all(part in advice for part in (f"{COUNT} frame(s)", "--gain"))
 
 
 def test_a_video_comes_back_as_one(program, colour_transport, tmp_path):
     film, out, video = tmp_path / "film.avi", tmp_path / "out", tmp_path / "made.mkv"
     write_video(film, np.random.default_rng(6).uniform(0.05, 0.08, (3, 4, 12)), fps=12.0)
-    common = ["compensate", colour_transport, film, "--out", out, "--batch", "2", "--video", video]
+    common = ["film", colour_transport, film, "--out", out, "--batch", "2", "--video", video]
     outcome = program(*common, "--high", "9", "--gain", "auto", "--appearance", "--format", "exr")
     assert str(video) in outcome.out
     source = open_frames(video)

@@ -107,7 +107,7 @@ def test_frames_and_videos_hold_codes(program, store, tmp_path, rig):
         "--video",
         tmp_path / "out.mkv",
     ]
-    assert program("compensate", *arguments).code == 0
+    assert program("film", *arguments).code == 0
     codes = codes_in(tmp_path / "out" / "pattern_000001.png")
     assert error_of(codes, rig) < 0.015
     shown = next(iter(open_frames(tmp_path / "out.mkv", encoding="linear"))).picture()

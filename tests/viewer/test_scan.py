@@ -29,8 +29,9 @@ from ltcl.acquisition.agreement import ROUGH_NOISE
 from ltcl.acquisition.radiometry import Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
-from ltcl.show.window import Window, play
-from ltcl.viewer.answers import Scene
+from ltcl.show.player import play
+from ltcl.show.window import Window
+from ltcl.viewer.answers import ViewerScene
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.server import Viewer
 from tests import json_schema
@@ -252,7 +253,7 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(
     source, told = open_frames(tmp_path / "film.mkv"), []
     pictures = [frame.picture() for frame in source]
     with Window("film", open_browser=False) as window, looking(window.url, slow) as shown:
-        scene = Scene(T, "T", {}, None)
+        scene = ViewerScene(T, "T", {}, None)
         facts = play(scene, source, window, 0.5, lambda *what, detail: told.append(what), rtol=1e-4)
         window.close()
     expected = [
@@ -274,7 +275,7 @@ def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) 
     T = ltcl.Transport(random.random((20, 12), np.float32), (3, 4), camera_grid=(4, 5))
     images.write(tmp_path / "0.png", np.full((4, 5), 0.9))
     source = open_frames(tmp_path)
-    scene = Scene(T, "T", {}, None)
+    scene = ViewerScene(T, "T", {}, None)
     with Window("film", open_browser=False) as window, looking(window.url) as shown:
         assert play(scene, source, window, 1.0, lambda *_, **__: None)["shown"]
         window.close()
@@ -302,7 +303,7 @@ def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey:
         "clamp": True,
     }
     with Window("film", open_browser=False) as window, looking(window.url) as shown:
-        scene = Scene(T, "T", {}, None)
+        scene = ViewerScene(T, "T", {}, None)
         assert play(scene, source, window, 0.5, lambda *_, **__: None, **rules)["shown"] == 2
         window.close()
     for found, frame in zip(shown, source, strict=True):

@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 from ltcl.cli.reports.parts import Channels, Files, FolderReport, Options, VerdictReport, Versions
 from ltcl.cli.reports.report import Report
 
+RigKind = Annotated[Literal["virtual", "mitsuba", "folder", "live"], "Kind of the rig."]
+
 
 @dataclass(kw_only=True)
 class SimulateReport(FolderReport):
@@ -62,7 +64,7 @@ class StrategyPlan(Report):
 class PlanReport(FolderReport):
     """`ltcl acquire plan`."""
 
-    rig: Annotated[Literal["virtual", "mitsuba", "folder", "live"], "Kind of the rig."]
+    rig: RigKind
     measured: Annotated[bool, "Whether noise and light were measured; else they are guessed."]
     asked_for: Annotated[str, "Strategy in acquisition.toml."]
     auto: Annotated[str, "Strategy that `auto` uses."]
@@ -82,9 +84,7 @@ class ScanReport(FolderReport):
     """`ltcl acquire report`: the attributes of `ltcl.acquisition.Report`."""
 
     store: Annotated[Path, "Folder of the transport."]
-    strategy: Annotated[
-        Literal["adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."
-    ]
+    strategy: Annotated[Literal["adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."]
     why: Annotated[str, "Reason for the strategy."]
     grid: Annotated[tuple[int, int], "Projector pixels of T: height, width."]
     channels: Annotated[Channels, "1, or 3 for red, green and blue."]
@@ -134,4 +134,4 @@ class PhotographMissing(FolderReport):
 
     next: Annotated[NextPhotograph, "The photograph to take."]
     missing: Annotated[list[int], "Numbers of all missing photographs."]
-    exit_code: Annotated[Literal[3], "3."]
+    exit_code: Annotated[Literal[3], "3."] = 3

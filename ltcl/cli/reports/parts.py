@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from ltcl.cli.reports.report import Report
 from ltcl.solvers import Solution
 from ltcl.tasks import report
+from ltcl.transport.verdict import Verdict
 
 Channels = Literal[1, 3]
 Options = Annotated[
@@ -62,9 +63,7 @@ class TransportFacts(Report):
     channels: Annotated[Channels, "1, or 3 for red, green and blue."]
     grid: Annotated[tuple[int, int], "Projector pixels: height, width."]
     camera_grid: Annotated[tuple[int, int], "Camera pixels: height, width."]
-    error: Annotated[
-        float, "Relative error of solutions by compression; 0 if T is not compressed."
-    ]
+    error: Annotated[float, "Relative error of solutions by compression; 0 if T is not compressed."]
     masked: Annotated[int, "Number of projector pixels that are too dark and stay unlit."]
     compressed: Annotated[bool, "Whether T is compressed."]
 
@@ -229,9 +228,7 @@ class VerdictReport(Report):
     """
 
     text: Annotated[str, "Two sentences."]
-    compensation: Annotated[
-        bool | None, "Whether T can be used for compensation; null if unknown."
-    ]
+    compensation: Annotated[bool | None, "Whether T can be used for compensation; null if unknown."]
     bounces: Annotated[bool | None, "Whether T can be used for bounces 1 to 3; null if unknown."]
     causes: Annotated[
         list[str], "Names of `numbers` beyond their limits, the most important first."
@@ -239,3 +236,8 @@ class VerdictReport(Report):
     numbers: Annotated[
         VerdictNumbers, "Measurements of the worst channel, as far as they are known."
     ]
+
+    @classmethod
+    def from_verdict(cls, verdict: Verdict) -> VerdictReport:
+        """Return the report of a verdict."""
+        return cls.from_attributes(verdict, numbers=VerdictNumbers(**verdict.numbers))

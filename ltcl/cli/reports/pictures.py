@@ -44,9 +44,7 @@ class CompensatedPicture(Report):
     too_dark: Annotated[float, "Share of the picture that stays too dark."]
     too_bright: Annotated[float, "Share of the picture that stays too bright."]
     channels: Annotated[list[Solve], "Solves without bounds, one for each colour channel."]
-    limited: Annotated[
-        list[Solve], "Solves within the projector's range, if these were needed."
-    ]
+    limited: Annotated[list[Solve], "Solves within the projector's range, if these were needed."]
     pattern: Annotated[PictureWithStd, "The pattern."]
     appearance: Annotated[
         PictureWithStd, "Picture that the scene will show, at `exposure` / `gain`."

@@ -18,7 +18,7 @@ class Report:
     """A JSON object."""
 
     @classmethod
-    def from_attributes(cls, source: Any, **others: Any) -> Self:
+    def from_attributes(cls, source: Any, /, **others: Any) -> Self:
         """Read each field from the attribute of its name, except for those in `others`."""
         values = dict(others)
         for field in dataclasses.fields(cls):

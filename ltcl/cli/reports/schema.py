@@ -80,8 +80,10 @@ def schema() -> dict[str, Any]:
     """Describe the output of all commands."""
     definitions: dict[str, Any] = {}
     for name, kind in COMMANDS.items():
-        is_report = inspect.isclass(kind) and issubclass(kind, Report)
-        definitions[name] = _describe_report(kind) if is_report else _describe(kind)
+        if get_origin(kind) is Annotated:
+            definitions[name] = _describe(kind)
+        else:
+            definitions[name] = _describe_report(kind)
     for name, part in PARTS.items():
         definitions[name] = _describe_report(part)
     outputs = [*COMMANDS, "error"]

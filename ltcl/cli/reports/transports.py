@@ -114,9 +114,7 @@ class ChannelAnalysisReport(Report):
         tuple[float, float, float], "Smallest, median and largest direct light."
     ]
     reciprocity_defect: Annotated[float, "0 for a Lambertian scene without noise."]
-    negative_bounce: Annotated[
-        float, "Negative share of a bounce; above 0.005 for glossy scenes."
-    ]
+    negative_bounce: Annotated[float, "Negative share of a bounce; above 0.005 for glossy scenes."]
     energy: Annotated[EnergyChecks, "Checks of the conservation of energy."]
 
 
@@ -179,9 +177,7 @@ class ChannelCompressionReport(TrialReport):
     inverse_norm: Annotated[float, "Bound on the 2-norm of the inverse of S."]
     solution_error: Annotated[float, "Bound on the relative error of solutions, by `--norm`."]
     error_bound: Annotated[float, "Bound on the relative error of solutions for any light."]
-    pictures: Annotated[
-        PictureErrorReport | None, "Loss of pictures; null with `--norm worst`."
-    ]
+    pictures: Annotated[PictureErrorReport | None, "Loss of pictures; null with `--norm worst`."]
     confidence: Annotated[float, "Confidence in all bounds."]
     trials: Annotated[list[TrialReport], "The bases that were tried."]
 
