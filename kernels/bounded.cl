@@ -17,9 +17,9 @@ static inline real bounded_free(real x, real g, real lower, real upper)
 }
 
 // Sums: g.d, d.d; and the largest share of the way to its bound that an entry of x + d has gone; columns with
-// rest[column] rest. scratch: 2 more a column.
+// resting[column] rest. scratch: 2 more a column.
 kernel void bounded_direction(
-    int rows, int k, int slices, global const int *rest, global const real *numbers, global const real *lower,
+    int rows, int k, int slices, global const int *resting, global const real *numbers, global const real *lower,
     global const real *upper, global const real *x, global const real *g, global real *d, global real *sums,
     local real *scratch)
 {
@@ -27,7 +27,7 @@ kernel void bounded_direction(
     local real *alphas = columns_totals(numbers + 4 * k, slices, 2, 2, k, s, scratch, 0), *betas = alphas + s.width;
     EACH_COLUMN(j) {
         betas[j] = NUMBER(1) > 0 ? -betas[j] / NUMBER(1) : 0;  // -z.h / <A d, A d>
-        alphas[j] = rest[s.origin + j] ? 0 : NUMBER(0);
+        alphas[j] = resting[s.origin + j] ? 0 : NUMBER(0);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     const real alpha = alphas[s.column], beta = betas[s.column];
@@ -83,17 +83,17 @@ kernel void bounded_move(
     columns_sum(rr, numbers + (4 + 2 * get_num_groups(0) + get_group_id(0)) * k, 0, s, scratch);
 }
 
-// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w A d, which anew == 1 leaves as it is. Sums: the
+// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w A d, which restart == 1 leaves as it is. Sums: the
 // Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), and z.h.
 kernel void bounded_look(
-    int rows, int k, int anew, global const real *lower, global const real *upper, global const real *x,
+    int rows, int k, int restart, global const real *lower, global const real *upper, global const real *x,
     global const real *q, global real *g, global real *h, global real *numbers, local real *scratch)
 {
     const share s = columns_share(rows, k);
     const real lambda = s.first < s.end ? numbers[2 * k + s.origin + s.column] : 0;
     real gap = 0, zh = 0;
     EACH_VALUE(i, row) {
-        if (!anew)
+        if (!restart)
             h[i] = lambda == 0 ? 0 : (-q[i] - g[i]) / lambda;
         g[i] = -q[i];
         gap += g[i] * (x[i] - (g[i] > 0 ? lower[row] : upper[row]));

@@ -198,29 +198,29 @@ kernel void form_factor_matvec(
 }
 
 kernel void form_factor_pairs(
-    int count, int pitch, global const int *from, global const int *to, global const real *geometry,
+    int count, int pitch, global const int *from_patches, global const int *to_patches, global const real *geometry,
     global const real *blocks, global real *out)
 {
     const int n = get_global_id(0);
     if (n >= count)
         return;
-    const int lane = to[n] % LANES;
-    const stretch g = entries(from[n], to[n] - lane, geometry, pitch, blocks);
+    const int lane = to_patches[n] % LANES;
+    const stretch g = entries(from_patches[n], to_patches[n] - lane, geometry, pitch, blocks);
     out[n] = ((const real *)&g)[lane];
 }
 
-// out (columns, rows) = of the rays between the fronts of patch from[row] and of patches from to[row] on, a multiple of
+// out (columns, rows) = of the rays between the fronts of patch from_patches[row] and of patches from to_patches[row] on, a multiple of
 // LANES, the share that gets through; 1 where there are none. starts and ends hold three rows of `pitch` reals for each
 // ray, normals three. Ray k ends at point partner(k) of the other patch, and partner(partner(k)) = k: both directions
 // have the same rays, and the same result to the bit.
 kernel void form_factor_visible(
-    int rows, int pitch, int rays, global const int *from, global const int *to, global const real *starts,
+    int rows, int pitch, int rays, global const int *from_patches, global const int *to_patches, global const real *starts,
     global const real *ends, global const real *normals, global const real *blocks, global real *out)
 {
     const int row = get_global_id(0), column = get_global_id(1) * LANES;
     if (row >= rows)
         return;
-    const int i = from[row], j = to[row] + column;
+    const int i = from_patches[row], j = to_patches[row] + column;
     const spots p_normal = load_spots(normals, pitch, 0, i, true), q_normal = load_spots(normals, pitch, 0, j, false);
     const stretch none = 0, one = 1;
     stretch open = 0, faced = 0;

@@ -20,11 +20,11 @@ static inline real divided(real a, real b)
 }
 
 // out = w - sum_j h_j V_j, j < count, with h of the partial sums, the last of which are w * w. `h` gets those numbers,
-// added to `before` where again == 1, and the length of what is left of w, by Pythagoras, or 0 where that is rounding.
-// finish == 1 brings out to length 1, which is the next V. `out` may be w. scratch: count + 2 more a column.
+// added to `first_pass` where second_pass == 1, and the length of what is left of w, by Pythagoras, or 0 where that is rounding.
+// unit_length == 1 brings out to length 1, which is the next V. `out` may be w. scratch: count + 2 more a column.
 kernel void krylov_subtract(
-    int rows, int k, int count, int slices, int again, int finish, global const real *partials,
-    global const real *before, global real *h, global real *V, global const real *w, global real *out,
+    int rows, int k, int count, int slices, int second_pass, int unit_length, global const real *partials,
+    global const real *first_pass, global real *h, global real *V, global const real *w, global real *out,
     local real *scratch)
 {
     const share s = columns_share(rows, k);
@@ -33,7 +33,7 @@ kernel void krylov_subtract(
     EACH_COLUMN(j) {
         real squares = 0, all = 0;
         for (int i = 0; i < count; ++i) {
-            const real now = totals[i * s.width + j], sum = again ? now + before[i * k + s.origin + j] : now;
+            const real now = totals[i * s.width + j], sum = second_pass ? now + first_pass[i * k + s.origin + j] : now;
             squares += now * now;
             all += sum * sum;
             if (get_group_id(0) == 0)
@@ -42,7 +42,7 @@ kernel void krylov_subtract(
         const real square = totals[count * s.width + j];
         const real left = sqrt(square - (squares > square ? square : squares));  // NaN stays NaN
         const bool complete = left <= ORTHOGONAL * sqrt(all + left * left);
-        scale[j] = complete ? 0 : finish ? divided(1, left) : 1;
+        scale[j] = complete ? 0 : unit_length ? divided(1, left) : 1;
         if (get_group_id(0) == 0)
             h[count * k + s.origin + j] = complete ? 0 : left;
     }
@@ -55,17 +55,17 @@ kernel void krylov_subtract(
             const real c = totals[j * s.width + s.column];
             value = c == 0 ? value : value - c * V[j * size + i];  // a column without part in it, whatever it holds
         }
-        if (finish)
+        if (unit_length)
             V[count * size + i] = value = length == 0 ? 0 : length * value;
         out[i] = value;
     }
 }
 
 // p = r + beta p, q = w + beta q, x = x + alpha p, r = r - alpha q, with the sums <r, r> and <w, r>. state rows,
-// twice: <r, r>, alpha, 1 where there was no positive curvature. Columns rest where rest[column]; anew == 1 forgets p
+// twice: <r, r>, alpha, 1 where there was no positive curvature. Columns rest where resting[column]; restart == 1 forgets p
 // and q. scratch: 2 more a column.
 kernel void krylov_cg(
-    int rows, int k, int slices, int step, int anew, global const int *rest, global const real *partials,
+    int rows, int k, int slices, int step, int restart, global const int *resting, global const real *partials,
     global real *state, global const real *w, global real *p, global real *q, global real *x, global real *r,
     local real *scratch)
 {
@@ -75,8 +75,8 @@ kernel void krylov_cg(
         const real square = alphas[j], product = betas[j];
         const real previous = state[OWN(step, 0)], last = state[OWN(step, 1)];
         real broken = state[OWN(step, 2)];
-        bool moves = !rest[s.origin + j] && !(broken > 0);
-        real beta = !anew && previous > 0 ? square / previous : 0;
+        bool moves = !resting[s.origin + j] && !(broken > 0);
+        real beta = !restart && previous > 0 ? square / previous : 0;
         real curvature = beta == 0 ? product : product - beta * square / last;
         if (!(curvature > 0) && product > 0) {  // the recursion has left S: start anew along r
             beta = 0;

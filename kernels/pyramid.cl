@@ -6,7 +6,7 @@
 //   pyramid_spread  the transpose: to each pixel, the sum of the cells that it lies in
 //
 // Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A launch of
-// pyramid_gather of several levels, first .. last - 1, takes one group a piece, which waits for itself between them.
+// pyramid_gather of several levels, first_level .. end_level - 1, takes one group a piece, which waits for itself between them.
 //
 // Required define: K, see common/lanes.h. Layout: cells level by level, the finest first, each row-major, right-hand
 // sides side by side. sums is scratch for as many and a spare cell between levels: wide loads reach there.
@@ -14,17 +14,17 @@
 #include "common/lanes.h"
 
 kernel void pyramid_gather(
-    int height, int width, int first, int last, int k, real a, real b, global const real *x, global real *sums,
+    int height, int width, int first_level, int end_level, int k, real a, real b, global const real *x, global real *sums,
     global const real *y, global real *out)
 {
     const piece p = piece_of(get_global_id(0), k);
     int below_height = height, below_width = width, at = 0;  // of the level before, and where this one begins
     global const real *below = x + p.at;
-    for (int level = 0; level < last; ++level) {
+    for (int level = 0; level < end_level; ++level) {
         const int h = level ? (below_height + 1) / 2 : height, w = level ? (below_width + 1) / 2 : width;
         const int reach = level ? 2 : 1;
         global real *here = sums + (at + level) * k + p.at;
-        for (int row = get_global_id(2); level >= first && row < h; row += get_global_size(2))
+        for (int row = get_global_id(2); level >= first_level && row < h; row += get_global_size(2))
             for (int column = get_global_id(1); column < w; column += get_global_size(1)) {
                 lanes sum = 0;
                 for (int i = reach * row; i < min(reach * (row + 1), below_height); ++i)

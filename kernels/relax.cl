@@ -12,19 +12,19 @@
 // by strip by the item that ends the sums of a strip or the strip before it, whichever is later: none waits. Assumed
 // beyond OpenCL 1.2, true of CPU drivers: mem_fence and atomics order writes across the work-groups of a launch.
 //
-// A row is split at column i where its correction is omega s_i / S_ii at once (`inverses` 0), else at the first column
+// A row is split at column i where its correction is omega s_i / S_ii at once (`by_inverses` 0), else at the first column
 // of its block. The sum below, of the x before, stays in carry = b - sum: with the sum above it gives r of that x.
 //
 // Optional define: DENSE: M has rows of `width` numbers, without pointers, columns and windows. windows[2 row] is the
 // first entry of the window, windows[2 row + 1] that from the split on; weights are rows of P_BB^-1, `block` numbers
-// each, or 1 / S_ii. A launch takes rows begin .. end of the panel or block from row `start` on. scratch: 2 K reals a
+// each, or 1 / S_ii. A launch takes rows begin .. end of the panel or block from row `panel_start` on. scratch: 2 K reals a
 // work-item. arrivals[0] counts the strips begun, arrivals[i] what strip i waited for; all are 0 between launches.
 
 #include "common/product.h"
 #include "common/row_sums.h"
 
 #define ARGUMENTS \
-    int begin, int end, int first, int start, int stride, int offset, real shift, real scale, int width, \
+    int begin, int end, int first, int panel_start, int stride, int offset, real shift, real scale, int width, \
     global const int *pointers, global const int *columns, global const real *values, global const int *windows, \
     global real *x, global const real *b, global real *s, global real *r, global real *carry
 #define OFFSET (stride = STRIDE(stride), x += offset, b += offset, s += offset, r += offset, carry += offset)
@@ -41,7 +41,7 @@
 #define WINDOW_END(row, column) (SPARSE ? windows[2 * (row) + 1] : (column))
 
 kernel void relax_strips(
-    ARGUMENTS, int strips, int all, int block, int inverses, real omega, global const real *weights,
+    ARGUMENTS, int strips, int n, int block, int by_inverses, real omega, global const real *weights,
     volatile global int *arrivals, global real *before)
 {
     OFFSET;
@@ -50,8 +50,8 @@ kernel void relax_strips(
     int top = (begin / block + strip) * block;  // first row of the block
     for (int i = max(begin, top); i < min(end, top + block); ++i) {
         const int row = i - first;
-        const sums lower = ROW_SUM(row, ROW_BEGIN(row), WINDOW_BEGIN(row, start));
-        const sums upper = ROW_SUM(row, WINDOW_END(row, inverses ? top : i), ROW_END(row));
+        const sums lower = ROW_SUM(row, ROW_BEGIN(row), WINDOW_BEGIN(row, panel_start));
+        const sums upper = ROW_SUM(row, WINDOW_END(row, by_inverses ? top : i), ROW_END(row));
         for (int c = 0, j = i * stride; c < K; ++c, ++j) {
             before[j] = x[j];
             s[j] = shift * x[j] + scale * upper.item[c];
@@ -68,16 +68,16 @@ kernel void relax_strips(
             arrivals[strip] = 0;
         for (int i = max(begin, top); i < min(end, top + block); ++i) {
             const int row = i - first;
-            const sums lower = ROW_SUM(row, WINDOW_BEGIN(row, start), WINDOW_END(row, inverses ? top : i));
+            const sums lower = ROW_SUM(row, WINDOW_BEGIN(row, panel_start), WINDOW_END(row, by_inverses ? top : i));
             for (int c = 0, j = i * stride; c < K; ++c, ++j) {
                 carry[j] -= scale * lower.item[c];
                 s[j] = carry[j] - s[j];
-                if (!inverses)
+                if (!by_inverses)
                     x[j] += omega * weights[i] * s[j];
             }
         }
-        const int bottom = min(top + block, all);
-        for (int i = top; inverses && bottom <= end && i < bottom; ++i) {  // a block may end in the next slab
+        const int bottom = min(top + block, n);
+        for (int i = top; by_inverses && bottom <= end && i < bottom; ++i) {  // a block may end in the next slab
             global const real *inverse = weights + (size_t)i * block;
             const sums delta = {row_sum(false, 0, inverse, s + top * stride, stride, 0, bottom - top)};
             for (int c = 0; c < K; ++c)
@@ -91,7 +91,7 @@ kernel void relax_rows(ARGUMENTS, local real *scratch)
 {
     OFFSET;
     const int row = begin - first + get_group_id(0);  // one group a row exactly: no row is beyond the last
-    const int me = get_local_id(0), items = get_local_size(0), split = WINDOW_END(row, start);
+    const int me = get_local_id(0), items = get_local_size(0), split = WINDOW_END(row, panel_start);
     real sum[2 * K] = {0};
     row_add(SPARSE, sum, columns, VALUES(row), x, stride, ROW_BEGIN(row) + me, split, items);
     row_add(SPARSE, sum + K, columns, VALUES(row), x, stride, split + me, ROW_END(row), items);

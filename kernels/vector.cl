@@ -72,13 +72,13 @@ kernel void vector_step(
     columns_sum(dot_share(r, r, 0, s), squares + first + get_group_id(0) * k, 0, s, scratch);
 }
 
-// out (slots, k) from `first` on = sums (slots, groups, k) added up over the groups. Slot get_group_id(1).
+// out (slots, k) from `first` on = sums (slots, rows, k) added up over the rows. Slot get_group_id(1).
 kernel void vector_sums(
-    int groups, int k, global const real *sums, global real *out, int first, local real *scratch)
+    int rows, int k, global const real *sums, global real *out, int first, local real *scratch)
 {
-    const share s = columns_share(groups, k);
+    const share s = columns_share(rows, k);
     const int slot = get_group_id(1);
     real sum = 0;
-    EACH_VALUE(i, row) sum += sums[slot * groups * k + i];
+    EACH_VALUE(i, row) sum += sums[slot * rows * k + i];
     columns_sum(sum, out + first + slot * k, 0, s, scratch);
 }

@@ -4,11 +4,11 @@
 //
 // A level halves both sides at once: from the values that the filters reach, two by two are made, or two by 2 PAIRS.
 // Items stride through pieces of K right-hand sides (dimension 0), pairs of columns (1) and of rows (2). A launch of
-// several levels, first .. last - 1, takes one group a piece, which waits for itself between levels.
+// several levels, first_level .. end_level - 1, takes one group a piece, which waits for itself between levels.
 //
 // Required defines: K, see common/lanes.h; TAPS and PAIRS. Layout: a picture is row-major, its k right-hand sides side
 // by side. Coefficients stand as in PyWavelets' coeffs_to_array: of each side the approximation first, ceil(n / 2) of
-// n. taps[2 * TAPS]: low-pass filter, high-pass filter, in the order of the samples. near: the approximations of levels
+// n. taps[2 * TAPS]: low-pass filter, high-pass filter, in the order of the samples. approximations: the approximations of levels
 // 1 .. levels - 1, that of level i + 1 from pixel starts[i] on.
 //
 // Of the ceil(pixels / 2^level) samples of a side the last may stand for fewer pixels. It stays out of the filters;
@@ -177,18 +177,18 @@ INLINE void store(
 }
 
 #define TRANSFORM \
-    int height, int width, int first, int last, int levels, int k, real scale, real add_scale, \
-    constant int *starts, constant real *taps, global const real *x, global real *near, global const real *add, \
+    int height, int width, int first_level, int end_level, int levels, int k, real scale, real add_scale, \
+    constant int *starts, constant real *taps, global const real *x, global real *approximations, global const real *add, \
     global real *out
 
 kernel void wavelet_split(TRANSFORM)
 {
     const piece p = piece_of(get_global_id(0), k);
-    for (int level = first; level < last; ++level) {
+    for (int level = first_level; level < end_level; ++level) {
         const side a = side_at(height, level), b = side_at(width, level);
         const bool deepest = level + 1 == levels;
-        global const real *from = (level ? near + starts[level - 1] * k : x) + p.at;
-        global real *to = deepest ? out + p.at : near + starts[level] * k + p.at;
+        global const real *from = (level ? approximations + starts[level - 1] * k : x) + p.at;
+        global real *to = deepest ? out + p.at : approximations + starts[level] * k + p.at;
         const real u = deepest ? scale : 1, v = deepest ? add_scale : 0;
         for (int i = get_global_id(2); i < a.pairs; i += get_global_size(2))
             for (int j = get_global_id(1), done; j < b.pairs; j += done * get_global_size(1)) {
@@ -209,18 +209,18 @@ kernel void wavelet_split(TRANSFORM)
     }
 }
 
-// Levels last - 1 .. first; `out` gets the picture where the first is level 0.
+// Levels end_level - 1 .. first_level; `out` gets the picture where first_level is 0.
 kernel void wavelet_join(TRANSFORM)
 {
     const piece p = piece_of(get_global_id(0), k);
     x += p.at;
     add += p.at;
-    for (int level = last - 1; level >= first; --level) {
+    for (int level = end_level - 1; level >= first_level; --level) {
         const side a = side_at(height, level), b = side_at(width, level);
         const bool deepest = level + 1 == levels;
-        global const real *low = deepest ? x : near + starts[level] * k + p.at;
+        global const real *low = deepest ? x : approximations + starts[level] * k + p.at;
         const int pitch = deepest ? width : b.pairs;
-        global real *to = (level ? near + starts[level - 1] * k : out) + p.at;
+        global real *to = (level ? approximations + starts[level - 1] * k : out) + p.at;
         const real u = level ? 1 : scale, v = level ? 0 : add_scale;
         for (int i = get_global_id(2); i < a.pairs; i += get_global_size(2))
             for (int j = get_global_id(1), done; j < b.pairs; j += done * get_global_size(1)) {

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Refusals of bad input before anything is built: one line with argument, value and what it must be."""
+"""Checks of arguments: bad input is refused before anything is built.
+
+Each error is one line that names the argument, what it was and what it must be.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +21,14 @@ import scipy.sparse
 
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 
-_BOUNDS = {
+BOUNDS = {
     "above": ("above", operator.gt),
     "least": ("at least", operator.ge),
     "most": ("at most", operator.le),
     "below": ("below", operator.lt),
 }
-_UPWARDS = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING)
+TWO_DIGITS_UPWARDS = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING)
+UNLIMITED = 1 << 62  # bytes
 
 
 def finite(name: str, array: np.ndarray) -> np.ndarray:
@@ -34,23 +38,21 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
         if array.size == 0 or np.isfinite(np.sum(array)):
             return array
     bad = np.argwhere(~np.isfinite(array)).tolist()
-    if bad:
-        place = (
-            f", the first at {bad[0][0] if array.ndim == 1 else tuple(bad[0])}"
-            if array.ndim
-            else ""
-        )
-        raise InputError(
-            f"{name} has {len(bad)} NaN or infinite value(s){place}; all must be finite"
-        )
-    return array
+    if not bad:
+        return array
+    place = ""
+    if array.ndim == 1:
+        place = f", the first at {bad[0][0]}"
+    elif array.ndim > 1:
+        place = f", the first at {tuple(bad[0])}"
+    raise InputError(f"{name} has {len(bad)} NaN or infinite value(s){place}; all must be finite")
 
 
 def real(name: str, value: Any) -> np.ndarray:
     """Return `value` as an array of real numbers (no copy where it is one); refuse others."""
     if isinstance(value, (str, os.PathLike)):
-        reading = "read a picture with ltcl.images.read, a transport with ltcl.load"
-        raise InputTypeError(f"{name} is the text {str(value)!r}; it must be an array: {reading}")
+        advice = "read a picture with ltcl.images.read, a transport with ltcl.load"
+        raise InputTypeError(f"{name} is the text {str(value)!r}; it must be an array: {advice}")
     unmasked(name, value)
     try:
         array = np.asarray(value)
@@ -59,17 +61,19 @@ def real(name: str, value: Any) -> np.ndarray:
             f"{name} is ragged; it must be a rectangular array of real numbers"
         ) from error
     if array.dtype.kind not in "fiub":
-        wrong = "is None" if value is None else f"holds {array.dtype}"
-        raise InputTypeError(f"{name} {wrong}; it must hold real numbers")
+        content = "is None" if value is None else f"holds {array.dtype}"
+        raise InputTypeError(f"{name} {content}; it must hold real numbers")
     return array
 
 
 def unmasked(name: str, value: Any) -> None:
     """Refuse an array with masked values, or a list of such rows: np.asarray would drop the mask."""
     rows = value if isinstance(value, (list, tuple)) else [value]
-    if masked := sum(
-        int(np.ma.count_masked(row)) for row in rows if isinstance(row, np.ma.MaskedArray)
-    ):
+    masked = 0
+    for row in rows:
+        if isinstance(row, np.ma.MaskedArray):
+            masked += int(np.ma.count_masked(row))
+    if masked:
         raise InputTypeError(
             f"{name} has {masked} masked value(s); fill them first, as with .filled(0)"
         )
@@ -78,17 +82,17 @@ def unmasked(name: str, value: Any) -> None:
 def shape(name: str, array: np.ndarray, *allowed: tuple[int, ...]) -> np.ndarray:
     """Return `array` unchanged if its shape is one of `allowed`."""
     if array.shape not in allowed:
-        raise InputError(
-            f"{name} has shape {array.shape}; it must be {' or '.join(map(str, allowed))}"
-        )
+        shapes = " or ".join(map(str, allowed))
+        raise InputError(f"{name} has shape {array.shape}; it must be {shapes}")
     return array
 
 
 def grid(name: str, value: Any, pixels: int | None = None) -> tuple[int, int]:
     """Return `value` as (h, w) of positive integers, with h * w == pixels where that is given."""
     h = w = 0
-    with contextlib.suppress(TypeError, ValueError, OverflowError):  # the last of infinity
-        h, w = (int(v) for v in value)
+    # An infinite size overflows.
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        h, w = (int(size) for size in value)
     if h < 1 or w < 1 or (h, w) != tuple(value):
         raise InputError(f"{name} is {shown(value)}; it must be two positive integers (h, w)")
     if pixels is not None and h * w != pixels:
@@ -99,12 +103,18 @@ def grid(name: str, value: Any, pixels: int | None = None) -> tuple[int, int]:
 def number(name: str, value: Any, **bounds: float) -> float:
     """Return `value` as a finite float; bounds are above=, least=, most= and below=."""
     x = math.nan
-    if not isinstance(value, (bool, str, bytes)) and not getattr(value, "ndim", 0):
+    is_scalar = not isinstance(value, (bool, str, bytes)) and not getattr(value, "ndim", 0)
+    if is_scalar:
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             x = float(value)
-    limits = [(*_BOUNDS[side], bound) for side, bound in bounds.items()]
-    if not math.isfinite(x) or not all(holds(x, bound) for _, holds, bound in limits):
-        allowed = " and ".join(f"{text} {bound:g}" for text, _, bound in limits)
+    is_allowed = math.isfinite(x)
+    conditions = []
+    for side, bound in bounds.items():
+        text, holds = BOUNDS[side]
+        conditions.append(f"{text} {bound:g}")
+        is_allowed = is_allowed and holds(x, bound)
+    if not is_allowed:
+        allowed = " and ".join(conditions)
         raise InputError(f"{name} is {shown(value)}; it must be a finite number {allowed}".rstrip())
     return x
 
@@ -115,7 +125,8 @@ def interval(name: str, value: Any) -> tuple[float, float]:
         low, high = value
     except (TypeError, ValueError):
         raise InputError(f"{name} is {shown(value)}; it must be (low, high)") from None
-    low, high = number(f"{name}[0]", low), number(f"{name}[1]", high)
+    low = number(f"{name}[0]", low)
+    high = number(f"{name}[1]", high)
     if low >= high:
         raise InputError(f"{name} is {shown(value)}; it must be (low, high) with low below high")
     return low, high
@@ -123,7 +134,8 @@ def interval(name: str, value: Any) -> tuple[float, float]:
 
 def count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
     """Return `value` as an integer of at least `least` and at most `most`."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+    is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not is_whole or value < least:
         raise InputError(f"{name} is {shown(value)}; it must be a whole number of at least {least}")
     if most is not None and value > most:
         raise InputError(f"{name} is {value}; it must be at most {most}")
@@ -141,16 +153,16 @@ def one_of(name: str, value: Any, allowed: Iterable[Any]) -> Any:
     """Return `value` if it is one of `allowed`."""
     choices = list(allowed)
     if getattr(value, "ndim", 0) or value not in choices:
-        raise InputError(f"{name} is {value!r}; it must be one of {', '.join(map(str, choices))}")
+        names = ", ".join(map(str, choices))
+        raise InputError(f"{name} is {value!r}; it must be one of {names}")
     return value
 
 
 def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     """Return `matrix` as a checked `csr_array` with sorted, unique indices."""
     if not scipy.sparse.issparse(matrix):
-        raise InputTypeError(
-            f"{name} is a {type(matrix).__name__}; it must be a scipy.sparse array"
-        )
+        kind = type(matrix).__name__
+        raise InputTypeError(f"{name} is a {kind}; it must be a scipy.sparse array")
     if matrix.ndim != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
     real(name, np.zeros(0, matrix.dtype))
@@ -159,10 +171,9 @@ def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
         matrix.data = matrix.data.astype(np.float32)
     if matrix.format not in ("csr", "csc"):
         matrix = scipy.sparse.csr_array(matrix)
-    shape = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
-    compressed(
-        name, matrix.indptr, matrix.indices, matrix.data, shape
-    )  # SciPy may read outside of arrays
+    # The arrays are checked before SciPy converts them: it may read outside of arrays that lie.
+    compressed_shape = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
+    compressed(name, matrix.indptr, matrix.indices, matrix.data, compressed_shape)
     result = scipy.sparse.csr_array(matrix)
     if not result.has_canonical_format:
         result = result.copy()
@@ -173,17 +184,20 @@ def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
 def compressed(
     name: str, indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, shape: tuple[int, int]
 ) -> None:
-    """Refuse compressed rows of no matrix of `shape`, some of which SciPy's `check_format` takes."""
+    """Refuse compressed rows that are no matrix of `shape`.
+
+    SciPy's `check_format` takes some of these.
+    """
     rows, columns = shape
-    for what, array in (("indptr", indptr), ("indices", indices), ("data", data)):
-        kinds, of = ("iu", " of integers") if what != "data" else ("fiubc", "")
-        if array.ndim != 1 or array.dtype.kind not in kinds:
-            raise InputError(
-                f"{name}.{what} has shape {array.shape}, {array.dtype}; it must be a vector{of}"
-            )
+    _check_vector(f"{name}.indptr", indptr, "iu", "a vector of integers")
+    _check_vector(f"{name}.indices", indices, "iu", "a vector of integers")
+    _check_vector(f"{name}.data", data, "fiubc", "a vector")
     if len(indptr) != rows + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
-        start = f"{len(indptr)} entries from {indptr[0] if len(indptr) else 'none'}"
-        raise InputError(f"{name}.indptr has {start}; it must have {rows + 1}, and must never fall")
+        first = indptr[0] if len(indptr) else "none"
+        raise InputError(
+            f"{name}.indptr has {len(indptr)} entries from {first}; it must have {rows + 1}, from 0, "
+            "and must never fall"
+        )
     if indptr[-1] != len(indices) or len(indices) != len(data):
         counts = f"{len(indices)} indices and {len(data)} values"
         raise InputError(f"{name}.indptr ends at {indptr[-1]} with {counts}; the three must agree")
@@ -195,37 +209,51 @@ def compressed(
     finite(f"{name}.data", data)
 
 
+def _check_vector(name: str, array: np.ndarray, kinds: str, expected: str) -> None:
+    if array.ndim != 1 or array.dtype.kind not in kinds:
+        raise InputError(f"{name} has shape {array.shape}, {array.dtype}; it must be {expected}")
+
+
 def host_memory() -> int:
-    """Bytes of memory the host can still give, as far as the system and a limit of this process say."""
-    available = 1 << 62  # unknown: let the allocation itself decide
+    """Bytes of memory the host can still give, as far as the system and limits of this process say."""
+    return min(_memory_of_system(), _memory_within_limits())
+
+
+def _memory_of_system() -> int:
+    """Bytes that the system has free; unlimited where unknown: then the allocation itself decides."""
+    with contextlib.suppress(OSError, KeyError, ValueError):
+        with open("/proc/meminfo", encoding="ascii") as file:
+            fields = dict(line.split(":", 1) for line in file)
+        return int(fields["MemAvailable"].split()[0]) * 1024
     with contextlib.suppress(AttributeError, OSError, ValueError):
-        available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with (
-        contextlib.suppress(OSError, KeyError, ValueError),
-        open("/proc/meminfo", encoding="ascii") as file,
-    ):
-        fields = dict(line.split(":", 1) for line in file)
-        available = int(fields["MemAvailable"].split()[0]) * 1024
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return UNLIMITED
+
+
+def _memory_within_limits() -> int:
+    """Bytes that the limits of this process (`ulimit`) leave."""
+    available = UNLIMITED
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource  # not on Windows
 
-        for kind, column in (
-            (resource.RLIMIT_AS, 0),
-            (resource.RLIMIT_DATA, 5),
-        ):  # addresses; without files
+        # Columns of /proc/self/statm: all addresses; data, without files.
+        for kind, column in ((resource.RLIMIT_AS, 0), (resource.RLIMIT_DATA, 5)):
             limit, _ = resource.getrlimit(kind)
-            if limit != resource.RLIM_INFINITY:
-                with open("/proc/self/statm", encoding="ascii") as file:
-                    used = int(file.read().split()[column]) * os.sysconf("SC_PAGE_SIZE")
-                available = min(available, max(limit - used, 0))
+            if limit == resource.RLIM_INFINITY:
+                continue
+            with open("/proc/self/statm", encoding="ascii") as file:
+                pages = int(file.read().split()[column])
+            used = pages * os.sysconf("SC_PAGE_SIZE")
+            available = min(available, max(limit - used, 0))
     return available
 
 
-def fits_host(what: str, needed: int, most: int = 1 << 62) -> None:
+def fits_host(what: str, needed: int, most: int = UNLIMITED) -> None:
     """Refuse an allocation of `needed` bytes beyond `most` or what the host has, before it is tried."""
     if needed > most:
         raise MemoryLimitError(f"{what} needs {size(needed)}; it may take at most {size(most)}")
-    if needed > (available := host_memory()):
+    available = host_memory()
+    if needed > available:
         raise MemoryLimitError(
             f"{what} needs {size(needed)}, but the host has {size(available)} free"
         )
@@ -249,4 +277,5 @@ def size(nbytes: float) -> str:
 
 def upwards(error: float) -> str:
     """Two digits, rounded up: 0.00421 -> '0.0043'."""
-    return f"{float(_UPWARDS.create_decimal(repr(float(error)))):.2g}"
+    rounded = TWO_DIGITS_UPWARDS.create_decimal(repr(float(error)))
+    return f"{float(rounded):.2g}"

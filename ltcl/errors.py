@@ -14,11 +14,8 @@ class LtclError(Exception):
     """Base of every exception that ltcl raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (
-            type(self),
-            self.args,
-            self.__dict__,
-        )  # else Dask makes a FileError by `ValueError.__new__`
+        # Without this, unpickling makes a FileError by `ValueError.__new__`, which loses its type.
+        return type(self), self.args, self.__dict__
 
 
 class InputError(LtclError, ValueError):
@@ -30,7 +27,10 @@ class InputTypeError(LtclError, TypeError):
 
 
 class ToleranceError(InputError):
-    """A tolerance is below what float32 keeps; `least` is about what it does, infinite where not known."""
+    """A tolerance is below what float32 resolves.
+
+    `least` is about the smallest tolerance that it does resolve, infinite where unknown.
+    """
 
     def __init__(self, message: str, least: float = math.inf) -> None:
         super().__init__(message)
@@ -54,7 +54,7 @@ class ClusterError(LtclError, RuntimeError):
 
 
 class BatchError(LtclError, RuntimeError):
-    """Some of many scenes failed. `results` has all, in order, with errors in their places."""
+    """Some of many scenes failed; `results` has all results in order, errors in the failed places."""
 
     def __init__(self, message: str, results: Any = ()) -> None:
         super().__init__(message)
@@ -62,23 +62,28 @@ class BatchError(LtclError, RuntimeError):
 
 
 class AcquisitionError(LtclError, RuntimeError):
-    """A photograph is missing, stale or unusable, or the rig failed; the message says which and why."""
+    """A photograph is missing, stale or unusable, or the rig failed."""
 
 
 class ScanRefused(AcquisitionError):
-    """Photographs that are in a store already cannot be used: what goes on with it would end as it did."""
+    """Photographs that are in a store already cannot be used; a scan that goes on would fail again."""
 
 
 class PhotographMissing(AcquisitionError):
-    """A person has yet to take the photograph `shot` of the shooting list; `missing` are not there yet."""
+    """A person has yet to take a photograph of the shooting list.
+
+    `number` and `shot` are that photograph's; `missing` counts the photographs that are not there.
+    """
 
     def __init__(self, message: str, number: int = 0, shot: Any = None, missing: int = 1) -> None:
         super().__init__(message)
-        self.number, self.shot, self.missing = number, shot, missing
+        self.number = number
+        self.shot = shot
+        self.missing = missing
 
 
 class ConvergenceError(LtclError, ArithmeticError):
-    """A solve did not reach its tolerance. `solution`, as the function returns it, holds the best iterate."""
+    """A solve did not reach its tolerance; `solution` holds the best iterate."""
 
     def __init__(self, message: str, solution: Any = None) -> None:
         super().__init__(message)

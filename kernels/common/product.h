@@ -3,8 +3,8 @@
 //
 //   without STEP   out = a (A x) + b y + c x
 //   with STEP      one step of a stationary iteration on S = a A + c I along the direction x:
-//                  iterate += x;  r -= S x;  next = keep x + gain r;  and the squares of the new r, summed over a
-//                  work-group, to partials[group_at + group]
+//                  iterate += x;  r -= S x;  next_x = keep x + gain r;  and the squares of the new r, summed over a
+//                  work-group, to partials[first_group + group]
 //
 // <format>_matvec takes one work-item a row, in wide loads: for CPUs, and for short rows; <format>_matvec_group one
 // work-group, its items side by side: for GPUs. Each is BY_ITEM or BY_GROUP of a statement that adds item `me` of
@@ -29,14 +29,14 @@ static inline void group_sums(real *value, local real *scratch)
 
 #ifdef STEP
 #define PRODUCT_ARGUMENTS \
-    int rows, int first, int stride, int offset, real a, real c, real keep, real gain, int group_at, \
-    global const real *x, global real *iterate, global real *r, global real *next, global real *partials
+    int rows, int first, int stride, int offset, real a, real c, real keep, real gain, int first_group, \
+    global const real *x, global real *iterate, global real *r, global real *next_x, global real *partials
 #define PRODUCT_NAMES \
-    rows, first, stride, offset, a, c, keep, gain, group_at, x, iterate, r, next, partials
+    rows, first, stride, offset, a, c, keep, gain, first_group, x, iterate, r, next_x, partials
 #define SUM_SQUARES group_sums(sum.item, scratch)
 #define KEEP_SQUARES \
     for (int k = 0; k < K && get_local_id(0) == 0; ++k) \
-        partials[(group_at + (int)get_group_id(0)) * stride + offset + k] = sum.item[k]
+        partials[(first_group + (int)get_group_id(0)) * stride + offset + k] = sum.item[k]
 
 // The step of one row; `sum` becomes the squares of its residual.
 static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
@@ -46,7 +46,7 @@ static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
         const real d = x[i + k], left = r[i + k] - (a * sum[k] + c * d);
         iterate[i + k] += d;
         r[i + k] = left;
-        next[i + k] = keep * d + gain * left;
+        next_x[i + k] = keep * d + gain * left;
         sum[k] = left * left;
     }
 }

@@ -33,7 +33,7 @@ from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
 from ltcl.acquisition.radiometry import Radiance, Response
-from ltcl.acquisition.radiometry.camera import NO_LIGHT
+from ltcl.acquisition.radiometry.exposures import NO_LIGHT
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import CaptureSession, Photograph, Request, acquisition_error
 from ltcl.errors import AcquisitionError, InputError

@@ -28,14 +28,15 @@ from ltcl.batch.cluster import is_there, stream
 from ltcl.batch.manifest import OtherRun, Record, curve, identity, setting
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, locked, read_ahead
+from ltcl.images.encoding import Encoding
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
-from ltcl.images.pictures import Encoding
 from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
 from ltcl.tasks.compensation import compensate, problem
 from ltcl.tasks.report import versions
+from ltcl.tasks.requirements import error_note, resolve_reference
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import Transport, error_note, require, resolve_reference
+from ltcl.transport.transport import Transport, check_transport
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -221,7 +222,7 @@ def _validate(
     T: Transport, gain: Any, loss: Any, functions: dict[str, Any], options: dict[str, Any]
 ) -> tuple[float, float]:
     """The bounds; refuses what `compensate` would, and pictures that are not for all frames."""
-    require(T, square=False)
+    check_transport(T, square=False)
     resolve_reference(T, options.get("exact"))
     problem.gain(gain, loss)
     for name, value in functions.items():

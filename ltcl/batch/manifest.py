@@ -17,7 +17,7 @@ import numpy as np
 
 from ltcl.errors import InputError
 from ltcl.files import input_file, replace_file
-from ltcl.store.record import about
+from ltcl.store.guards import about
 from ltcl.tasks import report
 from ltcl.transport.fingerprint import fingerprint
 from ltcl.transport.transport import Transport

@@ -13,8 +13,8 @@ from ltcl.cli.command import Answer, Context, command, note
 from ltcl.cli.options import argument, check_writable_file
 from ltcl.cli.reports.transports import ConvertReport
 from ltcl.errors import InputError
-from ltcl.store import Parts, Record, formats
-from ltcl.store.record import about
+from ltcl.store import CompressedRecord, StoreRecord, formats
+from ltcl.store.guards import about
 
 
 @command(options.file_options)
@@ -41,13 +41,15 @@ def convert(
     return Answer(report, [f"{target}: {facts.stored}, {size} on disk"])
 
 
-def _set_grids(context: Context, record: Record | Parts) -> Record | Parts:
+def _set_grids(
+    context: Context, record: StoreRecord | CompressedRecord
+) -> StoreRecord | CompressedRecord:
     """Set the grids of the options; a compressed transport cannot have another one."""
     sizes = {}
     for name in ("grid", "camera_grid"):
         if context.options[name] is not None:
             sizes[name] = context.options[name]
-    if isinstance(record, Record):
+    if isinstance(record, StoreRecord):
         return dataclasses.replace(record, **sizes)
     if any(size != record.grid for size in sizes.values()):
         size = next(iter(sizes.values()))
@@ -56,7 +58,7 @@ def _set_grids(context: Context, record: Record | Parts) -> Record | Parts:
     return record
 
 
-def _note_lost_grids(target: Path, record: Record | Parts) -> None:
+def _note_lost_grids(target: Path, record: StoreRecord | CompressedRecord) -> None:
     rows, columns = record.shape
     if target.suffix.lower() == ".npy" or record.grid is None:
         grid = "x".join(str(size) for size in record.grid or "HW")

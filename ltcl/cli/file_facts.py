@@ -11,7 +11,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.cli.reports.transports import FileFacts
 from ltcl.errors import InputError
-from ltcl.store import Parts, Record
+from ltcl.store import CompressedRecord, StoreRecord
 from ltcl.store.record import CSR
 from ltcl.transport import first_bounce
 from ltcl.transport.noise import estimate
@@ -22,9 +22,11 @@ from ltcl.transport.verdict import Verdict, verdict
 MAX_JUDGED_BYTES = 1 << 28
 
 
-def describe(file: Path, record: Record | Parts) -> tuple[FileFacts, np.ndarray | None]:
+def describe(
+    file: Path, record: StoreRecord | CompressedRecord
+) -> tuple[FileFacts, np.ndarray | None]:
     """Return facts of a transport, and F (channels, N); refuse what could not be loaded again."""
-    if isinstance(record, Parts):
+    if isinstance(record, CompressedRecord):
         return _describe_compressed(file, record)
     F = _first_bounce(record)
     matrices: list[Any] = list(record.matrices)
@@ -52,7 +54,7 @@ def describe(file: Path, record: Record | Parts) -> tuple[FileFacts, np.ndarray 
     return facts, F
 
 
-def _describe_compressed(file: Path, record: Parts) -> tuple[FileFacts, np.ndarray]:
+def _describe_compressed(file: Path, record: CompressedRecord) -> tuple[FileFacts, np.ndarray]:
     """Describe a compressed transport without its operators, which need a device."""
     F = record.first_bounce
     kinds = ", ".join(record.kinds)
@@ -75,7 +77,7 @@ def _describe_compressed(file: Path, record: Parts) -> tuple[FileFacts, np.ndarr
     return facts, F
 
 
-def _stored_form(record: Parts) -> Any:
+def _stored_form(record: CompressedRecord) -> Any:
     """Return "compressed" or "inverse"."""
     return record.format.split("-")[1]
 
@@ -84,11 +86,11 @@ def _channels(count: int) -> Any:
     return count
 
 
-def _mixing(record: Record | Parts) -> Any:
+def _mixing(record: StoreRecord | CompressedRecord) -> Any:
     return None if record.mixing is None else np.asarray(record.mixing).tolist()
 
 
-def _count_entries(record: Record, matrix: Any) -> int:
+def _count_entries(record: StoreRecord, matrix: Any) -> int:
     return int(np.count_nonzero(matrix)) if record.dense else int(matrix.nnz)
 
 
@@ -106,7 +108,7 @@ def _count_dark(F: np.ndarray | None) -> int | None:
     return None if F is None else int(np.count_nonzero((F <= 0).any(axis=0)))
 
 
-def _first_bounce(record: Record) -> np.ndarray | None:
+def _first_bounce(record: StoreRecord) -> np.ndarray | None:
     """Check a whole record; return F (channels, N), 0 where dark, or None if T is not square."""
     _check_record(record)
     rows, columns = record.shape
@@ -131,7 +133,7 @@ def _first_bounce(record: Record) -> np.ndarray | None:
     return np.where(is_dark, 0.0, F)
 
 
-def _check_record(record: Record) -> None:
+def _check_record(record: StoreRecord) -> None:
     rows, columns = record.shape
     checks.grid("grid", record.grid or (1, columns), columns)
     checks.grid("camera_grid", record.camera_grid or (1, rows), rows)
@@ -143,9 +145,9 @@ def _check_record(record: Record) -> None:
         checks.finite("T", matrix if record.dense else matrix.data)
 
 
-def judge(record: Record | Parts, facts: FileFacts) -> Verdict:
+def judge(record: StoreRecord | CompressedRecord, facts: FileFacts) -> Verdict:
     """Judge a transport as far as this is cheap; else tell which command can."""
-    if isinstance(record, Parts):
+    if isinstance(record, CompressedRecord):
         return Verdict(
             f"Unknown: stored as {facts.stored}: run 'ltcl analyze' on what it was made of."
         )

@@ -16,7 +16,7 @@ from ltcl.cli.reports.transports import BadFile, FileFacts, GoodFile
 from ltcl.cli.tables import interval_text, size_text, table, verdict_lines
 from ltcl.errors import LtclError
 from ltcl.store import BlockStore, formats
-from ltcl.store.record import about
+from ltcl.store.guards import about
 from ltcl.transport.verdict import Verdict
 
 COLUMNS = (

@@ -17,7 +17,8 @@ from ltcl.errors import InputError
 from ltcl.operators import rank_device
 from ltcl.solvers.solve import SAMPLED
 from ltcl.tasks import report
-from ltcl.transport.transport import Transport, default_rtol, resolve_reference
+from ltcl.tasks.requirements import default_rtol, resolve_reference
+from ltcl.transport.transport import Transport
 
 # Relative error of a float32 picture by rounding.
 PICTURE_ROUNDING = 1e-5
@@ -34,11 +35,13 @@ def load(context: Context, path: Path, notes_dark: bool = True) -> Transport:
     if noise_path is not None:
         context.progress(f"reading {noise_path}")
         settings["noise"] = store.load(noise_path, device=device, **settings)
-    settings |= _given_options(context, "first_bounce", "on_dark", "dark")
+    settings |= _given_options(context, "first_bounce", "on_dark")
+    if options.get("dark") is not None:
+        settings["dark_threshold"] = options["dark"]
     T = store.load(path, device=device, **settings)
     dark_pixels = int(T.masked.sum())
     # Loading has logged the note on pixels that are below a threshold.
-    if dark_pixels and notes_dark and not T.dark:
+    if dark_pixels and notes_dark and not T.dark_note:
         pixels = f"{dark_pixels} of {T.shape[1]} projector pixels"
         note(f"{path}: {pixels} give no direct light; they stay unlit")
     return T
@@ -136,7 +139,7 @@ def _load_original(context: Context, T: Transport) -> Transport:
         grid=T.grid,
         first_bounce=T.first_bounce,
         on_dark="mask" if T.masked.any() else "raise",
-        dark=0.0,
+        dark_threshold=0.0,
         device=T.device,
     )
     # It refuses other colours.

@@ -19,7 +19,7 @@ import typer
 
 from ltcl.errors import FileError
 from ltcl.solvers.solve import METHODS
-from ltcl.transport.first_bounce import DARK
+from ltcl.transport.first_bounce import DARK_THRESHOLD
 
 TRANSPORT_PANEL = "Reading the transport"
 SOLVER_PANEL = "Solving"
@@ -185,7 +185,7 @@ def transport_options(
             "0 keeps them lit.",
             panel=TRANSPORT_PANEL,
         ),
-    ] = DARK,
+    ] = DARK_THRESHOLD,
     noise: Annotated[
         Path | None,
         file_option(

@@ -20,7 +20,7 @@ from ltcl.cli.reports.acquisition import SimulateReport
 from ltcl.cli.reports.parts import Versions
 from ltcl.cli.tables import size_text
 from ltcl.errors import InputError
-from ltcl.store import Record, formats
+from ltcl.store import StoreRecord, formats
 from ltcl.tasks.report import versions
 
 SCENES = ("dihedral", "trihedral", "box")
@@ -231,7 +231,7 @@ def _mitsuba_rig(source: str, asked: dict[str, Any]) -> dict[str, Any]:
     return rig
 
 
-def _named_scene(name: str, asked: dict[str, Any]) -> Record:
+def _named_scene(name: str, asked: dict[str, Any]) -> StoreRecord:
     from ltcl import scenes
 
     albedo = asked["albedo"] or DEFAULT_ALBEDO
@@ -239,7 +239,7 @@ def _named_scene(name: str, asked: dict[str, Any]) -> Record:
     sides = {"sides": 5} if name == "box" else {}
     make = getattr(scenes, name)
     built = make(asked["size"] or DEFAULT_SIZE, albedo=walls, **sides)
-    return Record(built.matrices(), grid=built.grid)
+    return StoreRecord(built.matrices(), grid=built.grid)
 
 
 def _scene_of_file(scene: str, asked: dict[str, Any]) -> Any:
@@ -250,7 +250,7 @@ def _scene_of_file(scene: str, asked: dict[str, Any]) -> Any:
     record = formats.read(path)
     if record.grid is None and asked["grid"] is None:
         raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
-    if isinstance(record, Record) and asked["grid"] is not None:
+    if isinstance(record, StoreRecord) and asked["grid"] is not None:
         grid = checks.grid("--grid", asked["grid"], record.shape[1])
         return dataclasses.replace(record, grid=grid)
     return record
@@ -269,4 +269,4 @@ def _write_camera(path: Path, camera_grid: tuple[int, int], scene_grid: tuple[in
         return x, y
 
     seen = camera_map(project, camera_grid, scene_grid)
-    formats.write(path, Record((seen,), grid=scene_grid, camera_grid=camera_grid))
+    formats.write(path, StoreRecord((seen,), grid=scene_grid, camera_grid=camera_grid))

@@ -15,11 +15,11 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ltcl.errors import DeviceError, LtclError, MemoryLimitError
+from ltcl.errors import DeviceError, InputTypeError, LtclError, MemoryLimitError
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
@@ -93,49 +93,67 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
             ) from error
 
 
-class Kernel:
-    """A compiled kernel of one device.
+class Parameter(NamedTuple):
+    """One argument of a kernel, as the compiler reports it."""
 
-    Call it with the number of work-items, the work-group size and the arguments: Python numbers,
-    `Array`, or local memory. Items are rounded up to whole groups, which are clamped to what is
-    allowed (`group`).
+    index: int
+    # The bytes of a Python number; None for buffers and local memory.
+    pack: Callable[[Any], Any] | None
+
+
+class Kernel:
+    """A compiled kernel of one device, launched with its arguments by their names in the source.
+
+    Values are Python numbers, `Array`s, or local memory. Work-items are rounded up to whole
+    work-groups, whose size is clamped to what kernel and device allow (`group`).
+
+    >>> import ltcl
+    >>> device = ltcl.open_device("cpu")
+    >>> out = device.empty(1000)
+    >>> kernel = device.kernel("vector", "vector_fill")
+    >>> kernel(1000, 64, count=1000, value=2.0, out=out)  # queue it once
+    >>> launch = kernel.bind(1000, 64, count=1000, value=3.0, out=out)
+    >>> launch()  # queue it, again and again
+    >>> launch.set(value=4.0)
+    >>> launch()
+    >>> out.get()[:3].tolist()
+    [4.0, 4.0, 4.0]
     """
 
     def __init__(self, device: Device, program: Any, name: str) -> None:
-        self.device, self.name, self._program = device, name, program
-        self.idle: list[Any] = []  # cl_kernels of launches that are gone: making one costs 0.1 ms
-        self._limits: list[int] = device.handle.max_work_item_sizes
-        info = device.cl.kernel_arg_info
+        self.device = device
+        self.name = name
+        self._program = program
+        # cl_kernels of launches that are gone: making one costs 0.1 ms.
+        self.idle: list[Any] = []
+        self._groups: dict[tuple[int, ...], tuple[int, ...]] = {}
+        self._item_limits: list[int] = device.handle.max_work_item_sizes
         handle = self.take()
         with translated(f"asking for {name} on {device.name}"):
             work_group = device.cl.kernel_work_group_info.WORK_GROUP_SIZE
-            largest = handle.get_work_group_info(work_group, device.handle)
-            self._largest: int = min(largest, device.max_group)
-            # How a number becomes argument `index`; None of buffers and local memory.
-            self.packers = tuple(
-                _PACKERS[handle.get_arg_info(index, info.TYPE_NAME).replace("unsigned ", "u")]
-                if handle.get_arg_info(index, info.ADDRESS_QUALIFIER) == _PRIVATE
-                else None
-                for index in range(handle.num_args)
-            )
+            allowed = handle.get_work_group_info(work_group, device.handle)
+            self._max_group: int = min(allowed, device.max_group)
+            self.parameters = _parameters(device.cl.kernel_arg_info, handle)
         self.idle.append(handle)
 
-    def __call__(self, items: _Size, group: _Size, *arguments: Any) -> None:
+    def __call__(self, items: _Size, group: _Size, /, *positional: Any, **named: Any) -> None:
         """Queue a launch over `items` rounded up to whole groups; returns at once."""
-        Launch(self, items, group, arguments)()
+        Launch(self, items, group, self._by_name(positional, named))()
 
-    def bind(self, items: _Size, group: _Size, *arguments: Any) -> Launch:
+    def bind(self, items: _Size, group: _Size, /, *positional: Any, **named: Any) -> Launch:
         """The launch that calling the kernel would queue, to be queued again and again."""
-        return Launch(self, items, group, arguments)
+        return Launch(self, items, group, self._by_name(positional, named))
 
     def group(self, size: Any) -> Any:
-        """The work-group of a launch that asks for one of `size`: halved until kernel and device allow it."""
+        """The work-group of a launch that asks for `size`: halved until kernel and device allow it."""
         if isinstance(size, int):
             return self.group((size,))[0]
-        sizes = list(map(min, size, self._limits))
-        while math.prod(sizes) > self._largest:
-            sizes[sizes.index(max(sizes))] //= 2
-        return tuple(sizes)
+        if size not in self._groups:
+            sizes = list(map(min, size, self._item_limits))
+            while math.prod(sizes) > self._max_group:
+                sizes[sizes.index(max(sizes))] //= 2
+            self._groups[size] = tuple(sizes)
+        return self._groups[size]
 
     def take(self) -> Any:
         """A cl_kernel for one user, who puts it back into `idle`."""
@@ -144,36 +162,98 @@ class Kernel:
         with translated(f"no kernel {self.name} for {self.device.name}"):
             return self.device.cl.Kernel(self._program, self.name)
 
+    def check_names(self, names: Iterable[str]) -> None:
+        """Refuse names that the kernel does not have, and a launch that lacks some."""
+        names = set(names)
+        unknown = sorted(names - self.parameters.keys())
+        if unknown:
+            raise self._unknown(unknown[0])
+        missing = [name for name in self.parameters if name not in names]
+        if missing:
+            raise InputTypeError(f"kernel {self.name} needs argument {', '.join(missing)}")
+
+    def argument_error(self, name: str, value: Any, error: Exception) -> Exception:
+        """The error of ltcl for `error`, raised while an argument was set."""
+        if isinstance(error, self.device.cl.Error):
+            return explain(f"argument {name} of {self.name}", error)
+        if name not in self.parameters:
+            return self._unknown(name)
+        return InputTypeError(
+            f"argument {name} of kernel {self.name} is {value!r}; it must be a number of its type"
+        )
+
+    def _unknown(self, name: str) -> InputTypeError:
+        known = ", ".join(self.parameters)
+        return InputTypeError(f"kernel {self.name} has no argument {name}; it has {known}")
+
+    def _by_name(self, positional: tuple, named: dict[str, Any]) -> dict[str, Any]:
+        """All arguments by name, those without a name in the order of the source."""
+        if not positional:
+            return named
+        if len(positional) > len(self.parameters):
+            raise InputTypeError(
+                f"kernel {self.name} got {len(positional)} arguments; "
+                f"it has {len(self.parameters)}: {', '.join(self.parameters)}"
+            )
+        values = dict(zip(self.parameters, positional, strict=False))
+        doubled = values.keys() & named.keys()
+        if doubled:
+            raise InputTypeError(f"kernel {self.name} got argument {min(doubled)} twice")
+        return values | named
+
+
+def _parameters(info: Any, handle: Any) -> dict[str, Parameter]:
+    """The arguments of a cl_kernel by name, in the order of the source."""
+    parameters = {}
+    for index in range(handle.num_args):
+        name = handle.get_arg_info(index, info.NAME)
+        pack = None
+        if handle.get_arg_info(index, info.ADDRESS_QUALIFIER) == _PRIVATE:
+            type_name = handle.get_arg_info(index, info.TYPE_NAME)
+            pack = _PACKERS[type_name.replace("unsigned ", "u")]
+        parameters[name] = Parameter(index, pack)
+    return parameters
+
 
 class Launch:
     """A kernel with its items and arguments, which it keeps alive: to be queued by one thread at a time."""
 
-    def __init__(self, kernel: Kernel, items: _Size, group: _Size, arguments: tuple) -> None:
+    def __init__(self, kernel: Kernel, items: _Size, group: _Size, values: dict[str, Any]) -> None:
         self._kernel = kernel
         self._group = kernel.group(group if isinstance(group, tuple) else (group,))
         self.resize(items)
+        if len(values) != len(kernel.parameters):
+            kernel.check_names(values)
         self._handle = kernel.take()
-        self._arguments = [None] * len(kernel.packers)
-        for index, (_, argument) in enumerate(zip(kernel.packers, arguments, strict=True)):
-            self.set(index, argument)
+        self._parameters = kernel.parameters
+        # Buffers live as long as the launch: OpenCL does not keep them.
+        self._kept: dict[str, Any] = {}
+        self.set(**values)
 
     def __call__(self) -> None:
         """Queue the launch; returns at once."""
         if 0 not in self._size:
             self._kernel.device.launch(self._kernel.name, self._handle, self._size, self._group)
 
-    def set(self, index: int, value: Any) -> None:
-        """Change argument `index` for the launches that follow, a number by its type in the source."""
-        packer = self._kernel.packers[index]
+    def set(self, *indexed: Any, **values: Any) -> None:
+        """Change arguments, by name, for the launches that follow: ``launch.set(keep=0.5)``."""
+        if indexed:
+            index, value = indexed
+            values = {list(self._kernel.parameters)[index]: value}
+        parameters = self._parameters
+        handle = self._handle
+        name = ""
         try:
-            if packer is None:
-                self._handle.set_arg(index, getattr(value, "buffer", value))
-            else:
-                # `set_arg` would do as well, but tries all else before bytes: 6 us instead of 0.1
-                self._handle._set_arg_buf(index, packer(value))
-        except self._kernel.device.cl.Error as error:
-            raise explain(f"argument {index} of {self._kernel.name}", error) from error
-        self._arguments[index] = value
+            for name, value in values.items():
+                index, pack = parameters[name]
+                if pack is None:
+                    handle.set_arg(index, getattr(value, "buffer", value))
+                    self._kept[name] = value
+                else:
+                    # `set_arg` would do as well, but tries all else before bytes: 6 us, not 0.1.
+                    handle._set_arg_buf(index, pack(value))
+        except Exception as error:
+            raise self._kernel.argument_error(name, values[name], error) from error
 
     def resize(self, items: _Size) -> None:
         """Change the number of work-items, rounded up to whole groups, for the launches that follow."""

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from ltcl.device.device import Device
     from ltcl.device.kernels import Kernel
 
+# The argument `pairs` of vector_dots: 4 bits a pair, here arrays 0 and 1.
+_DOT_OF_A_AND_B = 0b0100
 _VALUES = {
     True: 128,
     False: 8,
@@ -126,13 +128,13 @@ def rounded(values: Any, dtype: Any) -> np.ndarray:
 
 def fill(x: Array, value: float) -> Array:
     """x = value everywhere."""
-    return _elementwise(x, "vector_fill", float(value))
+    return _elementwise(x, "vector_fill", value=value)
 
 
 def axpby(a: float, x: Array, b: float, y: Array, out: Array) -> Array:
     """out = a x + b y; `out` may be `x` or `y`."""
     _same_shape(x, y, out)
-    return _elementwise(out, "vector_axpby", float(a), x, float(b), y)
+    return _elementwise(out, "vector_axpby", a=a, x=x, b=b, y=y)
 
 
 def axpy(a: float, x: Array, y: Array) -> Array:
@@ -145,14 +147,14 @@ def scale_rows(d: Array, x: Array, out: Array) -> Array:
     _same_shape(x, out)
     if d.shape != x.shape[:1]:
         raise InputError(f"the diagonal has shape {d.shape}; it must be {x.shape[:1]}")
-    return _elementwise(out, "vector_scale_rows", x.columns, d, x)
+    return _elementwise(out, "vector_scale_rows", k=x.columns, d=d, x=x)
 
 
 def dot(x: Array, y: Array) -> np.ndarray:
     """<x_c, y_c> of every column c, as (k,) float64; waits for the device."""
     _same_shape(x, y)
     sums = x.device.empty((_plan("vector_dots", x).groups, x.columns))
-    _reduce("vector_dots", x, 0, 0b0100, 0, x, x, y, y, sums)
+    _queue_partial_dots(x, y, sums, 0)
     return sums.get().sum(axis=0, dtype=np.float64)
 
 
@@ -172,12 +174,29 @@ def norms(*xs: Array) -> np.ndarray:
 def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
     """Row `slot` of `out` (slots, k) = <x_c, y_c> of every column c; does not wait."""
     _same_shape(x, y)
-    if (groups := _plan("vector_dots", x).groups) == 1:
-        _reduce("vector_dots", x, slot * x.columns, 0b0100, 0, x, x, y, y, out)
-    else:
-        sums = x.device.empty((1, groups, x.columns))
-        _reduce("vector_dots", x, 0, 0b0100, 0, x, x, y, y, sums)
-        queue_sum_partials(sums, 1, out, slot)
+    groups = _plan("vector_dots", x).groups
+    if groups == 1:
+        _queue_partial_dots(x, y, out, slot * x.columns)
+        return
+    partials = x.device.empty((1, groups, x.columns))
+    _queue_partial_dots(x, y, partials, 0)
+    queue_sum_partials(partials, 1, out, slot)
+
+
+def _queue_partial_dots(x: Array, y: Array, partials: Array, first: int) -> None:
+    """Sums of x * y by column and group, from value `first` of `partials` on."""
+    _reduce(
+        "vector_dots",
+        x,
+        first=first,
+        pairs=_DOT_OF_A_AND_B,
+        weighted=0,
+        weights=x,  # not read
+        a=x,
+        b=y,
+        c=y,  # not read
+        partials=partials,
+    )
 
 
 def queue_step(
@@ -188,7 +207,9 @@ def queue_step(
     The squares of the new r go, added up, to row `slot` of `partials` (slots, step_groups(x), k).
     """
     _same_shape(p, x, r, d)
-    _reduce("vector_step", x, keep, gain, slot * step_groups(x) * x.columns, p, x, r, d, partials)
+    first = slot * step_groups(x) * x.columns
+    vectors = {"p": p, "x": x, "r": r, "d": d}
+    _reduce("vector_step", x, keep=keep, gain=gain, first=first, squares=partials, **vectors)
 
 
 def step_groups(x: Array) -> int:
@@ -198,7 +219,8 @@ def step_groups(x: Array) -> int:
 
 def queue_sum_partials(partials: Array, slots: int, out: Array, slot: int = 0) -> None:
     """Rows slot .. slot + slots - 1 of `out` = the first of `partials` (slots, groups, k), added up."""
-    _reduce("vector_sums", partials, partials, out, slot * out.columns, across=slots)
+    first = slot * out.columns
+    _reduce("vector_sums", partials, across=slots, sums=partials, out=out, first=first)
 
 
 class _Plan(NamedTuple):
@@ -225,14 +247,15 @@ def _plan(name: str, x: Array) -> _Plan:
     return device.reductions[name, rows, k]
 
 
-def _reduce(name: str, x: Array, *arguments: float | Array, across: int = 1) -> None:
-    kernel, rows, k, groups, group = _plan(name, x)
+def _reduce(name: str, like: Array, /, *, across: int = 1, **arguments: float | Array) -> None:
+    kernel, rows, k, groups, group = _plan(name, like)
     items = (groups * group, across, -(-k // group))
-    kernel(items, (group, 1, 1), rows, k, *arguments, x.device.local(group))
+    scratch = like.device.local(group)
+    kernel(items, (group, 1, 1), rows=rows, k=k, scratch=scratch, **arguments)
 
 
-def _elementwise(out: Array, name: str, *arguments: float | Array) -> Array:
-    kernel_of(out.device, name)(out.size, 256, out.size, *arguments, out)
+def _elementwise(out: Array, name: str, /, **arguments: float | Array) -> Array:
+    kernel_of(out.device, name)(out.size, 256, count=out.size, out=out, **arguments)
     return out
 
 

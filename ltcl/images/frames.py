@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Many pictures in a row, a folder of them or a video, read as linear light; videos written.
+"""Frames of a folder of pictures or of a video, as linear light; videos written.
 
-OpenCV's FFmpeg decodes videos to 8 bits a channel and leaves damaged frames out: they are counted.
-`_COUNTED` formats keep their number; others, as Matroska, a duration, which sound may stretch: a
-warning. Known limits: a decoder may replace damaged pixels by others, and FFmpeg itself also writes
-to stderr about damage.
+OpenCV's FFmpeg decodes videos to 8 bits a channel. It leaves damaged frames out, so they are
+counted: the formats of `COUNTED_EXTENSIONS` store their number, and a missing frame is an error;
+others, as Matroska, store a duration, which sound may stretch, and a missing frame is a warning.
+Known limits: a decoder may replace damaged pixels by others, and FFmpeg itself also writes to
+stderr about damage.
 """
 
 from __future__ import annotations
@@ -24,131 +25,152 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.images.pictures import (
-    BITS,
-    ENCODINGS,
-    Encoding,
-    as_picture,
-    decoding,
-    from_linear,
-    read,
-    to_linear,
-)
+from ltcl.images.decoders import decoding
+from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
+from ltcl.images.pictures import BITS, as_picture, read
 
-_COUNTED = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
-EXTENSIONS = (
-    *_COUNTED,
-    ".mkv",
-    ".webm",
-    ".mpg",
-    ".mpeg",
-    ".ts",
-    ".wmv",
-    ".flv",
-    ".ogv",
-)  # of videos
-CODECS = {".mkv": "FFV1", ".avi": "FFV1", ".mp4": "mp4v"}  # of videos that can be written
+# Videos that store the number of their frames.
+COUNTED_EXTENSIONS = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
+
+# Videos that can be read.
+OTHER_EXTENSIONS = (".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv", ".flv", ".ogv")
+EXTENSIONS = COUNTED_EXTENSIONS + OTHER_EXTENSIONS
+
+# Videos that can be written, and the codec of each; FFV1 is lossless.
+CODECS = {".mkv": "FFV1", ".avi": "FFV1", ".mp4": "mp4v"}
+
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame: its `number`, from 1, and `name`, of its file or of the video with its number there."""
+    """One frame of a folder or a video.
+
+    Attributes
+    ----------
+    number : int
+        Position among the frames, from 1.
+    name : str
+        Name of the picture file, or of the video with the number.
+    stored : Path or ndarray
+        The picture file, or the BGR codes of a video, uint8, (h, w, 3).
+    encoding : "auto", "srgb" or "linear"
+        Encoding of the codes.
+    """
 
     number: int
     name: str
-    stored: Path | np.ndarray  # BGR uint8, (h, w, 3), of a video
+    stored: Path | np.ndarray
     encoding: Encoding
 
     def digest(self) -> str:
         """SHA-256 of the file or, in a video, of the pixels, in hexadecimal digits."""
         if isinstance(self.stored, Path):
-            return hashlib.sha256(input_file(self.stored).read_bytes()).hexdigest()
-        return hashlib.sha256(repr(self.stored.shape).encode() + self.stored.tobytes()).hexdigest()
+            content = input_file(self.stored).read_bytes()
+        else:
+            content = repr(self.stored.shape).encode() + self.stored.tobytes()
+        return hashlib.sha256(content).hexdigest()
 
     def picture(self) -> np.ndarray:
-        """Linear float32, (h, w) or (h, w, 3); FileError where it cannot be read."""
+        """Linear light, float32, (h, w) or (h, w, 3); FileError if it cannot be read."""
         if isinstance(self.stored, Path):
             return read(self.stored, encoding=self.encoding)
         b, g, r = cv2.split(self.stored)
-        is_grey = np.array_equal(b, g) and np.array_equal(g, r)  # which costs a third
-        return to_linear(
-            b if is_grey else cv2.cvtColor(self.stored, cv2.COLOR_BGR2RGB), self.encoding
-        )
+        is_grey = np.array_equal(b, g) and np.array_equal(g, r)
+        if is_grey:  # one channel costs a third
+            return to_linear(b, self.encoding)
+        return to_linear(cv2.cvtColor(self.stored, cv2.COLOR_BGR2RGB), self.encoding)
 
 
 class Source:
-    """The frames of a folder or a video, in order: `count`, an estimate of a video, and `fps`, or None."""
+    """The frames of a folder or a video, in order.
+
+    Attributes
+    ----------
+    count : int or None
+        Number of frames; of a video an estimate, or None if it stores none.
+    fps : float or None
+        Frames per second of a video; None for a folder.
+    """
 
     def __init__(self, path: Path, encoding: Encoding) -> None:
-        self.path, self.fps = path, None
+        self.path = path
         self.encoding: Encoding = encoding
-        self._files = _pictures(path) if path.is_dir() else []
-        self.count: int | None = len(self._files)
-        if not self._files:
-            capture = _opened(path)
-            self.count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0) or None
-            self.fps = max(capture.get(cv2.CAP_PROP_FPS), 0.0) or None
+        self.count: int | None = None
+        self.fps: float | None = None
+        self._files: list[Path] = []
+        if path.is_dir():
+            self._files = _list_pictures(path)
+            self.count = len(self._files)
+            return
+        capture = _open_video(path)
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if count > 0:
+            self.count = count
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        if fps > 0.0:
+            self.fps = fps
 
     def __iter__(self) -> Iterator[Frame]:
-        """All frames from the first one on; FileError where one is missing."""
+        """All frames, from the first one on; FileError where one is missing."""
         if self._files:
             for number, file in enumerate(self._files, start=1):
                 yield Frame(number, file.name, file, self.encoding)
-            return
-        number, capture = 0, _opened(self.path)
-        while (decoded := capture.read())[0]:
+        else:
+            yield from self._video_frames()
+
+    def _video_frames(self) -> Iterator[Frame]:
+        capture = _open_video(self.path)
+        number = 0
+        is_decoded, codes = capture.read()
+        while is_decoded:
             number += 1
-            yield Frame(number, f"{self.path.name}:{number}", decoded[1], self.encoding)
-        if number < (self.count or 1):
-            text = f"{self.path}: {number} of {self.count or 'its'} frames can be read; the video is damaged"
-            if not number or self.path.suffix.lower() in _COUNTED:
-                raise FileError(text)
-            _logger.warning("%s, or their number is an estimate, as this format may keep it", text)
+            yield Frame(number, f"{self.path.name}:{number}", codes, self.encoding)
+            is_decoded, codes = capture.read()
+        self._check_count(number)
 
-
-def _pictures(folder: Path) -> list[Path]:
-    """Those that stand directly in the folder, in natural order: numbers in names compare as numbers."""
-
-    def order(file: Path) -> tuple[list[str | int], str]:
-        pieces = re.split(r"(\d+)", file.stem.lower())  # numbers at the odd places
-        return [int(piece) if place % 2 else piece for place, piece in enumerate(pieces)], file.name
-
-    try:
-        visible = [file for file in folder.iterdir() if not file.name.startswith(".")]
-    except OSError as error:
-        raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
-    files = sorted(
-        (file for file in visible if file.suffix.lower() in BITS and file.is_file()), key=order
-    )
-    if not files:
-        raise FileError(f"{folder}: holds no pictures; frames are {', '.join(BITS)}")
-    for file, other in itertools.pairwise(files):
-        if file.stem == other.stem:
-            raise FileError(
-                f"{folder}: holds {file.name} and {other.name}; each frame must be one file"
-            )
-    return files
-
-
-def _opened(path: Path) -> cv2.VideoCapture:
-    with decoding(input_file(path)):
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not capture.isOpened():
-            raise FileError("is no video that can be decoded, or a damaged or truncated one")
-        return capture
+    def _check_count(self, decoded: int) -> None:
+        """Refuse a video of fewer frames than it says, or warn where it may only estimate them."""
+        if self.count is None:
+            expected = 1
+            counted = "its"
+        else:
+            expected = self.count
+            counted = str(self.count)
+        if decoded >= expected:
+            return
+        text = f"{self.path}: {decoded} of {counted} frames can be read; the video is damaged"
+        if decoded == 0 or self.path.suffix.lower() in COUNTED_EXTENSIONS:
+            raise FileError(text)
+        _logger.warning("%s, or their number is an estimate, as this format may keep it", text)
 
 
 def is_frames(path: str | os.PathLike[str]) -> bool:
-    """Whether `path` is a folder, or is called like a video."""
+    """Whether `path` is a folder, or has the extension of a video."""
     return Path(path).is_dir() or Path(path).suffix.lower() in EXTENSIONS
 
 
 def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> Source:
-    """Open a folder of pictures, in natural order, or a video, upright as a player shows it.
+    """Open a folder of pictures or a video.
 
-    Hidden and other files are left out; `encoding` is that of `ltcl.images.read`. FileError for no
-    picture in the folder, two files of one name in it, an unknown extension, no readable video.
+    Parameters
+    ----------
+    path : path
+        A folder, whose pictures come in natural order without hidden and other files; or a video,
+        upright as a player shows it.
+    encoding : "auto", "srgb" or "linear"
+        Encoding of the codes, as in `ltcl.images.read`.
+
+    Returns
+    -------
+    Source
+        Iterates over the frames.
+
+    Raises
+    ------
+    FileError
+        The folder holds no picture, or two of one name; the extension is unknown; the video cannot
+        be read.
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     path = as_path(path)
@@ -158,53 +180,125 @@ def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") ->
 
 
 def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
-    """Refuse a video of (h, w) frames by its extension, or by an odd size, which OpenCV would cut."""
+    """Refuse a video by its extension, or by an odd height or width, which OpenCV would cut."""
     path = as_path(path)
     if path.suffix.lower() not in CODECS:
         raise FileError(f"{path}: {unknown_extension(path)}; a video must be {', '.join(CODECS)}")
-    if grid[0] % 2 or grid[1] % 2:
-        raise InputError(
-            f"{path}: frames are {grid[0]} x {grid[1]} pixels; those of a video must be even"
-        )
+    h, w = grid
+    if h % 2 or w % 2:
+        raise InputError(f"{path}: frames are {h} x {w} pixels; those of a video must be even")
 
 
 def write_video(
     path: str | os.PathLike[str], pictures: Iterable[np.ndarray], fps: float = 25.0
 ) -> int:
-    """Write linear pictures as a video, which replaces another whole or not at all; their number.
+    """Write linear pictures as a video, which replaces an earlier file whole or not at all.
 
-    `path` ends in .mkv or .avi (lossless) or .mp4; 8 bits in sRGB. `pictures`, (h, w) or (h, w, 3),
-    are cut to [0, 1]; h and w are even and the same for all. InputError for other sizes, no frames
-    or NaN; FileError for another extension or a file that cannot be written.
+    Parameters
+    ----------
+    path : path
+        A .mkv or .avi file (lossless) or an .mp4 file, of 8 bits in sRGB.
+    pictures : iterable of array_like
+        (h, w) or (h, w, 3), clipped to [0, 1]; h and w are even, and the same for all.
+    fps : float
+        Frames per second.
+
+    Returns
+    -------
+    int
+        The number of frames.
+
+    Raises
+    ------
+    InputError
+        A size is odd or differs from the first one, a picture has NaN, or there are no frames.
+    FileError
+        The extension is unknown, or the file cannot be written.
     """
-    path, fps = as_path(path), checks.number("fps", fps, above=0.0)
+    path = as_path(path)
+    fps = checks.number("fps", fps, above=0.0)
     check_video(path, (0, 0))
-    writer, codec, shape, count = cv2.VideoWriter(), CODECS[path.suffix.lower()], (), 0
+    codec = CODECS[path.suffix.lower()]
     with replace_file(path) as temporary:
-        try:
-            for count, picture in enumerate(pictures, start=1):
-                codes = from_linear(as_picture("a frame", picture), "srgb", 8, is_float=False)
-                codes = cv2.cvtColor(
-                    codes, cv2.COLOR_GRAY2BGR if codes.ndim == 2 else cv2.COLOR_RGB2BGR
-                )
-                if count == 1:
-                    shape = h, w, _ = codes.shape
-                    check_video(path, (h, w))
-                    writer.open(str(temporary), cv2.CAP_FFMPEG, writer.fourcc(*codec), fps, (w, h))
-                if codes.shape != shape:
-                    raise InputError(
-                        f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}"
-                    )
-                writer.write(codes)
-        finally:
-            writer.release()
-        if not count:
+        count = _encode_video(path, temporary, pictures, fps)
+        if count == 0:
             raise InputError(f"{path}: there are no frames to write")
-        written = int(
-            cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT)
-        )
-        if written != count:  # of which OpenCV says nothing
+        # OpenCV does not say that a disk is full.
+        capture = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
+        written = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if written != count:
             raise FileError(
                 f"{path}: holds {written} of {count} frames in {codec}; is the disk full?"
             )
     return count
+
+
+def _encode_video(path: Path, temporary: Path, pictures: Iterable[np.ndarray], fps: float) -> int:
+    """Encode pictures into the file `temporary`, which is for `path`; their number."""
+    writer = cv2.VideoWriter()
+    count = 0
+    shape: tuple[int, ...] = ()
+    try:
+        for count, picture in enumerate(pictures, start=1):
+            codes = _bgr_codes(picture)
+            if count == 1:
+                shape = codes.shape
+                h, w = shape[:2]
+                check_video(path, (h, w))
+                fourcc = writer.fourcc(*CODECS[path.suffix.lower()])
+                writer.open(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (w, h))
+            if codes.shape != shape:
+                raise InputError(f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}")
+            writer.write(codes)
+    finally:
+        writer.release()
+    return count
+
+
+def _bgr_codes(picture: np.ndarray) -> np.ndarray:
+    """Codes of a linear picture in sRGB, uint8, (h, w, 3) in the order of OpenCV."""
+    codes = from_linear(as_picture("a frame", picture), "srgb", 8, is_float=False)
+    if codes.ndim == 2:
+        return cv2.cvtColor(codes, cv2.COLOR_GRAY2BGR)
+    return cv2.cvtColor(codes, cv2.COLOR_RGB2BGR)
+
+
+def _open_video(path: Path) -> cv2.VideoCapture:
+    with decoding(input_file(path)):
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        if not capture.isOpened():
+            raise FileError("is no video that can be decoded, or a damaged or truncated one")
+        return capture
+
+
+def _list_pictures(folder: Path) -> list[Path]:
+    """Pictures that stand directly in the folder, in natural order."""
+    try:
+        entries = list(folder.iterdir())
+    except OSError as error:
+        raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
+    files = sorted(filter(_is_picture, entries), key=_natural_order)
+    if not files:
+        raise FileError(f"{folder}: holds no pictures; frames are {', '.join(BITS)}")
+    for file, next_file in itertools.pairwise(files):
+        if file.stem == next_file.stem:
+            raise FileError(
+                f"{folder}: holds {file.name} and {next_file.name}; each frame must be one file"
+            )
+    return files
+
+
+def _is_picture(file: Path) -> bool:
+    is_hidden = file.name.startswith(".")
+    return not is_hidden and file.suffix.lower() in BITS and file.is_file()
+
+
+def _natural_order(file: Path) -> tuple[list[str | int], str]:
+    """Key to sort by: numbers in names compare as numbers."""
+    key: list[str | int] = []
+    for place, piece in enumerate(re.split(r"(\d+)", file.stem.lower())):
+        if place % 2 == 1:
+            key.append(int(piece))
+        else:
+            key.append(piece)
+    return key, file.name

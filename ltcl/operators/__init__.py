@@ -9,20 +9,25 @@ from ltcl.device import Device, open_device
 from ltcl.operators.base import Epilogue, Norms, Operator
 from ltcl.operators.bases import (
     Basis,
-    Pyramid,
     SubsetBasis,
     multiresolution_order,
     restrict_to_support,
 )
-from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns
+from ltcl.operators.compressed import Compressed
+from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
 from ltcl.operators.distributed import Distributed, rank_device
+from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.interreflection import interreflections
-from ltcl.operators.parts import MultiDevice, Parts, Streamed, on_devices, stays_on_disk
-from ltcl.operators.stored import basis
+from ltcl.operators.multi_device import MultiDevice, upload_matrix
+from ltcl.operators.out_of_core import Streamed, stays_on_disk
+from ltcl.operators.parts import Parts
+from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.scaled_columns import ScaledColumns
+from ltcl.operators.scipy_operator import Host
 from ltcl.operators.tiles import Tiles, smallest
-from ltcl.operators.wavelets import Wavelet
+from ltcl.operators.wavelets import Wavelet, basis
 
 __all__ = [
     "CSR",
@@ -72,4 +77,4 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
         return Streamed(device, matrix)
     if hasattr(matrix, "matvec") and not hasattr(matrix, "row_blocks"):
         return Host(device, matrix)
-    return on_devices(device, matrix)
+    return upload_matrix(device, matrix)

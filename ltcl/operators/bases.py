@@ -24,7 +24,6 @@ _GROUP = 64  # work-items side by side
 _GROUPS = (
     1 << 14
 )  # items along the second and third dimension, where kernels stride: GPUs take 65535 groups
-_SMALL = 4096  # cells of a level from which on one launch does all the rest
 _MOST = 0.5  # of the coefficients: where more are in the support, restricting to them gains little
 
 
@@ -152,48 +151,6 @@ class SubsetBasis(Basis):
         else:
             self.of._product(x, coefficients, PLAIN, False)
             kernel(items, group, order.size, k, a, b, order, coefficients, y, out)
-
-
-class Pyramid(Basis):
-    """A quad-tree: sums over the cells of all levels, (M, N), the finest first (`kernels/pyramid.cl`).
-
-    Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the
-    edges, until one cell is left: the basis of transports that were scanned adaptively. Not
-    orthonormal. `cells` holds (rows, columns) of each level, whose cells are row-major one behind
-    the other.
-
-    Examples
-    --------
-    >>> import ltcl, numpy
-    >>> from ltcl.operators import Pyramid
-    >>> W = Pyramid(ltcl.open_device(), (2, 3))
-    >>> (W @ numpy.arange(6.0)).tolist()  # pixels, then 0 + 1 + 3 + 4 and 2 + 5, then all
-    [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0, 7.0, 15.0]
-    """
-
-    orthonormal = False
-    isometric = False
-
-    def __init__(self, device: Device, grid: tuple[int, int]) -> None:
-        h, w = checks.grid("grid", grid)
-        levels = range((max(h, w) - 1).bit_length() + 1)
-        self.cells = tuple((-(-h // 2**level), -(-w // 2**level)) for level in levels)
-        super().__init__(device, grid, "pyramid", sum(h * w for h, w in self.cells))
-
-    def _transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
-        k, levels = x.columns, len(self.cells)
-        kernel, pieces = self._kernel("pyramid", "spread" if transpose else "gather", k)
-        if transpose:
-            launch_grid(kernel, pieces, *self.grid, *self.grid, levels, k, a, b, x, y, out)
-            return
-        sums = self.device.empty((self.shape[0] + levels) * k)  # a spare cell a level
-        large = sum(h * w > _SMALL for h, w in self.cells)
-        for level in range(large):
-            arguments = (*self.grid, level, level + 1, k, a, b, x, sums, y, out)
-            launch_grid(kernel, pieces, *self.cells[level], *arguments)
-        launch_group(kernel, pieces, *self.grid, large, levels, k, a, b, x, sums, y, out)
 
 
 def restrict_to_support(core: Any, W: Basis) -> tuple[scipy.sparse.csr_array, Basis]:

@@ -27,7 +27,7 @@ from ltcl.device import Array, Device, list_devices, open_device
 from ltcl.device.discovery import choose
 from ltcl.errors import DeviceError, InputError, LtclError
 from ltcl.operators.base import PLAIN, Norms, Operator
-from ltcl.operators.parts import Parts, on_device
+from ltcl.operators.parts import Parts, upload_part
 from ltcl.operators.rows import RowOperator
 
 _opened: weakref.WeakValueDictionary[tuple[int, Device], RankDevice] = weakref.WeakValueDictionary()
@@ -40,7 +40,7 @@ class RankDevice(Device):
         vars(self).update(vars(own))  # one queue, memory pool and set of kernels
         self.comm, self.others = comm, (own,) * (comm.size - 1)  # which are alike
 
-    def over_ranks(self, rows: int, make: Callable[[Device, slice], RowOperator]) -> Operator:
+    def split_over_ranks(self, rows: int, make: Callable[[Device, slice], RowOperator]) -> Operator:
         """What `make` puts on the device of each rank: as many rows as on others."""
         start, stop = (rows * end // self.comm.size for end in (self.comm.rank, self.comm.rank + 1))
         return Distributed(self.comm, together(self.comm, lambda: make(self, slice(start, stop))))
@@ -133,7 +133,7 @@ class Distributed(Parts):
                 f"rows have the shapes {shapes}, by rank; they must be (m, N), with m above 0"
             )
         device = rank_device(comm, rows.device if isinstance(rows, Operator) else device)
-        make = lambda: rows if isinstance(rows, Operator) else on_device(device, rows)  # noqa: E731
+        make = lambda: rows if isinstance(rows, Operator) else upload_part(device, rows)  # noqa: E731
         self.comm, self.rows = comm, together(comm, make)
         self.counts = [count for count, _ in shapes]
         self.first = sum(self.counts[: comm.rank])

@@ -14,9 +14,12 @@ from ltcl.device import Array, Device, open_device
 from ltcl.device.vectors import rounded
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
-from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, spread
 from ltcl.operators.csr import CSR, Pattern
-from ltcl.operators.parts import Streamed, on_devices, row_blocks, stays_on_disk
+from ltcl.operators.identity_plus import IdentityPlus
+from ltcl.operators.multi_device import upload_matrix
+from ltcl.operators.out_of_core import Streamed, row_blocks, stays_on_disk
+from ltcl.operators.scaled_columns import ScaledColumns, spread
+from ltcl.operators.scipy_operator import Host
 
 # times the largest entry of a column of T: up to such an F, S keeps 6 digits of the column
 _DIGITS = 16.0
@@ -46,7 +49,7 @@ def interreflections(
     systems, pattern = [], None
     on_disk = device.agreed(stays_on_disk(matrices, device))
     for matrix, f in zip(matrices, F, strict=True):
-        S = made_with(matrix)
+        S = underlying_system(matrix)
         if S is not None and np.array_equal(matrix.d, f):
             systems.append(S)
             continue
@@ -63,21 +66,21 @@ def interreflections(
     return tuple(systems)
 
 
-def made_with(matrix: Any) -> IdentityPlus | None:
+def underlying_system(matrix: Any) -> IdentityPlus | None:
     """The S of an operator that is S diag(d); None of any other matrix."""
     unshifted = isinstance(matrix, ScaledColumns) and not matrix.shift.any()
     return matrix.A if unshifted and isinstance(matrix.A, IdentityPlus) else None
 
 
-def maskable(matrix: Any) -> bool:
+def can_mask_pixels(matrix: Any) -> bool:
     """Whether pixels may be dropped from it, which a LinearOperator would keep in its products."""
     entries = isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or hasattr(
         matrix, "row_blocks"
     )
-    return entries or made_with(matrix) is not None
+    return entries or underlying_system(matrix) is not None
 
 
-def device_of(rows: Sequence[Sequence[Any]], requested: Device | str | None) -> Device | None:
+def common_device(rows: Sequence[Sequence[Any]], requested: Device | str | None) -> Device | None:
     """The device that all operators in `rows` lie on, None where there are none; `requested` must be that."""
     devices = {A.device for row in rows for A in row if isinstance(A, Operator)}
     if len(devices) > 1:
@@ -107,13 +110,13 @@ def _interreflection(
     # diagonal.
     divisor = np.where(lit, F, np.inf)
     if isinstance(matrix, np.ndarray):
-        R = on_devices(device, matrix, lambda first, rows: _dense_R(rows, divisor, lit, first))
+        R = upload_matrix(device, matrix, lambda first, rows: _dense_R(rows, divisor, lit, first))
         R.exact = matrix, divisor, lit
         return R
     if isinstance(matrix, scipy.sparse.csr_array):
-        return on_devices(device, _sparse_R(matrix, divisor, lit), pattern=pattern)
+        return upload_matrix(device, _sparse_R(matrix, divisor, lit), pattern=pattern)
     if hasattr(matrix, "row_blocks"):
-        return on_devices(
+        return upload_matrix(
             device, matrix, lambda k, rows: _sparse_R(rows, divisor, lit, k), more=len(F)
         )
     operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)

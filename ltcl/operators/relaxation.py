@@ -17,9 +17,9 @@ import numpy as np
 from ltcl.device import Array
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator, widths
-from ltcl.operators.composed import IdentityPlus
 from ltcl.operators.csr import CSR
 from ltcl.operators.dense import Dense
+from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.rows import Slab
 
 INVERTED = 128  # rows of a block whose inverse is kept: small beside the matrix

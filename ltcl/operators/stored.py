@@ -22,12 +22,13 @@ from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators.base import Operator
-from ltcl.operators.bases import Basis, Pyramid, SubsetBasis
-from ltcl.operators.composed import Compressed, IdentityPlus
+from ltcl.operators.bases import Basis, SubsetBasis
+from ltcl.operators.compressed import Compressed
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
+from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.tiles import Tiles
-from ltcl.operators.wavelets import Wavelet
+from ltcl.operators.wavelets import Wavelet, basis
 
 Arrays = dict[str, np.ndarray]
 _CORES = {"csr": CSR, "dense": Dense, "tiles": Tiles}
@@ -118,22 +119,6 @@ def _read(
 
 def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
     return {f"{prefix}.{name}": array for name, array in arrays.items()}
-
-
-def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
-    """The basis called `name` of pictures of h x w pixels.
-
-    That is "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets:
-    "haar", "db2", "db4", ...; InputError for others.
-
-    >>> import ltcl
-    >>> from ltcl.operators import basis
-    >>> basis(ltcl.open_device(), (8, 8), "db2").orthonormal
-    True
-    """
-    if name == "pixels":
-        return None
-    return Pyramid(device, grid) if name == "pyramid" else Wavelet(device, grid, name)
 
 
 def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:

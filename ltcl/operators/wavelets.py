@@ -18,9 +18,10 @@ from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.errors import InputError
 from ltcl.operators.bases import Basis, launch_grid, launch_group
+from ltcl.operators.pyramid import Pyramid
 
 _pywt: Any = pywt  # compiled, so that no type checker knows its names
-_SMALL = 4096  # pixels of a level from which on one launch does all the rest
+SMALL_LEVEL_PIXELS = 4096  # pixels of a level from which on one launch does all the rest
 
 
 class Wavelet(Basis):
@@ -51,7 +52,9 @@ class Wavelet(Basis):
         super().__init__(device, grid, name, h * w, self._taps)
         most = (max(self.grid) - 1).bit_length()
         self.levels = most if levels is None else checks.count("levels", levels, least=0, most=most)
-        self._large = sum(h * w > _SMALL for h, w in map(self._sides, range(self.levels)))
+        self._large = sum(
+            h * w > SMALL_LEVEL_PIXELS for h, w in map(self._sides, range(self.levels))
+        )
         # Where the approximations of levels 1, 2, ... begin, a spare pixel between: wide loads
         # reach there.
         pixels = [h * w + 1 for h, w in map(self._sides, range(1, self.levels + 1))]
@@ -115,3 +118,19 @@ def filters(name: Any) -> np.ndarray:
     if not np.max(np.abs(shifted)) < 1e-7:  # that of dmey is 2e-3
         raise InputError(f"wavelet {name} is not orthonormal; it must be {offered}")
     return taps
+
+
+def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
+    """The basis called `name` of pictures of h x w pixels.
+
+    That is "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets:
+    "haar", "db2", "db4", ...; InputError for others.
+
+    >>> import ltcl
+    >>> from ltcl.operators import basis
+    >>> basis(ltcl.open_device(), (8, 8), "db2").orthonormal
+    True
+    """
+    if name == "pixels":
+        return None
+    return Pyramid(device, grid) if name == "pyramid" else Wavelet(device, grid, name)

@@ -23,7 +23,8 @@ from ltcl import checks
 from ltcl.errors import MemoryLimitError
 from ltcl.operators import CSR, Dense, Host, IdentityPlus, Operator, RowBlocks, ScaledColumns, Tiles
 from ltcl.operators.base import Transposed
-from ltcl.operators.parts import MultiDevice, Streamed
+from ltcl.operators.multi_device import MultiDevice
+from ltcl.operators.out_of_core import Streamed
 
 Product = Callable[[np.ndarray], np.ndarray]  # (N, k) float64 -> (M, k) float64
 EPS = 2.0**-23

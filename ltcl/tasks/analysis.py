@@ -17,7 +17,7 @@ from ltcl.tasks import report
 from ltcl.theory.forecast import LEAST_RTOL
 from ltcl.transport import diagnostics
 from ltcl.transport.diagnostics import Energy
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 from ltcl.transport.verdict import Verdict, verdict
 
 
@@ -89,7 +89,7 @@ class Analysis:
         return f"<ltcl Analysis grid {h} x {w}, rho(R) {radii}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         bars = {}
         for channel in self.channels:
@@ -116,7 +116,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     >>> 0.5 < a.channels[0].spectral_radius < 0.7  # m / (1 - m) = 2/3, less what diag(T) took along
     True
     """
-    require(T)
+    check_transport(T)
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     systems = zip(
         T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True

@@ -43,7 +43,7 @@ from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
 from ltcl.transport.noise import Noise
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 SHIFTS = 4, 6  # trees whose results are averaged; in the last estimate of a reciprocal T
 THRESHOLD = 3.0  # standard deviations of a coefficient
@@ -108,7 +108,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     >>> bool(numpy.linalg.norm(ltcl.denoise(T).to_numpy() - exact) < 0.5 * numpy.linalg.norm(error))
     True
     """
-    require(T, square=False)
+    check_transport(T, square=False)
     if T.blocks is not None:
         raise InputError("T has blocks between colours; denoise takes a T of 1 or 3 channels")
     for A in T.matrices:
@@ -150,7 +150,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     noise = dataclasses.replace(noise, **light)
     settings = {"device": T._requested_device, "mixing": T.mixing, "noise": noise}
     first = T.first_bounce if T.is_square else "diagonal"
-    result = Transport(matrices, T.grid, first, T.camera_grid, dark=0.0, **settings)
+    result = Transport(matrices, T.grid, first, T.camera_grid, dark_threshold=0.0, **settings)
     result.first_bounce_error = T.first_bounce_error
     return result
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 
 def relight(T: Transport, pattern: Any) -> np.ndarray:
@@ -24,4 +24,4 @@ def relight(T: Transport, pattern: Any) -> np.ndarray:
     >>> print(ltcl.relight(T, numpy.array([[1.0, 1.0]])))
     [[0.6 0.6]]
     """
-    return require(T, square=False) @ pattern
+    return check_transport(T, square=False) @ pattern

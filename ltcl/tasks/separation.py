@@ -25,18 +25,12 @@ from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.solvers import Inverse, Solution, solve, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
+from ltcl.tasks.requirements import check_inverse, default_rtol, error_note, resolve_reference
+from ltcl.transport import diagnostics
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import ENTRIES
-from ltcl.transport.transport import (
-    Transport,
-    default_rtol,
-    diagnostics,
-    error_note,
-    require,
-    require_inverse,
-    resolve_reference,
-)
-from ltcl.transport.uncertainty import SeparationStd, of_separation
+from ltcl.transport.transport import Transport, check_transport
+from ltcl.transport.uncertainty import SeparationStd, separation_std
 
 logger = logging.getLogger(__name__)
 
@@ -97,14 +91,14 @@ class Separation:
     def std(self) -> SeparationStd:
         """Standard deviations by the noise of T, `ltcl.transport.uncertainty`, computed at the first call."""
         T, true = self._transports
-        return of_separation(T, true.noise, [self.direct, *self.bounces], self._inverse)
+        return separation_std(T, true.noise, [self.direct, *self.bounces], self._inverse)
 
     def __repr__(self) -> str:
         shape, error = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
         return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{error}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         bounces = {f"bounce {k}": bounce for k, bounce in enumerate(self.bounces, 1)}
         return thumbnails(self, {"direct": self.direct, **bounces, "rest": self.rest})
@@ -160,7 +154,7 @@ def separate(
     >>> bool(abs(b.direct - 0.5).max() < 1e-3)
     True
     """
-    require(T)
+    check_transport(T)
     checks.count("bounces", bounces, least=0)
     if "pixels" in options:
         raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")
@@ -171,7 +165,7 @@ def separate(
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
     true, judges = resolve_reference(T, exact)
     if inverse is not None:
-        require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+        check_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
         for name in options.keys() - {"callback", "throw"}:
             raise InputTypeError(
                 f"option {name!r} is given, but with inverse there is no solve that takes it"
@@ -257,7 +251,7 @@ def _refuse_impossible(
         raise InputError(
             f"direct light is {direct_share:.0%} of the image, uncertain to {uncertainty:.1%}; "
             "it must be from 0 to 100 %: T or its first bounce is wrong or noisy, most of all at the pixels "
-            f"(row, column): {where}; mask dark ones by dark=, or measure T again"
+            f"(row, column): {where}; mask dark ones by dark_threshold=, or measure T again"
         )
 
 

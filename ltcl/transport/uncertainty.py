@@ -38,7 +38,7 @@ from ltcl.solvers import Inverse, solve
 from ltcl.solvers.bounded import least_squares
 from ltcl.transport import frames as layout
 from ltcl.transport.noise import Noise
-from ltcl.transport.transport import Transport, default_rtol
+from ltcl.transport.transport import Transport
 
 _DRAWS, _FRAME_DRAWS, _WHOLE_DRAWS = (
     8,
@@ -84,7 +84,7 @@ class CompensationStd(_Deviations):
     appearance: np.ndarray
 
 
-def of_separation(
+def separation_std(
     T: Transport, noise: Noise, pictures: Sequence[np.ndarray], inverse: Inverse | None = None
 ) -> SeparationStd:
     """Of `pictures`: the direct part and the bounces."""
@@ -121,7 +121,7 @@ def of_separation(
     return SeparationStd(packed[0], np.stack(packed)[1:])
 
 
-def of_compensation(
+def compensation_std(
     T: Transport,
     noise: Noise,
     pattern: np.ndarray,
@@ -254,7 +254,7 @@ def _solve(T: Transport, c: int, light: np.ndarray, inverse: Inverse | None) -> 
     x = (
         inverse.solve(b, c)
         if inverse is not None
-        else solve(T.systems[c], b, rtol=default_rtol(_RTOL, T))
+        else solve(T.systems[c], b, rtol=_RTOL if T.error >= 1.0 else max(_RTOL, T.error))
     )
     return x.x.astype(np.float64).reshape(light.shape)
 

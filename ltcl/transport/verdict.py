@@ -23,7 +23,7 @@ from ltcl.errors import InputError
 from ltcl.transport import diagnostics, uncertainty
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import ENTRIES
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 _STEPS, _AT_ONCE = 8, 8  # of a solve; right-hand sides
 _ENTRIES, _LEAST = 1 << 24, 64  # to read of a channel; pixels: fewer tell neither parts nor noise
@@ -157,7 +157,7 @@ def verdict(T: Transport, **known: float) -> Verdict:
     """
     numbers, places = {name: x for name, x in known.items() if not math.isnan(x)}, dict[str, str]()
     try:
-        if require(T, square=False).noise.source == "estimated" and min(T.shape) < _LEAST:
+        if check_transport(T, square=False).noise.source == "estimated" and min(T.shape) < _LEAST:
             raise InputError(
                 f"fewer than {_LEAST} pixels do not tell their noise: use ltcl analyze --noise"
             )
@@ -308,10 +308,10 @@ def _bounces(T: Any) -> Iterator[Number]:
     b = [np.atleast_2d(T.first_bounce)]  # (channels, N)
     for _ in range(3):
         b.append(b[-1] - [S.solve(f[:, None])[:, 0] for S, f in zip(T.systems, b[-1], strict=True)])
-    shape = layout.Layout(False, None, T.channels == 3)
+    shape = layout.PictureLayout(False, None, T.channels == 3)
     pictures = [shape.pack([f[:, None] for f in each], T.grid) for each in b]
     inverse: Any = SimpleNamespace(solve=lambda b, c: SimpleNamespace(x=T.systems[c].solve(b)))
-    std = uncertainty.of_separation(T, T.noise, pictures, inverse)
+    std = uncertainty.separation_std(T, T.noise, pictures, inverse)
     for k, picture in enumerate(std.bounces, 1):
         for c, deviation in enumerate(layout.unpack("bounces", picture, T.grid, T.channels)[0]):
             yield from (

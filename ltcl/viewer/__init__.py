@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 if TYPE_CHECKING:
     from ltcl.viewer.server import Viewer
@@ -62,7 +62,7 @@ def view(
     from ltcl.viewer.answers import ViewerScene
     from ltcl.viewer.server import Viewer
 
-    require(T, square=False)
+    check_transport(T, square=False)
     pictures = {}
     if isinstance(picture, Mapping):
         pictures = picture

@@ -15,7 +15,8 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.errors import InputError, InputTypeError, LtclError
-from ltcl.images.pictures import BITS, as_picture, from_linear, to_linear
+from ltcl.images.encoding import from_linear, to_linear
+from ltcl.images.pictures import BITS, as_picture
 from ltcl.tasks import report
 from ltcl.tasks.compensation import compensate
 from ltcl.tasks.separation import separate

@@ -15,7 +15,7 @@ import pytest
 from pyopencl import _cl
 
 from ltcl.device import kernels, vectors
-from ltcl.errors import DeviceError, MemoryLimitError
+from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
 
 TWINS = (Path(__file__).parents[1] / "reference.py").read_text(encoding="utf-8")
 FILES = sorted(path.stem for path in kernels.folder().glob("*.cl"))
@@ -125,23 +125,53 @@ def test_groups_are_clamped_to_what_kernel_and_device_allow(device, size):
 def test_a_bound_launch_keeps_its_arrays_and_runs_again_with_changed_arguments(device):
     x, y, z = (vectors.fill(device.empty(1000), value) for value in (1, 10, 2))
     kernel = device.kernel("vector", "vector_axpby")
-    launch = kernel.bind(1000, 64, 1000, 2.0, z, 1.0, y, y)
-    other = kernel.bind(1000, 64, 1000, 0.0, y, 0.0, y, y)  # has arguments of its own
-    kernel(1000, 64, 1000, 5.0, y, 0.0, y, device.empty(1000))
+    launch = kernel.bind(1000, 64, count=1000, a=2.0, x=z, b=1.0, y=y, out=y)
+    # Another launch has arguments of its own.
+    zeroing = kernel.bind(1000, 64, out=y, count=1000, a=0.0, x=y, b=0.0, y=y)
+    kernel(1000, 64, count=1000, a=5.0, x=y, b=0.0, y=y, out=device.empty(1000))
     del z
     gc.collect()
     for _ in range(10):
         vectors.fill(device.empty(1000), -1)  # would take the blocks of arrays that are gone
     launch()
     assert (y.get() == 14).all()
-    launch.set(1, -1)
+    launch.set(a=-1)
     launch()
-    launch.set(5, x)
+    launch.set(a=-1.0, out=x)
     launch()
     assert (y.get() == 12).all()
     assert (x.get() == 10).all()
-    other()
+    zeroing()
     assert (y.get() == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"value": None}, "vector_fill needs argument value$"),
+        ({"valeu": 1.0}, "vector_fill has no argument valeu; it has count, value, out"),
+        ({"value": None, "valeu": 1.0}, "vector_fill has no argument valeu"),
+        ({"value": "1"}, "argument value of kernel vector_fill is '1'; .*number"),
+        ({"count": 1.5}, "argument count of kernel vector_fill is 1.5"),
+    ],
+)
+def test_wrong_and_missing_names_are_refused_at_once(device, changes, message):
+    kernel = device.kernel("vector", "vector_fill")
+    arguments = {"count": 3, "value": 1.0, "out": device.empty(3)} | changes
+    named = {name: value for name, value in arguments.items() if value is not None}
+    launches = device.launches.total()
+    for act in (kernel, kernel.bind):
+        with pytest.raises(InputTypeError, match=message):
+            act(3, 1, **named)
+    assert device.launches.total() == launches
+
+
+def test_a_bound_launch_refuses_names_that_its_kernel_has_not(device):
+    launch = device.kernel("vector", "vector_fill").bind(
+        3, 1, count=3, value=1.0, out=device.empty(3)
+    )
+    with pytest.raises(InputTypeError, match="vector_fill has no argument x; it has count"):
+        launch.set(x=1.0)
 
 
 def test_threads_may_launch_one_kernel(device):
@@ -161,8 +191,8 @@ def test_threads_may_launch_one_kernel(device):
 def test_arguments_that_the_driver_refuses_are_errors_of_ltcl(device):
     kernel, local = device.kernel("vector", "vector_fill"), device.local(1)
     for act in (
-        lambda: kernel(1, 1, 1, 0.5, local),
-        lambda: kernel.bind(1, 1, 1, 0.5, device.empty(3)).set(2, local),
+        lambda: kernel(1, 1, count=1, value=0.5, out=local),
+        lambda: kernel.bind(1, 1, count=1, value=0.5, out=device.empty(3)).set(out=local),
     ):
         with pytest.raises(DeviceError, match="vector_fill"):
             act()

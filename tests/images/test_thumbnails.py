@@ -15,7 +15,7 @@ import pytest
 import ltcl
 from ltcl.acquisition import Report, VirtualRig
 from ltcl.acquisition.scanning import plans
-from ltcl.images.pictures import thumbnails
+from ltcl.images.thumbnails import thumbnails
 
 
 def decoded(html: str) -> list[np.ndarray]:

@@ -18,8 +18,8 @@ from ltcl.operators import (
     Pyramid,
     SubsetBasis,
     Wavelet,
-    bases,
     multiresolution_order,
+    pyramid,
     restrict_to_support,
     wavelets,
 )
@@ -41,8 +41,8 @@ def some(n: int, share: int = 3) -> np.ndarray:
 @pytest.mark.parametrize("name", ["haar", "db4", "pyramid"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
-    for module in (bases, wavelets):  # pixels of the levels that one launch does
-        monkeypatch.setattr(module, "_SMALL", small)
+    for module in (pyramid, wavelets):  # pixels of the levels that one launch does
+        monkeypatch.setattr(module, "SMALL_LEVEL_PIXELS", small)
     monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 5, 11))  # launches of every width, and pieces
     if name == "pyramid":
         W = Pyramid(shaped, grid)

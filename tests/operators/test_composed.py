@@ -19,7 +19,7 @@ from ltcl.operators import (
     Host,
     IdentityPlus,
     ScaledColumns,
-    composed,
+    compressed,
     interreflections,
 )
 from tests import gallery, reference
@@ -93,7 +93,7 @@ def test_threads_share_an_operator(device):
 
 
 def test_a_diagonal_of_many_pixels_has_to_be_told(device, monkeypatch):
-    monkeypatch.setattr(composed, "_FEW", N - 1)
+    monkeypatch.setattr(compressed, "MAX_DIAGONAL_PRODUCTS", N - 1)
     R = two_sided(device, gallery.bounces(N, 0.5))
     with pytest.raises(InputError, match=rf"{N} pixels.*diagonal="):
         R.diagonal()

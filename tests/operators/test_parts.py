@@ -29,7 +29,7 @@ from ltcl.operators import (
     ScaledColumns,
     Streamed,
     as_operator,
-    parts,
+    out_of_core,
 )
 from tests import gallery
 from tests.operators import helpers
@@ -99,7 +99,7 @@ def no_room(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     memory = 4 * (GRID[0] * GRID[1]) ** 2 * 2 // 3
     monkeypatch.setattr("ltcl.checks.host_memory", lambda: memory)
     monkeypatch.setattr(device, "memory", memory)
-    monkeypatch.setattr(parts, "_READ", 1 << 18)
+    monkeypatch.setattr(out_of_core, "READ_BYTES", 1 << 18)
 
 
 FORMS: dict[str, Callable[[Path, Device, Any], Parts]] = {
@@ -119,7 +119,7 @@ forms = pytest.mark.parametrize("make", FORMS.values(), ids=list(FORMS))
 @pytest.mark.parametrize("shape", [(53, 53), (53, 7), (40, 129)])
 def test_products_transposes_and_facts(tmp_path, device, monkeypatch, make, shape):
     monkeypatch.setattr(helpers, "COLUMNS", (None, 1, 3, 11))
-    monkeypatch.setattr(parts, "_READ", 4 * 8 * shape[1])  # 8 rows of float32 at once
+    monkeypatch.setattr(out_of_core, "READ_BYTES", 4 * 8 * shape[1])  # 8 rows of float32 at once
     matrix = gallery.signed(*shape)
     A = make(tmp_path, device, matrix)
     helpers.meets_twin(A, matrix)
@@ -139,7 +139,7 @@ def test_rows_that_are_larger_than_a_buffer_are_cut(tmp_path, small_device):
 @pytest.mark.parametrize("dtype", ["<f4", "<f8", ">f4"])
 @pytest.mark.parametrize("mode", ["r", "c"])
 def test_every_array_that_looks_at_a_file_is_read(tmp_path, device, monkeypatch, dtype, mode):
-    monkeypatch.setattr(parts, "_READ", 1000)
+    monkeypatch.setattr(out_of_core, "READ_BYTES", 1000)
     whole = np.stack([gallery.signed(30, 40)] * 3).astype(dtype) * np.arange(1, 4)[
         :, None, None
     ].astype(dtype)

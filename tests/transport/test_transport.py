@@ -224,7 +224,7 @@ BAD: list[tuple[Any, dict[str, Any], type[LtclError], str]] = [
     ],
     ([T35, T35 - np.diag(2.0 * DARK), np.eye(35)], {"on_dark": "raise"}, InputError, THREE),
     *[
-        (T35, {"dark": dark}, InputError, "dark .*at least 0 and below 1")
+        (T35, {"dark_threshold": dark}, InputError, "dark_threshold .*at least 0 and below 1")
         for dark in (-0.1, 1.0, "a")
     ],
     (np.zeros((35, 35)), {"on_dark": "mask"}, InputError, "zero or negative at every pixel"),
@@ -362,7 +362,9 @@ def test_relighting_has_all_digits_whatever_the_first_bounce(device, form, share
 
 @pytest.mark.filterwarnings("error")
 def test_a_first_bounce_too_small_for_float32_is_refused():
-    T = ltcl.Transport([[1, 0.5], [0.3, 1e-39]], (1, 2), noise=Noise.uniform((2, 2), 0.0), dark=0.0)
+    T = ltcl.Transport(
+        [[1, 0.5], [0.3, 1e-39]], (1, 2), noise=Noise.uniform((2, 2), 0.0), dark_threshold=0.0
+    )
     with pytest.raises(InputError, match=r"float32.* first bounce"):
         ltcl.relight(T, np.ones((1, 2)))
 

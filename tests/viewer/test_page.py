@@ -18,7 +18,7 @@ import pytest
 import ltcl
 from ltcl.acquisition import FolderRig
 from ltcl.images import to_srgb
-from ltcl.images.pictures import to_linear
+from ltcl.images.encoding import to_linear
 from ltcl.show.window import Window
 from ltcl.viewer import server
 from ltcl.viewer.scan import Scan

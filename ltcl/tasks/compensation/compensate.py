@@ -24,16 +24,10 @@ from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.tasks.compensation import gain as gains
 from ltcl.tasks.compensation import problem as problems
 from ltcl.tasks.compensation.problem import Columns, Limits, Problem, join, systems
+from ltcl.tasks.requirements import check_inverse, default_rtol, error_note, resolve_reference
 from ltcl.transport import frames as layout
-from ltcl.transport.transport import (
-    Transport,
-    default_rtol,
-    error_note,
-    require,
-    require_inverse,
-    resolve_reference,
-)
-from ltcl.transport.uncertainty import CompensationStd, of_compensation
+from ltcl.transport.transport import Transport, check_transport
+from ltcl.transport.uncertainty import CompensationStd, compensation_std
 
 RTOL = 1e-2
 _COARSE = 1e-5  # rtol from which on the rounding of a pattern does not count beside the residual
@@ -88,7 +82,7 @@ class Compensation:
     limited: tuple[Bounded, ...]
     transport_error: float
     rtol: float
-    _shape: layout.Layout
+    _shape: layout.PictureLayout
     _grid: tuple[int, int]  # of the camera
     _target: Columns
     _missing: Columns  # target - appearance
@@ -113,7 +107,7 @@ class Compensation:
         """Standard deviations by the noise of T, `ltcl.transport.uncertainty`, computed at the first call."""
         (T, true), own = self._transports, systems(self._transports[0]) if self.limited else ()
         bounds = self._bounds if self.clipped else (-np.inf, np.inf)
-        return of_compensation(
+        return compensation_std(
             T, true.noise, self.pattern, bounds, self._inverse, own, self._weights
         )
 
@@ -145,7 +139,7 @@ class Compensation:
         return f"<ltcl Compensation {shape}, {error}, {self.clipped:.2%} clipped>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.pictures import thumbnails  # brings OpenCV
+        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
 
         names = ("pattern", "appearance", "target", "out_of_reach")
         return thumbnails(self, {name: getattr(self, name) for name in names})
@@ -234,7 +228,7 @@ def compensate(
     >>> round(c.gain, 2), c.pattern.round(2).tolist()
     (0.6, [[1.0, 1.0]])
     """
-    require(T, square=False)
+    check_transport(T, square=False)
     low_high, requested = checks.interval("bounds", bounds), problems.gain(gain, loss)
     count = 1 if T.couples else T.channels
     limits = Limits.in_float32(low_high, join([T.masked] * T.channels, count)[0])
@@ -242,7 +236,7 @@ def compensate(
     dark = problems.background(background, T, shape, d)
     W, unit = problems.weights(weights, T, shape, d)
     if inverse is not None:
-        require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+        check_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
     rtol = default_rtol(RTOL, T, exact, inverse) if rtol is None else rtol
     rules = problems.rules(T, method, rtol, options)
     if checks.flag("clamp", clamp) and not T.is_square:
@@ -372,7 +366,7 @@ def _result(
     transports: tuple[Transport, Transport],
     inverse: Inverse | None,
     problem: Problem,
-    shape: layout.Layout,
+    shape: layout.PictureLayout,
     start: _Start,
     light: Columns,
     limited: list[Bounded],

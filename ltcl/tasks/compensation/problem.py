@@ -244,7 +244,7 @@ def warn_of_units(target: Columns, appearance: Columns) -> None:
         logger.warning("desired reaches %.3g, the scene %.3g at most; %s", highest, reached, units)
 
 
-def background(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:
+def background(value: Any, T: Transport, shape: layout.PictureLayout, like: Columns) -> Columns:
     """Of every channel: none, one number, one for all frames, or one per frame."""
     if value is None or np.ndim(value) == 0:
         level = np.float32(0) if value is None else checks.number("background", value)
@@ -253,7 +253,7 @@ def background(value: Any, T: Transport, shape: layout.Layout, like: Columns) ->
 
 
 def weights(
-    value: Any, T: Transport, shape: layout.Layout, like: Columns
+    value: Any, T: Transport, shape: layout.PictureLayout, like: Columns
 ) -> tuple[Columns | None, float]:
     """Of every channel, in a unit that keeps their squares inside float64; None where all are alike."""
     if value is None:
@@ -297,7 +297,9 @@ def rules(T: Transport, method: str, rtol: float, options: dict[str, Any]) -> di
     return checked
 
 
-def _alike(name: str, value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:
+def _alike(
+    name: str, value: Any, T: Transport, shape: layout.PictureLayout, like: Columns
+) -> Columns:
     """Columns of a picture that has as many frames and colours as `like`, which has `shape`, or one."""
     columns, own = layout.unpack(name, value, T.camera_grid, T.channels)
     # (M, frames, colours): one frame or one grey serves all.

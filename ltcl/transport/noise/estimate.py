@@ -28,7 +28,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.errors import InputError
-from ltcl.operators.interreflection import made_with
+from ltcl.operators.interreflection import underlying_system
 from ltcl.transport.noise.model import Noise, cancellation
 
 _SQUARE = 0.4549  # median of the squares of standard normal values
@@ -96,7 +96,9 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
     entries.
     """
     for T in matrices:
-        if made_with(T) is not None or not (isinstance(T, _ARRAYS) or hasattr(T, "between")):
+        if underlying_system(T) is not None or not (
+            isinstance(T, _ARRAYS) or hasattr(T, "between")
+        ):
             text = "noise is None, but T is compressed, or an operator, and shows no entries with noise"
             raise InputError(
                 f"{text}; give noise= (--noise) to what it was made from, which keeps it"

@@ -211,7 +211,7 @@ class Noise:
             raise InputError(f"{text}; both must be measured with the same exposure and light")
         return replace(noise, neighbours=shares)
 
-    def require(self, channels: int, shape: tuple[int, int], brightest: Any = 0.0) -> None:
+    def check_fits(self, channels: int, shape: tuple[int, int], brightest: Any = 0.0) -> None:
         """InputError where this is no noise of such a T (M, N), `brightest` (channels,), or 0 if unknown."""
         n, own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
         if (n, own) != (channels, shape):

@@ -67,7 +67,7 @@ def test_they_are_masked_with_one_warning_or_refused(caplog, form, first_bounce)
     case = corner()
     F: Any = np.full(n * n, 0.85) if first_bounce == "given" else first_bounce
     T = ltcl.Transport(form(case.measured), GRID, F)
-    assert [record.message for record in caplog.records] == [f"{T.dark}; they stay unlit"]
+    assert [record.message for record in caplog.records] == [f"{T.dark_note}; they stay unlit"]
     np.testing.assert_array_equal(np.flatnonzero(T.masked), case.dark)
     np.testing.assert_allclose(T.first_bounce[~T.masked], 0.85, rtol=0.04)
     with pytest.raises(InputError, match=r"13 of 1024 pixels.*on_dark='mask'"):
@@ -138,9 +138,9 @@ QUIET = Noise.uniform((32, 32), 0.0)
         (T32 * DIM, {}, False),  # dim, without noise
         (T32 * DIM**2, {"noise": QUIET}, False),
         (T32 * DIM**4, {"noise": QUIET}, True),  # of which no camera and no float32 sees anything
-        (T32 * DIM**4, {"noise": QUIET, "dark": 0.0}, False),
+        (T32 * DIM**4, {"noise": QUIET, "dark_threshold": 0.0}, False),
         (np.linalg.inv(np.diag(1 / (0.6 * DIM)) - SMALL.form_factors), {}, False),  # dark paint
-        (T32 * DIM, {"dark": 0.05}, True),
+        (T32 * DIM, {"dark_threshold": 0.05}, True),
         (T32 * DIM, {"noise": SIGMA}, True),
         (T32 * DIM**0.5, {"noise": SIGMA}, True),
         (T32 * ~SOME, {}, True),
@@ -152,7 +152,7 @@ def test_what_is_dark(matrix, options, dark) -> None:
     np.testing.assert_array_equal(ltcl.Transport(matrix, (4, 8), **options).masked, SOME & dark)
 
 
-@pytest.mark.parametrize(("options", "gain"), [({}, 1.0), ({"dark": 0.0}, 1e-12)])
+@pytest.mark.parametrize(("options", "gain"), [({}, 1.0), ({"dark_threshold": 0.0}, 1e-12)])
 def test_pixels_without_light_do_not_decide_the_gain(options, gain) -> None:
     """Projector pixels with 1e-12 of the others' light, and noise as small."""
     desired, without = np.full((4, 8), 0.5), ltcl.Transport(T32 * ~SOME, (4, 8))
