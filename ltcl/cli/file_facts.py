@@ -129,8 +129,13 @@ def _first_bounce(record: StoreRecord) -> np.ndarray | None:
     def noise() -> Any:
         return record.noise or estimate(matrices, grid, camera_grid)
 
-    is_dark = first_bounce.dark(matrices, first_bounce.DARK, noise, record.noise is not None, F)
-    return np.where(is_dark, 0.0, F)
+    rule = first_bounce.DarkRule(
+        matrices=matrices,
+        threshold=first_bounce.DARK_THRESHOLD,
+        noise=noise,
+        is_measured=record.noise is not None,
+    )
+    return np.where(rule.find_dark(F), 0.0, F)
 
 
 def _check_record(record: StoreRecord) -> None:
