@@ -96,8 +96,10 @@ def compensate(
         paths = [transport, *paths]
     if not paths:
         raise UsageError("Missing argument 'PICTURE...'.")
-    _check_pictures(paths)
     _check_sharing(context)
+    if has_scenes:
+        scenes.check_pictures(paths)
+    _check_pictures(paths)
     if has_scenes:
         return scenes.compensate_scenes(context, paths, out, compensate_pictures)
     return compensate_pictures(context, transport, paths, out)

@@ -39,6 +39,14 @@ def connect_cluster(context: Context) -> AbstractContextManager[Any]:
     return nullcontext()
 
 
+def check_pictures(pictures: list[Path]) -> None:
+    """Refuse a transport in place of the first picture."""
+    if pictures[0].suffix.lower() in FORMATS:
+        raise InputError(
+            f"{pictures[0]}: is a transport, and --transports is given, too; give one of them"
+        )
+
+
 def compensate_scenes(
     context: Context, pictures: list[Path], out: Path, compensate: CompensatePictures
 ) -> Answer:
@@ -46,10 +54,6 @@ def compensate_scenes(
     # It imports Dask.
     from ltcl.batch import map as map_scenes
 
-    if pictures[0].suffix.lower() in FORMATS:
-        raise InputError(
-            f"{pictures[0]}: is a transport, and --transports is given, too; give one of them"
-        )
     transports = _find_transports(context.options["transports"], out)
     task = _SceneTask(
         options=_options_of_one_scene(context), pictures=pictures, compensate=compensate

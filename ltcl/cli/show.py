@@ -57,8 +57,7 @@ def play(
                 context.progress,
                 **settings,
             )
-            if pace is not None:
-                report = PlayReport(film=film, **dataclasses.asdict(pace))
+            report = PlayReport(film=film, **dataclasses.asdict(pace))
     if report.shown is None:
         return Answer(report, [])
     line = (

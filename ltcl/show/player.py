@@ -54,19 +54,17 @@ def play(
     gain: float | str,
     progress: Callable[..., None],
     **settings: Any,
-) -> Pace | None:
+) -> Pace:
     """Show a film compensated for the T of `scene` at the film's own pace.
 
     `settings` are those of `ltcl.compensate`; a `gain` "auto" is the largest for frames from all
     parts of the film. In the result `frames_per_second` counts shown frames, and `latency` is the
-    median of the seconds between the due time of a frame and the end of its drawing. It is None if
-    the film has no frame.
+    median of the seconds between the due time of a frame and the end of its drawing.
     """
     compensator = _FrameCompensator(scene, gain, settings)
     compensator.prepare(film)
     timing = _Timing(period=1.0 / (film.fps or DEFAULT_FPS))
     title = window.title
-    pace = None
     for frame in film:
         begun_at = time.monotonic()
         if timing.is_too_late(frame.number, begun_at):
@@ -80,7 +78,7 @@ def play(
         window.title = f"{title}: {pace}"
         progress("playing", frame.number, film.count, detail=f": {pace}")
     window.wait(PAUSE_SECONDS)
-    return pace
+    return timing.pace(compensator.gain)
 
 
 class _FrameCompensator:
@@ -183,10 +181,11 @@ class _Timing:
 
     def pace(self, gain: float) -> Pace:
         """Return the pace so far."""
+        seconds = self.sent_at - self.start
         return Pace(
             shown=self.shown,
             dropped=self.number - self.shown,
             gain=gain,
-            frames_per_second=self.shown / (self.sent_at - self.start),
+            frames_per_second=self.shown / seconds if self.shown else 0.0,
             latency=median(self.latencies or [0.0]),
         )

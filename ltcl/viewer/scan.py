@@ -72,7 +72,7 @@ class Scan(ViewerScene):
         self._warnings: dict[str, str] = {}
         self._progress: dict[str, Any] = {}
         self._reader = PhotographReader(self.project.table.get("bits"))
-        self._agreement = _Agreement()
+        self.agreement = PhotographAgreement()
         self._calibration_photographs = 0
         if self.project.state == "final":
             self._show_result()
@@ -130,7 +130,7 @@ class Scan(ViewerScene):
         store = None
         if state != "new":
             store = BlockStore.open(self.project.store)
-            self._agreement.set_calibration(store)
+            self.agreement.set_calibration(store)
         with self._open_rig() as rig:
             files = list(self._list_files(rig, store))
             self._progress = self._measure_progress(state, files, store)
@@ -178,7 +178,7 @@ class Scan(ViewerScene):
             "what": unit,
             "left": _seconds_left(files, done, total),
         }
-        calibration = self._agreement.calibration
+        calibration = self.agreement.calibration
         if calibration is not None:
             progress["coverage"] = float(np.mean(calibration.resampling.coverage > 0))
             progress["saturated"] = 1.0 - float(np.mean(calibration.white.valid))
@@ -216,11 +216,11 @@ class Scan(ViewerScene):
     def _check(self, name: str, shot: Shot, codes: np.ndarray) -> None:
         """Compare a photograph with the others of its pattern."""
         self._warnings.pop(shot.pattern, None)
-        self._agreement.add(shot, codes)
-        saturation = self._agreement.saturation(name, shot, codes)
+        self.agreement.add(shot, codes)
+        saturation = self.agreement.saturation(name, shot, codes)
         if saturation:
             self._warnings[name] = saturation
-        deviation = self._agreement.deviation(shot.pattern)
+        deviation = self.agreement.deviation(shot.pattern)
         if deviation:
             self._warnings[shot.pattern] = deviation
 
@@ -244,7 +244,7 @@ class Scan(ViewerScene):
         return self._previews[name].facts["time"]
 
 
-class _Agreement:
+class PhotographAgreement:
     """Photographs by hand against the others of their patterns, once the camera is calibrated."""
 
     def __init__(self) -> None:

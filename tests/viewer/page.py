@@ -50,7 +50,8 @@ class Page:
     def __init__(self, url: str, **settings: Any) -> None:
         origin = "/".join(url.split("/")[:3])
         settings = {"origin": origin, "max_size": None, "compression": None, **settings}
-        self.url, self.origin = url, origin
+        self.url = url
+        self.origin = origin
         self._opened = contextlib.ExitStack()
         opening = connect(url.replace("http", "ws", 1) + "socket", **settings)
         self.socket: ClientConnection = self._opened.enter_context(opening)
