@@ -32,7 +32,8 @@ from ltcl.images.encoding import Encoding
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
 from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
-from ltcl.tasks.compensation import compensate, problem
+from ltcl.tasks.compensation import compensate
+from ltcl.tasks.compensation.inputs import check_gain
 from ltcl.tasks.report import versions
 from ltcl.tasks.requirements import error_note, resolve_reference
 from ltcl.transport import frames as layout
@@ -224,7 +225,7 @@ def _validate(
     """The bounds; refuses what `compensate` would, and pictures that are not for all frames."""
     check_transport(T, square=False)
     resolve_reference(T, options.get("exact"))
-    problem.gain(gain, loss)
+    check_gain(gain, loss)
     for name, value in functions.items():
         if value is not None and not callable(value):
             raise InputTypeError(f"{name} is {checks.shown(value)}; it must be a function, or None")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Requirements that several tasks share: an `inverse` and an `exact` of the same T, and a default tolerance."""
+"""Requirements of several tasks: `inverse` and `exact` of the same T, and a default tolerance."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _roundtrip_deviation(T: Transport, inverse: Inverse) -> float:
 def default_rtol(
     minimum: float, T: Transport, exact: Any = None, inverse: Inverse | None = None
 ) -> float:
-    """Default tolerance of a task: `minimum`, or the error of a compressed T or of an inverse if larger."""
+    """Default tolerance of a task: `minimum`, or the error of T or of the inverse if larger."""
     error = 0.0
     if inverse is not None:
         error = inverse.error
@@ -92,7 +92,10 @@ def default_rtol(
 def resolve_reference(
     T: Transport, exact: Any
 ) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:
-    """The transport that results describe, and the S that judges each channel: T and None without `exact`."""
+    """The transport that results describe, and the S that judges each channel.
+
+    Without `exact` these are T and None.
+    """
     if exact is None:
         return T, (None,) * T.channels
     check_transport(T)

@@ -34,8 +34,9 @@ least 0.96 times that of a right one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ import scipy.sparse.linalg
 
 from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError
-from ltcl.operators import IdentityPlus
+from ltcl.operators import IdentityPlus, Operator
 from ltcl.solvers import solve
 
 ALL, QUICK = 1 << 22, 1 << 18  # entries to compare at most, in `analyze` and in passing
@@ -54,6 +55,10 @@ _LARGEST = 60.0  # of |log d|: beyond, there is nothing but noise to fit
 _PARTS = 4  # along each side of the picture
 _PAIRS, _BINS = 32, 64  # rows to compare, columns of these added up: noise averages out
 _JUMP, _ALIKE = 2.0, 0.7  # at the ends of rows at least; of another grid at most
+
+
+# Pixels of a picture whose parts tell ambient light from a bounce, at least.
+MIN_AMBIENT_PIXELS = 64
 
 
 def reciprocity_defect(T: Any, F: np.ndarray, *, entries: int = ALL, seed: int = 0) -> float:
@@ -170,6 +175,27 @@ def ambient(inverse: Callable[..., Any], grid: tuple[int, int], step: int = 1) -
     between = between_parts(inverse, grid, 2 * _PARTS, step)
     least = max(float(np.median(np.nanmin(between, axis=int(step == 1)))), 0.0)
     return least / max(float(np.nanmean(np.abs(between))), 1e-300)
+
+
+def ambient_share(systems: Sequence[IdentityPlus], grid: tuple[int, int]) -> float:
+    """`ambient` of the worst channel, from every 7th part alone; 0 if it is not known.
+
+    Pictures of fewer than 64 pixels have too few parts, and a solve may not converge.
+    """
+    if grid[0] * grid[1] < MIN_AMBIENT_PIXELS:
+        return 0.0
+    shares = []
+    try:
+        for S in systems:
+            undo = partial(_undo_coarsely, S.as_it_stands())
+            shares.append(ambient(undo, grid, step=7))
+    except ConvergenceError:
+        return 0.0
+    return max(shares)
+
+
+def _undo_coarsely(S: Operator, light: np.ndarray) -> np.ndarray:
+    return solve(S, light, rtol=1e-2).x
 
 
 def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:

@@ -415,6 +415,14 @@ class Transport:
         """Share of light that one bounce takes away, for each channel (`ltcl.transport.diagnostics`)."""
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
 
+    @cached_property
+    def ambient_share(self) -> float:
+        """Ambient light left in T, as a share of a bounce; 0 if T shows no entries, or few."""
+        has_entries = all(isinstance(T, ENTRIES) for T in self.matrices)
+        if not has_entries:
+            return 0.0
+        return diagnostics.ambient_share(self.systems, self.grid)
+
     # Operators on the device.
 
     @cached_property
