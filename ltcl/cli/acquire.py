@@ -240,7 +240,7 @@ def report(
 ) -> Answer:
     """Show coverage, saturation, noise and reciprocity of a finished acquisition.
 
-    For a virtual rig also the relative error of T p, for patterns p that were not scanned, after
+    A virtual rig also gets the relative error of T p, for patterns p that were not scanned, after
     one scale for each channel, as the unit of light of a camera is its own.
     """
     return _report(context, folder, device)

@@ -64,7 +64,7 @@ def sharing_options(
         option("Number of processes of --cluster local.", metavar="N", min=1, panel=SHARING_PANEL),
     ] = None,
 ) -> None:
-    """How the work is shared."""
+    """Options that share the work."""
 
 
 @command(compensation.target_options, *options.TASK_OPTIONS, sharing_options)

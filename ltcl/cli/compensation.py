@@ -81,12 +81,12 @@ def target_options(
         file_option("Picture of the weight of the error at each pixel.", panel=PROJECTOR_PANEL),
     ] = None,
 ) -> None:
-    """What the scene shall show, and what the projector can do."""
+    """Options of the target and of the projector."""
 
 
 @dataclass(kw_only=True)
 class CompensationJob:
-    """What a compensation needs: transport, measured projector, and arguments of `compensate`."""
+    """A transport, its measured projector, and the arguments of `compensate`."""
 
     T: Transport
     setup: Any

@@ -123,11 +123,14 @@ def _first_bounce(record: StoreRecord) -> np.ndarray | None:
     if F is None:
         F = np.stack([matrix.diagonal() for matrix in matrices])
     F = np.atleast_2d(checks.finite("first_bounce", F))
-    grid = record.grid or (1, columns)
-    camera_grid = record.camera_grid or grid
 
     def noise() -> Any:
-        return record.noise or estimate(matrices, grid, camera_grid)
+        """Return the measured noise, or estimate it, which takes a while."""
+        if record.noise is not None:
+            return record.noise
+        grid = (1, columns) if record.grid is None else record.grid
+        camera_grid = grid if record.camera_grid is None else record.camera_grid
+        return estimate(matrices, grid, camera_grid)
 
     rule = first_bounce.DarkRule(
         matrices=matrices,
@@ -140,8 +143,10 @@ def _first_bounce(record: StoreRecord) -> np.ndarray | None:
 
 def _check_record(record: StoreRecord) -> None:
     rows, columns = record.shape
-    checks.grid("grid", record.grid or (1, columns), columns)
-    checks.grid("camera_grid", record.camera_grid or (1, rows), rows)
+    if record.grid is not None:
+        checks.grid("grid", record.grid, columns)
+    if record.camera_grid is not None:
+        checks.grid("camera_grid", record.camera_grid, rows)
     if record.stored:
         # Blocks of a store are checked as they are read.
         return

@@ -60,7 +60,7 @@ def frame_options(
         option("Write how the scene will look, too.", "--appearance", panel=FRAMES_PANEL),
     ] = False,
 ) -> None:
-    """Which frames are read, and what is written of them."""
+    """Options of the frames that are read and written."""
 
 
 def cluster_options(
@@ -78,7 +78,7 @@ def cluster_options(
         option("Number of processes of --cluster local.", metavar="N", min=1, panel=CLUSTER_PANEL),
     ] = None,
 ) -> None:
-    """Where the work is done."""
+    """Options of a cluster."""
 
 
 @command(frame_options, compensation.target_options, *options.TASK_OPTIONS, cluster_options)

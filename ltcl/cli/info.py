@@ -80,6 +80,9 @@ def _read_facts(file: Path, variable: str | None) -> tuple[FileFacts, np.ndarray
 
 
 def _table_row(facts: FileFacts) -> list[Any]:
+    first_bounce = None
+    if facts.first_bounce is not None:
+        first_bounce = interval_text(*facts.first_bounce)
     camera_grid = size_text(facts.camera_grid)
     rows, columns = facts.shape
     if rows == columns and facts.camera_grid in (None, facts.grid):
@@ -93,6 +96,6 @@ def _table_row(facts: FileFacts) -> list[Any]:
         f"{facts.stored} {facts.dtype}",
         facts.entries,
         checks.size(facts.nbytes),
-        facts.first_bounce and interval_text(*facts.first_bounce),
+        first_bounce,
         facts.dark_pixels,
     ]

@@ -196,7 +196,7 @@ def transport_options(
     ] = None,
     device: DeviceName = None,
 ) -> None:
-    """How a transport is loaded, together with `file_options`."""
+    """Options of loading a transport, together with `file_options`."""
 
 
 def solve_options(
@@ -251,7 +251,7 @@ def solve_options(
         ),
     ] = None,
 ) -> None:
-    """How a task solves."""
+    """Options of the solver."""
 
 
 def picture_options(
@@ -267,7 +267,7 @@ def picture_options(
         ),
     ] = "auto",
 ) -> None:
-    """How pictures are read."""
+    """Options of reading pictures."""
 
 
 READ_OPTIONS = (file_options, transport_options)

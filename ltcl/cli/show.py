@@ -70,11 +70,14 @@ def play(
 @command()
 def show(
     context: Context,
-    folder: Annotated[Path, argument("FOLDER", "Pictures, one or a folder; or an acquisition.")],
+    folder: Annotated[
+        Path,
+        argument("FOLDER", "A picture, a folder of pictures, or the folder of an acquisition."),
+    ],
     display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
     every: Annotated[
         float | None,
-        option("Seconds between two pictures. Default: the next key.", metavar="SECONDS"),
+        option("Seconds between two pictures. Default: until a key is pressed.", metavar="SECONDS"),
     ] = None,
     arrival: Annotated[
         bool,

@@ -66,7 +66,7 @@ def _accuracy_options(
         ),
     ] = None,
 ) -> None:
-    """How accurate the solutions are, and in which basis R is written."""
+    """Options of the accuracy of solutions and of the basis of R."""
 
 
 @command(*options.READ_OPTIONS, _accuracy_options)
@@ -84,7 +84,7 @@ def compress(
     ] = None,
     norm: Annotated[
         Literal["pictures", "worst"],
-        option("What the error bound covers: pictures, or any light (worst)."),
+        option("Light that the error bound covers: pictures, or any light (worst)."),
     ] = "pictures",
 ) -> Answer:
     """Write R in a basis where it is sparse.

@@ -41,7 +41,7 @@ def address_options(
         bool, option("Print the URL, and open no browser.", "--no-browser", panel=ADDRESS_PANEL)
     ] = False,
 ) -> None:
-    """Where a page is served."""
+    """Options of the address of a page."""
 
 
 def address(context: Context) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def view(
 
     Ctrl-C ends it.
 
-    For the folder of an acquisition, while it runs or afterwards: photographs as they come, their
+    The folder of an acquisition shows, while it runs or afterwards, photographs as they come, their
     exposure, coverage, time left and warnings; and its transport as soon as that is finished.
     """
     from ltcl.viewer.server import Viewer

@@ -208,9 +208,10 @@ class Scan(ViewerScene):
         except LtclError as error:
             self._warnings[name] = _one_line(error)
             return
+        facts = {"histogram": _histogram(codes), "seconds": None}
         if file.shot is not None:
             self._check(name, file.shot, codes)
-        facts = {"histogram": _histogram(codes), "seconds": file.shot and file.shot.seconds}
+            facts["seconds"] = file.shot.seconds
         self._add_preview(name, file, codes, facts)
 
     def _check(self, name: str, shot: Shot, codes: np.ndarray) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One Chromium for all tests."""
+"""A Chromium that all tests share."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def visit(page: Page, viewer: Any, view: str) -> None:
 
 
 def pixels(page: Page, name: str) -> tuple[np.ndarray, float]:
-    """Codes of a canvas, (h, w, 3), and the light that is shown as white."""
+    """Return the codes of a canvas, (h, w, 3), and the light that is shown as white."""
     canvas(page, name).wait_for(state="attached")
     codes, shape, white = page.evaluate(
         """(name) => { const c = document.getElementById(name + "-canvas");
@@ -120,7 +120,7 @@ def canvas(page: Page, name: str) -> Locator:
 
 
 def at(page: Page, name: str, row: int, col: int, grid: tuple[int, int]) -> tuple[float, float]:
-    """The middle of a pixel of a canvas, on the page."""
+    """Return the middle of a pixel of a canvas, on the page."""
     box = canvas(page, name).bounding_box()
     assert box is not None
     height, width = grid
@@ -136,7 +136,7 @@ def unit(grid: tuple[int, int], row: int, col: int) -> np.ndarray:
 
 
 def row_of(T: ltcl.Transport, row: int, col: int) -> np.ndarray:
-    """What each projector pixel adds to a camera pixel, (h, w, 3)."""
+    """Return the light of each projector pixel in a camera pixel, (h, w, 3)."""
     i = row * T.camera_grid[1] + col
     return np.stack([np.reshape(np.asarray(matrix)[i], T.grid) for matrix in T.matrices], axis=-1)
 
@@ -397,7 +397,7 @@ class Late:
 
 
 def settle(page: Page) -> None:
-    """All is answered, and nothing is asked because of it."""
+    """Wait until all questions are answered, and no answer has led to another question."""
     page.wait_for_timeout(300)
     page.wait_for_selector("body[data-state=ready]")
 

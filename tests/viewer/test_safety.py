@@ -45,7 +45,7 @@ class Running:
         return int(pages) * 4096
 
     def raw(self, data: bytes) -> bytes:
-        """What comes back, until the viewer says no more."""
+        """Send bytes, and return the answer of the viewer."""
         received = b""
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=20)
         with connection, contextlib.suppress(OSError):  # it may be closed before all is sent

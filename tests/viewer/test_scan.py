@@ -49,7 +49,7 @@ def project(folder: Path, text: str) -> Project:
 
 
 def news(page: Page, seen: int = 0, count: int = 0, **wanted: Any) -> dict[str, Any]:
-    """What the page is told that has these facts, `count` photographs and warnings; asks again and again."""
+    """Ask again until the answer has these facts, and `count` photographs and warnings."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         found = page.ask("scan", seen=seen)

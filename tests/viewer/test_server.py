@@ -319,7 +319,7 @@ def test_light_beyond_what_numbers_hold_is_refused(device):
 
 
 class Slow:
-    """In the place of `separate`: 500 steps of 10 ms."""
+    """A stand-in for `separate`: 500 steps of 10 ms."""
 
     def __init__(self) -> None:
         self.steps = 0

@@ -97,7 +97,7 @@ class StandardErrors(Report):
 
 @dataclass(kw_only=True)
 class Solve(Report):
-    """One solve of one colour channel."""
+    """A solve of a colour channel."""
 
     method: Annotated[str, "Method that ran, also if `auto` was requested."]
     iterations: Annotated[int, "Number of iterations of the method."]
