@@ -214,8 +214,9 @@ def test_a_driver_that_crashes_or_hangs_is_named(program, monkeypatch, tmp_path)
         (tmp_path / f"{name}.icd").write_text(action)
     (check,) = failed_checks(program)
     crashing, working = check["found"].split("working")
+    # The driver of the wheel is there, too.
     assert re.findall(r"(\w+)\.icd", crashing) == ["crash", "hang"]
-    assert re.findall(r"(\w+)\.icd", working) == ["good", "odd"]
+    assert {"good", "odd"} <= {*re.findall(r"(\w+)\.icd", working)}
     assert "OCL_ICD_VENDORS" in check["fix"]
 
 
