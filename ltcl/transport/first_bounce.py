@@ -58,7 +58,10 @@ def find_first_bounce(
     seed: int = 0,
     rule: DarkRule | None = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """F (channels, N) float64 of any sign, diag(T) at dark pixels; and the standard error of an estimate."""
+    """F (channels, N) float64, and the standard error of an estimate.
+
+    F has any sign, and is diag(T) at the pixels that `rule` finds dark.
+    """
     checks.count("probes", probes, least=2)
     checks.count("seed", seed, least=0)
     if not isinstance(requested, str):
@@ -225,7 +228,7 @@ class DarkRule:
         return light <= least
 
     def _estimated_sigma(self, light: np.ndarray, is_faint: np.ndarray) -> np.ndarray:
-        """Standard deviation of `light` (channels, N) by estimated noise; 0 at pixels that are not faint."""
+        """Standard deviation (channels, N) by estimated noise; 0 at pixels that are not faint."""
         sigma = self.noise().diagonal(light)
         for T, channel_sigma, pixels in zip(self.matrices, sigma, is_faint, strict=True):
             column = abs(T[:, pixels])

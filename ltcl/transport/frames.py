@@ -52,7 +52,7 @@ class PictureLayout:
         return 1 if self.frames is None else self.frames
 
     def pack(self, columns: Sequence[np.ndarray], grid: tuple[int, int]) -> np.ndarray:
-        """The picture of right-hand sides: one (N, k) for each channel, or one (3 N, k) of all three."""
+        """The picture of right-hand sides: (N, k) of each channel, or one (3 N, k) of all three."""
         n = grid[0] * grid[1]
         if len(columns[0]) != n:
             columns = np.split(columns[0], 3)
@@ -139,7 +139,7 @@ def _find_layout(
 def to_light(
     columns: Sequence[np.ndarray], F: np.ndarray, mixing: np.ndarray | None
 ) -> list[np.ndarray]:
-    """Projector light F^-1 l_d from direct components l_d (N, k) of each channel; 0 where F is 0."""
+    """Projector light F^-1 l_d of direct components l_d (N, k) by channel; 0 where F is 0."""
     light = []
     for l_d, f in zip(columns, F, strict=True):
         divisor = f

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Checks of the matrices of a transport: one (M, N), three for RGB, 3 x 3 blocks, and a mixing of colours.
+"""Checks of the matrices of a transport: one (M, N), three for RGB, 3 x 3 blocks, and a mixing.
 
 Checked matrices are NumPy arrays, `scipy.sparse.csr_array` or LinearOperators.
 """
@@ -17,6 +17,17 @@ from ltcl.errors import InputError
 
 # Condition number of a mixing: above, float32 has hardly a digit left.
 MAX_MIXING_CONDITION = 1e6
+
+
+Blocks = tuple[tuple[Any, ...], ...]
+
+
+def split_channels(value: Any) -> tuple[Blocks | None, tuple[Any, ...]]:
+    """The 3 x 3 checked blocks, if there are any, and the matrix of each channel: their diagonal."""
+    blocks = check_blocks(value)
+    if blocks is None:
+        return None, check_matrices(value)
+    return blocks, tuple(blocks[channel][channel] for channel in range(3))
 
 
 def check_matrices(value: Any, name: str = "matrix") -> tuple[Any, ...]:
@@ -41,8 +52,8 @@ def check_matrices(value: Any, name: str = "matrix") -> tuple[Any, ...]:
     return _check_parts(name, named)
 
 
-def check_blocks(value: Any) -> tuple[tuple[Any, ...], ...] | None:
-    """3 x 3 checked matrices of one shape; None if `value` is no nested sequence or (3, 3, M, N) array."""
+def check_blocks(value: Any) -> Blocks | None:
+    """3 x 3 checked matrices of one shape; None if `value` is not nested, or (3, 3, M, N)."""
     rows = [_members(row, 3) for row in _members(value, 4)]
     if not any(_is_matrix(block) for row in rows for block in row):
         return None

@@ -41,7 +41,7 @@ from ltcl.transport.first_bounce import (
     find_first_bounce,
     mask_dark,
 )
-from ltcl.transport.matrices import check_blocks, check_matrices, check_mixing
+from ltcl.transport.matrices import check_mixing, split_channels
 from ltcl.transport.noise import Noise, estimate
 
 logger = logging.getLogger(__name__)
@@ -138,11 +138,7 @@ class Transport:
         probes: int = 128,
         seed: int = 0,
     ) -> None:
-        self.blocks = check_blocks(matrix)
-        if self.blocks is None:
-            self.matrices = check_matrices(matrix)
-        else:
-            self.matrices = tuple(self.blocks[channel][channel] for channel in range(3))
+        self.blocks, self.matrices = split_channels(matrix)
         self.channels = len(self.matrices)
         self.shape: tuple[int, int] = self.matrices[0].shape
         self.mixing: np.ndarray | None = None
@@ -171,12 +167,7 @@ class Transport:
         self.dark_note = ""
         self.first_bounce_error: np.ndarray | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
-        rule = DarkRule(
-            matrices=self.matrices,
-            threshold=checks.number("dark_threshold", dark_threshold, least=0.0, below=1.0),
-            noise=lambda: self.noise,
-            is_measured=noise is not None and getattr(noise, "source", "") != "estimated",
-        )
+        rule = self._dark_rule(dark_threshold)
         if self.is_square:
             self._set_first_bounce(first_bounce, rule, on_dark == "mask", probes, seed)
             self._warn_of_other_grid()
@@ -250,6 +241,17 @@ class Transport:
                     f"noise is a T of {name} {value}; a second measurement has {name} {expected}, "
                     "as matrix"
                 )
+
+    def _dark_rule(self, threshold: float) -> DarkRule:
+        is_measured = self._noise is not None
+        if isinstance(self._noise, Noise):
+            is_measured = self._noise.source != "estimated"
+        return DarkRule(
+            matrices=self.matrices,
+            threshold=checks.number("dark_threshold", threshold, least=0.0, below=1.0),
+            noise=lambda: self.noise,
+            is_measured=is_measured,
+        )
 
     def _set_first_bounce(
         self, requested: Any, rule: DarkRule, mask: bool, probes: int, seed: int
@@ -356,7 +358,7 @@ class Transport:
 
     @cached_property
     def noise(self) -> Noise:
-        """Standard deviations of the entries: as given or measured, else estimated from T at the first call.
+        """Standard deviations of the entries: given, measured, or estimated at the first call.
 
         InputError if T does not show its entries (compressed, or a LinearOperator) and no noise is
         given.
@@ -376,7 +378,7 @@ class Transport:
 
     @property
     def is_square(self) -> bool:
-        """Whether S exists: camera and projector have the same pixels, and colours no blocks between them."""
+        """Whether S exists: one grid of camera and projector, and no blocks between colours."""
         return self.camera_grid == self.grid and self.blocks is None
 
     @property
@@ -407,12 +409,12 @@ class Transport:
         """Deviation of the worst channel from reciprocity, by a sample of pixels; computed once."""
         defects = []
         for T, F in zip(self.matrices, self._require_first_bounce(), strict=True):
-            defects.append(diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK))
+            defects.append(diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK_ENTRIES))
         return max(defects)
 
     @cached_property
     def negative_bounces(self) -> tuple[float, ...]:
-        """Share of light that one bounce takes away, for each channel (`ltcl.transport.diagnostics`)."""
+        """Share of light that one bounce takes away, for each channel; computed once."""
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
 
     @cached_property
@@ -447,9 +449,9 @@ class Transport:
 
     @property
     def error(self) -> float:
-        """Relative error of solutions that compression leaves, as its `norm` states it: of pictures, or all.
+        """Relative error of solutions that compression leaves, besides rounding, 1e-7.
 
-        Rounding, 1e-7, comes on top.
+        It holds for pictures, or for all right-hand sides, as the `norm` of the compression states.
         """
         if not self.is_compressed:
             return 0.0
@@ -488,7 +490,7 @@ class Transport:
     # Use.
 
     def __matmul__(self, pattern: Any) -> np.ndarray:
-        """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
+        """Relight: the picture (float32) under `pattern`, as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
         if self.couples:
             columns = [np.concatenate(columns)]
@@ -500,7 +502,7 @@ class Transport:
         return shape.pack([picture.get() for picture in pictures], self.camera_grid)
 
     def to_numpy(self) -> np.ndarray:
-        """T on the host, dense, without `mixing`: (M, N), (3, M, N) in colour, (3, 3, M, N) of blocks."""
+        """T on the host, dense, without `mixing`: (M, N), (3, M, N), or (3, 3, M, N) of blocks."""
         M, N = self.shape
         count = self.channels if self.blocks is None else 9
         checks.fits_host("T as an array", 8 * count * M * N)
@@ -522,7 +524,7 @@ class Transport:
 
 
 def check_transport(T: Any, *, square: bool = True, name: str = "T") -> Transport:
-    """T itself; refused, before any upload, if it is no Transport, or has no S and must be `square`."""
+    """Return T if it is a Transport, and has an S or need not be `square`; refuse others."""
     if not isinstance(T, Transport):
         raise InputTypeError(
             f"{name} is a {type(T).__name__}; it must be a ltcl.Transport(matrix, grid)"
