@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ltcl import images
-from ltcl.batch import frames
+from ltcl.cli.progress import Progress
 from ltcl.files import locked
 from ltcl.images.frames import open_frames, write_video
 
@@ -30,16 +30,16 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def interrupt_after(count: int, solve: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function that solves `count` batches, and is interrupted by Ctrl-C in the next."""
-    remaining = iter(range(count))
+def interrupt_at(frames_done: int) -> Callable[..., None]:
+    """Make a method for Progress that is interrupted by Ctrl-C when so many frames are done."""
+    show = Progress.__call__
 
-    def solve_or_end(*arguments: Any, **options: Any) -> Any:
-        if next(remaining, None) is None:
+    def show_or_end(progress: Progress, step: str, *counts: Any, **options: Any) -> None:
+        show(progress, step, *counts, **options)
+        if step == "frames" and progress.completed == frames_done:
             signal.raise_signal(signal.SIGINT)
-        return solve(*arguments, **options)
 
-    return solve_or_end
+    return show_or_end
 
 
 def test_patterns_of_a_folder_are_listed(program, transport, film, tmp_path):
@@ -56,7 +56,7 @@ def test_patterns_of_a_folder_are_listed(program, transport, film, tmp_path):
 def test_finished_frames_are_kept_after_ctrl_c(program, transport, film, tmp_path, monkeypatch):
     common = ["film", transport, film, "--out", tmp_path, "--batch", "3"]
     with monkeypatch.context() as patch:
-        patch.setattr(frames, "compensate", interrupt_after(2, frames.compensate))
+        patch.setattr(Progress, "__call__", interrupt_at(6))
         program(*common).refused("6 frame(s)", str(tmp_path), "--resume", code=130)
     listed = json.loads((tmp_path / "frames.json").read_text())
     assert len(listed["frames"]) == 6
