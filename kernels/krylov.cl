@@ -10,8 +10,8 @@
 #define ORTHOGONAL 9.5367431640625e-7f  // 2^-20, a cosine: below, a float32 inner product is rounding
 #define STATE 16
 #define SLOTS 8
-#define OWN(step, row) ((((step) & 1) * 4 + (row)) * k + s.origin + j)  // of column j in the copy to be read
-#define SQUARES (state + (STATE + step % SLOTS * (int)get_num_groups(0) + (int)get_group_id(0)) * k)
+#define OWN(iteration, row) ((((iteration) & 1) * 4 + (row)) * k + s.origin + j)  // of column j in the copy to be read
+#define SQUARES (state + (STATE + iteration % SLOTS * (int)get_num_groups(0) + (int)get_group_id(0)) * k)
 
 // A denominator beyond float32 gives NaN, which the residual tells, not a step of 0.
 static inline real divided(real a, real b)
@@ -65,7 +65,7 @@ kernel void krylov_subtract(
 // twice: <r, r>, alpha, 1 where there was no positive curvature. Columns rest where resting[column]; restart == 1 forgets p
 // and q. scratch: 2 more a column.
 kernel void krylov_cg(
-    int rows, int k, int slices, int step, int restart, global const int *resting, global const real *partials,
+    int rows, int k, int slices, int iteration, int restart, global const int *resting, global const real *partials,
     global real *state, global const real *w, global real *p, global real *q, global real *x, global real *r,
     local real *scratch)
 {
@@ -73,8 +73,8 @@ kernel void krylov_cg(
     local real *alphas = columns_totals(partials, slices, 2, 2, k, s, scratch, 0), *betas = alphas + s.width;
     EACH_COLUMN(j) {
         const real square = alphas[j], product = betas[j];
-        const real previous = state[OWN(step, 0)], last = state[OWN(step, 1)];
-        real broken = state[OWN(step, 2)];
+        const real previous = state[OWN(iteration, 0)], last = state[OWN(iteration, 1)];
+        real broken = state[OWN(iteration, 2)];
         bool moves = !resting[s.origin + j] && !(broken > 0);
         real beta = !restart && previous > 0 ? square / previous : 0;
         real curvature = beta == 0 ? product : product - beta * square / last;
@@ -87,9 +87,9 @@ kernel void krylov_cg(
         moves = moves && square != 0 && !(broken > 0);
         const real alpha = divided(square, curvature);
         if (get_group_id(0) == 0) {
-            state[OWN(step + 1, 0)] = moves ? square : previous;
-            state[OWN(step + 1, 1)] = moves ? alpha : last;
-            state[OWN(step + 1, 2)] = broken;
+            state[OWN(iteration + 1, 0)] = moves ? square : previous;
+            state[OWN(iteration + 1, 1)] = moves ? alpha : last;
+            state[OWN(iteration + 1, 2)] = broken;
         }
         alphas[j] = moves ? alpha : 0;
         betas[j] = beta;
@@ -125,7 +125,7 @@ kernel void krylov_cg(
 // half = r - alpha v, alpha = rho / <r*, v>, with the sums <r*, v> and the square it is compared with.
 // scratch: 2 more a column.
 kernel void krylov_half(
-    int rows, int k, int slices, int step, global const real *partials, global real *state, global const real *r,
+    int rows, int k, int slices, int iteration, global const real *partials, global real *state, global const real *r,
     global const real *v, global real *half_way, local real *scratch)
 {
     const share s = columns_share(rows, k);
@@ -133,8 +133,8 @@ kernel void krylov_half(
     EACH_COLUMN(j) {
         const real sigma = totals[j], square = totals[s.width + j];
         const bool lost = fabs(sigma) <= ORTHOGONAL * sqrt(square) * sqrt(state[AGAINST]);
-        const bool moves = state[OWN(step, 1)] <= FRESH && !(lost && isfinite(square) && isfinite(sigma));
-        totals[j] = moves ? divided(state[OWN(step, 0)], sigma) : 0;
+        const bool moves = state[OWN(iteration, 1)] <= FRESH && !(lost && isfinite(square) && isfinite(sigma));
+        totals[j] = moves ? divided(state[OWN(iteration, 0)], sigma) : 0;
         if (get_group_id(0) == 0)
             state[ALPHA] = totals[j];
     }
@@ -147,7 +147,7 @@ kernel void krylov_half(
 // x = x + alpha p + omega s, r = s - omega t, p = r + beta (p - omega v), with the sums <t, s>, <t, t>, <r*, s>,
 // <r*, t> and <s, s>; and the partial sums <g, p> and <p, p> of the next step, two a slice. scratch: 5 more a column.
 kernel void krylov_bicgstab(
-    int rows, int k, int slices, int step, global const real *partials, global real *state,
+    int rows, int k, int slices, int iteration, global const real *partials, global real *state,
     global real *next_partials, global const real *g, global const real *half_way, global const real *t,
     global const real *v, global real *p, global real *x, global real *r, local real *scratch)
 {
@@ -156,7 +156,7 @@ kernel void krylov_bicgstab(
     local real *alphas = totals, *omegas = totals + s.width, *betas = totals + 2 * s.width;
     EACH_COLUMN(j) {
         const real ts = totals[j], tt = totals[s.width + j], ss = totals[4 * s.width + j];
-        const real alpha = state[ALPHA], does = state[OWN(step, 1)];
+        const real alpha = state[ALPHA], does = state[OWN(iteration, 1)];
         const real omega = alpha == 0 || tt == 0 ? 0 : divided(ts, tt);
         const real rho = totals[2 * s.width + j] - omega * totals[3 * s.width + j];
         const real square = ss - omega * (2 * ts - omega * tt);  // |r|^2, or about that
@@ -164,12 +164,12 @@ kernel void krylov_bicgstab(
         const real goes = alpha == 0 ? (does == FRESH ? BROKEN : WAITS) : lost ? WAITS : GOES;
         const real then = does <= FRESH ? goes : does;
         if (get_group_id(0) == 0) {
-            state[OWN(step + 1, 0)] = rho;
-            state[OWN(step + 1, 1)] = then;
+            state[OWN(iteration + 1, 0)] = rho;
+            state[OWN(iteration + 1, 1)] = then;
         }
         alphas[j] = alpha;
         omegas[j] = omega;
-        betas[j] = then == GOES ? rho / state[OWN(step, 0)] * (alpha / omega) : 0;
+        betas[j] = then == GOES ? rho / state[OWN(iteration, 0)] * (alpha / omega) : 0;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     const real alpha = alphas[s.column], omega = omegas[s.column], beta = betas[s.column];
