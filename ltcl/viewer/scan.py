@@ -18,9 +18,9 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import Calibration, Project, Setup
-from ltcl.acquisition.agreement import CameraModel, find_deviation, sample
+from ltcl.acquisition.agreement import find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
-from ltcl.acquisition.rigs.folder import Shot
+from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.errors import LtclError
 from ltcl.store import BlockStore, load
 from ltcl.viewer import scan_files
@@ -286,8 +286,7 @@ class PhotographAgreement:
             samples.append(codes)
         if len({*seconds}) < 2:
             return None
-        camera = CameraModel(calibration.response, calibration.noise, calibration.offset)
-        deviation = find_deviation(samples, seconds, camera)
+        deviation = find_deviation(samples, seconds, calibration.camera)
         return deviation.describe(numbers) if deviation else None
 
 

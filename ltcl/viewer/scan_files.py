@@ -17,7 +17,8 @@ import numpy as np
 
 from ltcl import images
 from ltcl.acquisition.rig import to_unit
-from ltcl.acquisition.rigs.folder import Shot, read_photograph
+from ltcl.acquisition.rigs.photographs import read_photograph
+from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.acquisition.session import calibration_folder
 from ltcl.store import ArrayLog, BlockStore
 
