@@ -397,10 +397,7 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
 def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, options, text):
     out = str(tmp_path / "out")
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        assert (
-            main(["film", *map(str, (film / "T.npz", film / "in")), "--out", out, *options])
-            == 1
-        )
+        assert main(["film", *map(str, (film / "T.npz", film / "in")), "--out", out, *options]) == 1
     error = capsys.readouterr().err
     assert (text in error, error.count("\n")) == (True, 1), error
     assert not (tmp_path / "out").exists()
