@@ -22,7 +22,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Device
-from ltcl.device.vectors import rounded
+from ltcl.device.arrays import rounded
 from ltcl.errors import InputError
 from ltcl.operators.rows import RowOperator, Slab, cut
 
