@@ -26,7 +26,9 @@ import ltcl
 from _figures import Claim
 from _harness import options
 from ltcl.plots.page import OTHERS
-from ltcl.tasks import denoising
+from ltcl.tasks.denoising.bases import multiwavelets
+from ltcl.tasks.denoising.problem import DenoisingProblem
+from ltcl.tasks.denoising.shrinkage import refine, threshold_coefficients
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
@@ -62,13 +64,17 @@ def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
 
 def oracle(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
     """T denoised by Wiener factors and folds of the truth."""
-    Y, grids = T.to_numpy(), (T.grid, T.grid)
-    problem = denoising.Problem.of(Y, T.noise, 0, *grids)
+    Y = T.to_numpy()
+    problem = DenoisingProblem.from_entries(Y, T.noise, 0, T.grid, T.grid)
+    thresholded = threshold_coefficients(problem, multiwavelets(problem.grids), ignore)
     pilot = (exact * problem.gauge).astype(np.float32)
-    np.fill_diagonal(
-        pilot, np.diag(denoising.shrink(problem, denoising.multiwavelets(grids), None)[0])
-    )
-    return ltcl.Transport(problem.restore(denoising.refine(problem, pilot)[0], Y), T.grid)
+    np.fill_diagonal(pilot, np.diag(thresholded))
+    estimate = refine(problem, pilot, ignore)
+    return ltcl.Transport(problem.restore_entries(estimate.Z, Y), T.grid)
+
+
+def ignore(share: float) -> None:
+    """A step whose progress nobody watches."""
 
 
 def first_only(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:

@@ -28,7 +28,7 @@ from _figures import Claim
 from _harness import Options, options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
-from ltcl.tasks.separation import LARGEST_NEGATIVE
+from ltcl.tasks.plausibility import LARGEST_NEGATIVE
 
 ALBEDO, PROJECTOR = 0.5, (2.4, 1.2, 1.2)
 ROOMS = {"both walls": (1.0, 1.0), "unlit wall": (0.0, 1.0)}  # share of the gloss on each wall

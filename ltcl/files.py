@@ -191,7 +191,7 @@ def sweep(folder: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    """Whether a process of this host runs, be it somebody else's."""
+    """True if a process of this host runs, be it somebody else's."""
     try:
         os.kill(process, 0)  # asks, and does nothing
     except ProcessLookupError:
@@ -249,7 +249,7 @@ def _place_to_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _is_about(error: OSError, target: Path) -> bool:
-    """Whether an error is about `target` or its folders, not about a file that the block read."""
+    """True if an error is about `target` or its folders, not about a file that the block read."""
     if not isinstance(error.filename, (str, Path)):
         return True
     place = Path(error.filename)

@@ -30,7 +30,7 @@ LAYERS: list[set[str]] = [
     {"checks"},
     {"files"},
     {"images", "device"},
-    {"operators", "transport.frames", "batch.cluster"},
+    {"operators", "transport.frames", "transport.matrices", "batch.cluster"},
     {"theory"},
     {"solvers"},
     {"transport"},

@@ -30,7 +30,8 @@ def bound(S, exact_S):
 def one_channel(device, channel=1, keep=0.5, f=None):
     """One channel S F, the float64 S that it stands for, and the exact one."""
     R = two_sided(device, SCENES[channel].R, keep, seed=channel)
-    S, true = np.eye(N) + stands_for(R), np.eye(N) + SCENES[channel].R
+    S = np.eye(N) + stands_for(R)
+    true = np.eye(N) + SCENES[channel].R
     f = F[channel] if f is None else f
     return ScaledColumns(IdentityPlus(R, solution_error=bound(S, true)), f), S, true
 
@@ -56,7 +57,8 @@ def test_another_first_bounce_makes_another_S(device):
     ratio = F[1] / other
     assert T.error == pytest.approx(matrix.A.solution_error * ratio.max() / ratio.min())
     b = rng.normal(size=(N, 20))
-    x, off = np.linalg.solve(true * ratio, b), np.linalg.solve(S * ratio, b)
+    x = np.linalg.solve(true * ratio, b)
+    off = np.linalg.solve(S * ratio, b)
     assert np.all(np.linalg.norm(off - x, axis=0) <= T.error * np.linalg.norm(x, axis=0))
 
 
@@ -74,7 +76,7 @@ def test_masked_pixels_stay_dark(device):
 
 @pytest.mark.parametrize("task", [ltcl.compensate, ltcl.separate])
 def test_results_tell_of_which_T_they_are(device, task):
-    """A target that is met with T~ is missed with T by at most T~.error of T~ p: ||E S~^-1|| is below it."""
+    """A target that is met with T~ is missed with T by at most T~.error: ||E S~^-1|| is below it."""
     C, T = pair(device)
     desired = T @ rng.uniform(0.3, 0.7, GRID)
     with pytest.raises(InputError, match=r"rtol is 1e-06.* 0\.\d+.*exact=T"):
@@ -102,10 +104,8 @@ def test_tasks_beside_the_exact_one(device, channels, rtol, close):
         ours.pattern, theirs.pattern, rtol=0, atol=close
     )  # rtol is of the norm
     image = T @ rng.uniform(0.2, 0.8, GRID)
-    ours, theirs = (
-        ltcl.separate(C, image, 2, exact=T, rtol=rtol),
-        ltcl.separate(T, image, 2, method="direct"),
-    )
+    ours = ltcl.separate(C, image, 2, exact=T, rtol=rtol)
+    theirs = ltcl.separate(T, image, 2, method="direct")
     np.testing.assert_allclose(ours.direct, theirs.direct, rtol=max(close, 1e-5))
     np.testing.assert_allclose(ours.bounces, theirs.bounces, atol=max(close, 1e-5))
     assert ours.reciprocity_defect == theirs.reciprocity_defect < 1e-6
@@ -118,23 +118,23 @@ def test_beyond_the_projector(device):
     """Least squares within the bounds takes products with the transpose, compressed ones or exact."""
     C, T = pair(device)
     desired = rng.uniform(0.0, 3.0, GRID)
-    alone, matrix = ltcl.compensate(C, desired, rtol=C.error), C.operators[0].to_dense()
+    alone = ltcl.compensate(C, desired, rtol=C.error)
+    matrix = C.operators[0].to_dense()
     assert alone.clipped > 0.0
     missed = np.linalg.norm(desired.ravel() - matrix @ alone.pattern.ravel()) / np.linalg.norm(
         desired
     )
     assert alone.error == pytest.approx(missed, rel=1e-3)
     assert alone.gap <= C.error
-    ours, theirs = (
-        ltcl.compensate(C, desired, exact=T, rtol=1e-4),
-        ltcl.compensate(T, desired, rtol=1e-4),
-    )
+    ours = ltcl.compensate(C, desired, exact=T, rtol=1e-4)
+    theirs = ltcl.compensate(T, desired, rtol=1e-4)
     assert ours.error == pytest.approx(theirs.error, abs=2e-4)
 
 
 def test_what_does_not_lie_beside(device, small_device):
     C, T = pair(device)
-    rgb, matrix = pair(device, (0, 1, 2))[1], T.matrices[0]
+    rgb = pair(device, (0, 1, 2))[1]
+    matrix = T.matrices[0]
     wrong: list[tuple[Any, type[LtclError], str]] = [
         (matrix, InputTypeError, "exact is a ndarray"),
         (T.interreflection, InputTypeError, "exact is a IdentityPlus"),
@@ -160,7 +160,7 @@ def test_what_does_not_lie_beside(device, small_device):
 
 
 def test_analysis_by_products(device):
-    """What needs the sight of entries is unknown; the rest is that of the exact T up to what was dropped."""
+    """Results that need entries are unknown; others are those of the exact T, up to its errors."""
     ours, theirs = (ltcl.analyze(one).channels[0] for one in pair(device, keep=0.999))
     assert np.isnan(
         [ours.norm_inf, ours.energy.negative_entries, ours.products["gauss_seidel"]]
@@ -173,7 +173,7 @@ def test_analysis_by_products(device):
 
 
 def test_tasks_accept_a_T_without_any_bound(device):
-    """Infinite: nothing is known of solutions, so that only exact= helps; relighting and checks go on."""
+    """An infinite bound tells nothing of solutions, so that only exact= helps; others go on."""
     R = two_sided(device, SCENES[1].R, 0.5)
     C = ltcl.Transport(
         ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1]), GRID, first_bounce=F[1]
@@ -194,7 +194,8 @@ def test_what_was_dropped_is_not_taken_for_gloss(device):
     core = W.to_dense() @ R @ W.to_dense().T
     core = CSR(device, scipy.sparse.csr_array(np.where(np.abs(core) < 1e-3, 0.0, core)))
     compressed = Compressed(core, W, W)
-    S, F = np.eye(len(R)) + compressed.to_dense(), T.first_bounce
+    S = np.eye(len(R)) + compressed.to_dense()
+    F = T.first_bounce
     matrix = ScaledColumns(IdentityPlus(compressed, solution_error=bound(S, np.eye(len(R)) + R)), F)
     C = ltcl.Transport(matrix, T.grid, first_bounce=F)
     found = ltcl.separate(C, T @ np.ones(T.grid), 1, rtol=0.1)

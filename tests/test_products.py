@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What `bench/products.py` multiplies: R by mirrors is the scene's, and thresholds cost what they claim."""
+"""Matrices of `bench/products.py`: R by mirrors is the scene's, thresholds cost as stated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BENCH = Path(__file__).resolve().parents[1] / "bench"
 
 @pytest.fixture(autouse=True)
 def benches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their helpers are imported from beside them."""
+    """Make the helpers of benches importable, which lie beside them."""
     monkeypatch.syspath_prepend(str(BENCH))
 
 
@@ -36,7 +36,8 @@ def test_R_by_mirrors_is_that_of_the_corner(n: int, albedo: float) -> None:
 def test_no_more_is_kept_than_an_error_takes(
     shape: tuple[int, int], tolerance: float, make
 ) -> None:
-    bench, rng = importlib.import_module("_coefficients"), np.random.default_rng(5)
+    bench = importlib.import_module("_coefficients")
+    rng = np.random.default_rng(5)
     dense = (rng.choice([-1, 1], shape) * 2.0 ** -rng.uniform(0, 20, shape)).astype(np.float32)
     x = rng.random(shape[1])
     y = dense @ x

@@ -75,7 +75,7 @@ def test_the_page_on_noise_runs(device, tmp_path, monkeypatch, capsys):
     for T in (names["T"], names["twice"]):
         np.testing.assert_allclose(T.noise.floor, names["sigma"], rtol=0.15)
     np.testing.assert_array_equal(names["holes"].masked, names["unlit"])
-    assert "3 of 288 pixels" in names["holes"].dark
+    assert "3 of 288 pixels" in names["holes"].dark_note
     assert names["errors"]["denoised"] < 0.5 * names["errors"]["raw"]
     assert names["within"] == pytest.approx(0.68, abs=0.06)
     assert (names["verdict"].compensation, names["verdict"].bounces) == (True, False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""No solve and no task lets a warning of NumPy or SciPy out: what is wrong is a status or an error."""
+"""No solve and no task lets a warning of NumPy or SciPy out: failures are a status or an error."""
 
 from typing import Any
 
@@ -49,7 +49,8 @@ def test_solves(case, method):
     try:
         solution = ltcl.solve(S, b, method, throw=False, maxiter=60, **options)
     except LtclError:
-        return  # one that says so, which is no warning
+        # A refusal is no warning.
+        return
     assert solution.x.shape == b.shape
 
 

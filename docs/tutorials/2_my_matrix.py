@@ -79,7 +79,7 @@ figure = pictures({"one column\n× 20": column, "one row\n× 20": row, "all pixe
 # %%
 # No light leaves the three pixels that miss the walls. ltcl found them, and will not use them:
 
-print(T.dark)
+print(T.dark_note)
 
 # %%
 # Is it good enough?

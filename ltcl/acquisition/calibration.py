@@ -22,7 +22,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.geometry import Resampling
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
 from ltcl.errors import FileError

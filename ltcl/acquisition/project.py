@@ -39,7 +39,7 @@ from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.settings import ScanSettings
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
-from ltcl.store import BlockStore, Parts, formats, load
+from ltcl.store import BlockStore, CompressedRecord, formats, load
 
 FILE, STORE = "acquisition.toml", "transport.zarr"
 _NOISELESS = 1e9  # electrons
@@ -222,7 +222,7 @@ def _make(folder: Path, table: dict[str, Any], closed: bool) -> Any:
             table.setdefault("camera_grid", T.camera_grid)
         else:
             record = formats.read(folder / str(camera_map))
-            if isinstance(record, Parts):
+            if isinstance(record, CompressedRecord):
                 raise InputError(
                     f"camera_map is {camera_map}, a compressed transport; it must be a matrix"
                 )

@@ -35,7 +35,7 @@ from ltcl.acquisition.session import check_same, check_same_rig
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, ScanRefused
 from ltcl.files import as_path
-from ltcl.store import BlockStore, Parts, StoredRows, load
+from ltcl.store import BlockStore, CompressedRecord, StoredRows, load
 from ltcl.store.block_store import check_place
 from ltcl.transport.transport import Transport
 
@@ -292,7 +292,7 @@ def scan(store: BlockStore, shots: Shots, settings: ScanSettings, progress: Prog
         arrays = adaptive.arrays(core, calibration.mixing, settings.sigmas) | pictures.noise(
             core.variances
         )
-        store.finalize(compressed=Parts(arrays))
+        store.finalize(compressed=CompressedRecord(arrays))
         progress("scan", log.done, log.done)
         return
     code, done = columns.code_of(strategy, pictures.grid, settings.order), 0

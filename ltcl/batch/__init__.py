@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ltcl.batch.frames import CompensatedFrames, compensate_frames
-    from ltcl.batch.manifest import Record
+    from ltcl.batch.manifest import FrameRecord
     from ltcl.batch.scenes import map
 
-__all__ = ["CompensatedFrames", "Record", "compensate_frames", "map"]
+__all__ = ["CompensatedFrames", "FrameRecord", "compensate_frames", "map"]
 
 # Loaded at the first use: tasks import `ltcl.batch.cluster`, and films need the tasks.
 _MODULES = {
     "CompensatedFrames": "frames",
     "compensate_frames": "frames",
-    "Record": "manifest",
+    "FrameRecord": "manifest",
     "map": "scenes",
 }
 

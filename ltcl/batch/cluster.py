@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import itertools
 import logging
 import math
 import os
@@ -31,17 +30,19 @@ if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
-_TRIES = 4  # of an item whose workers are lost, before it is taken for the reason
-_PATIENCE = 60.0  # seconds without a worker: what was killed has been started again by then
-_PERIOD = 1.0  # seconds between two looks at the list of workers
-_PCI = (
-    "pci_domain_id_nv",
-    "pci_bus_id_nv",
-    "pci_slot_id_nv",
-)  # what CUDA_VISIBLE_DEVICES does not renumber
 
-# Of a worker's process: functions of streams, by tokens, pickled until the first task; one device,
-# one task.
+# Tries of an item whose workers are lost, before the item is taken for the reason.
+MAX_TRIES = 4
+# Seconds without a worker before a stream ends: what was killed has been started again by then.
+PATIENCE = 60.0
+# Seconds between two looks at the list of workers.
+PERIOD = 1.0
+# Properties of an NVIDIA device that CUDA_VISIBLE_DEVICES does not renumber.
+PCI_ADDRESS = ("pci_domain_id_nv", "pci_bus_id_nv", "pci_slot_id_nv")
+MAX_PORT = 65535
+
+# In a worker's process: the functions of streams by token, pickled until their first task. The lock
+# lets one task run at a time, as there is one device.
 _functions: dict[str, Any] = {}
 _running = threading.Lock()
 
@@ -61,26 +62,27 @@ def stream(
     ----------
     client : distributed.Client, or None: calls are made here, one after the other
     function : callable(item)
-        Sent to each worker once, with all it holds, and called by one thread at a time. A worker
-        that cannot unpickle it takes no work.
+        It is sent to each worker once, with all it holds, and called by one thread at a time. A
+        worker that cannot unpickle it takes no work.
     items : iterable
     window : int
-        Items on the way for each worker: one is computed, others are there when it ends.
+        Number of items on the way for each worker: one is computed, others are there when it ends.
     share_gpu : bool
-        Whether several workers may use one GPU; else all but the first are excluded. A CPU can be
-        shared.
+        Let several workers use one GPU; else all but the first are excluded. A CPU is always shared.
     errors : bool
-        Whether the error of an item is yielded in its place, and not raised, which ends the stream.
-
-    A worker that is excluded is named with the reason in a warning.
+        Yield the error of an item in its place, instead of raising it, which ends the stream.
 
     Raises
     ------
     ClusterError
         No worker can take part or, for a minute, none is left; the scheduler is lost.
     LtclError
-        Of `function`, at the place of its item; of one that ends its workers, or whose result
+        `function` raised it, at the place of its item; or an item ends its workers, or its result
         cannot be sent.
+
+    Notes
+    -----
+    A worker that is excluded is named with the reason in a warning.
 
     Examples
     --------
@@ -90,16 +92,24 @@ def stream(
     [1, 2, 3]
     """
     if client is None:
-        yield from (_attempt(function, item) for item in items) if errors else map(function, items)
+        for item in items:
+            yield _attempt(function, item) if errors else function(item)
         return
-    crew = _Crew(client, require(client), _pickled(function), share_gpu, errors)
     window = checks.count("window", window)
+    crew = _Crew(
+        client=client,
+        scheduler=require(client),
+        function=_pickled(function),
+        share_gpu=share_gpu,
+        yields_errors=errors,
+    )
     try:
         for item in items:
             while crew.tasks and len(crew.tasks) >= window * len(crew.ready):
                 yield crew.result()
-            crew.tasks.append(_Task(_pickled(item)))
-            crew.submit(crew.tasks[-1])
+            task = _Task(_pickled(item))
+            crew.tasks.append(task)
+            crew.submit(task)
         while crew.tasks:
             yield crew.result()
     finally:
@@ -107,7 +117,7 @@ def stream(
 
 
 def _attempt(function: Callable[[Any], Any], item: Any) -> Any:
-    """Its result, or an LtclError without what it holds, which may lie on the device."""
+    """The result, or an LtclError without what it holds, which may lie on the device."""
     try:
         return function(item)
     except LtclError as error:
@@ -115,17 +125,18 @@ def _attempt(function: Callable[[Any], Any], item: Any) -> Any:
 
 
 def is_there(client: Any, path: Any) -> bool:
-    """Whether all workers see a file or folder; None is no file."""
+    """True if all workers see a file or folder; None is no file."""
     require(client)
-    return path is not None and all(client.run(os.path.exists, path, on_error="ignore").values())
+    if path is None:
+        return False
+    return all(client.run(os.path.exists, path, on_error="ignore").values())
 
 
 def require(client: Any) -> str:
-    """Address of its scheduler; refuses what is no connected `distributed.Client`, and a missing Dask."""
+    """Address of the scheduler; refuses what is no connected `distributed.Client`, and a missing Dask."""
     if not isinstance(client, _distributed().Client):
-        raise InputTypeError(
-            f"client is a {type(client).__name__}; it must be a distributed.Client"
-        )
+        kind = type(client).__name__
+        raise InputTypeError(f"client is a {kind}; it must be a distributed.Client")
     if client.status != "running":
         raise ClusterError(f"client is {client.status}; it must be connected to a scheduler")
     return client.scheduler.address
@@ -135,33 +146,43 @@ def require(client: Any) -> str:
 def connect(
     cluster: str, workers: int | None = None, device: str | None = None
 ) -> Iterator[Client]:
-    """A client of the scheduler at an address or, "local", of `workers` processes that end with the block.
+    """Connect to a scheduler, or start worker processes that end with the block.
 
-    These have a GPU each; or share `device`, by default that of LTCL_DEVICE, or the CPU, each with
-    all of its cores: with fewer, sums are rounded in another order than without a cluster. By
-    default they are as many as there are GPUs, or one. InputError for what is no address,
-    ClusterError where nothing answers.
+    Parameters
+    ----------
+    cluster : str
+        The scheduler's host:port, or "local" for processes on this machine.
+    workers : int, optional
+        Number of local processes; as many as there are GPUs, or one, when not given.
+    device : str, optional
+        The device that local workers share, LTCL_DEVICE when not given. Without either they have a
+        GPU each, or share the CPU, each with all of its cores: with fewer, sums are rounded in
+        another order than without a cluster.
+
+    Raises
+    ------
+    InputError
+        `cluster` is no address, or has workers of its own.
+    ClusterError
+        Nothing answers at the address.
     """
     distributed = _distributed()
     from dask import config
 
-    port = cluster.rpartition(":")[2]
-    if cluster != "local" and not (
-        port.isdecimal() and int(port) < 1 << 16
-    ):  # Dask would try for a minute
-        raise InputError(f"cluster is {cluster!r}; it must be 'local' or a scheduler's host:port")
-    if cluster != "local" and workers is not None:
-        raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
-    # Else a worker that takes 15 s to start again, on a busy machine, is given up.
-    patience = {"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}
-    place = _processes(workers, device) if cluster == "local" else contextlib.nullcontext(cluster)
-    quiet = distributed.utils.silence_logging_cmgr(
-        logging.CRITICAL
-    )  # of whoever is lost: one error says it
+    is_local = cluster == "local"
+    if not is_local:
+        _check_address(cluster)
+        if workers is not None:
+            raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
+    # Without this, a worker that takes 15 s to start again, on a busy machine, is given up.
+    patience = {"distributed.deploy.lost-worker-timeout": f"{PATIENCE}s"}
+    place = _processes(workers, device) if is_local else contextlib.nullcontext(cluster)
+    # Lost workers are not logged: one error names them.
+    quiet = distributed.utils.silence_logging_cmgr(logging.CRITICAL)
     with place as address, config.set(patience), quiet:
         try:
-            if cluster != "local":
-                distributed.comm.resolve_address(cluster)  # else Dask tries for a while
+            if not is_local:
+                distributed.comm.resolve_address(cluster)  # fails at once, where Dask would wait
             client = distributed.Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())
@@ -172,21 +193,37 @@ def connect(
             yield client
 
 
+def _check_address(cluster: str) -> None:
+    """Refuse at once what is no host:port; Dask would try for a minute."""
+    port = cluster.rpartition(":")[2]
+    if not port.isdecimal() or int(port) > MAX_PORT:
+        raise InputError(f"cluster is {cluster!r}; it must be 'local' or a scheduler's host:port")
+
+
 def _processes(workers: int | None, device: str | None) -> Any:
     """Workers on this machine, each with an environment of its own, unlike those of a LocalCluster."""
-    distributed, quiet = _distributed(), logging.CRITICAL
-    device = device or os.environ.get("LTCL_DEVICE")
-    gpus = [] if device else [each.index for each in list_devices() if each.kind == "gpu"]
-    count = checks.count("workers", max(1, len(gpus)) if workers is None else workers)
-    devices = itertools.cycle(gpus or [device or open_device().description.index])
-    local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-    alike = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": quiet}
-    environments = ({"LTCL_DEVICE": next(devices)} for _ in range(count))
-    nannies = (
-        {"cls": distributed.Nanny, "options": {**alike, "env": each}} for each in environments
-    )
-    scheduler = {"cls": distributed.Scheduler, "options": local}
-    return distributed.SpecCluster(dict(enumerate(nannies)), scheduler, silence_logs=quiet)
+    distributed = _distributed()
+    devices = _worker_devices(device or os.environ.get("LTCL_DEVICE"))
+    count = len(devices) if workers is None else checks.count("workers", workers)
+    loopback = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    options = {**loopback, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
+    nannies = {}
+    for number in range(count):
+        environment = {"LTCL_DEVICE": devices[number % len(devices)]}
+        nannies[number] = {
+            "cls": distributed.Nanny,
+            "options": {**options, "env": environment},
+        }
+    scheduler = {"cls": distributed.Scheduler, "options": loopback}
+    return distributed.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
+
+
+def _worker_devices(requested: str | None) -> list[str]:
+    """Indices of the devices that workers take in turn."""
+    if requested:
+        return [requested]
+    gpus = [description.index for description in list_devices() if description.kind == "gpu"]
+    return gpus or [open_device().description.index]
 
 
 def _distributed() -> Any:
@@ -198,28 +235,34 @@ def _distributed() -> Any:
 
 
 def _pickled(
-    value: Any, what: str = "what workers need cannot be sent to them", **how: Any
+    value: Any, problem: str = "what workers need cannot be sent to them", **options: Any
 ) -> bytes:
-    """Bytes: Dask looks for no keys in them, and a worker reads them when it has ltcl."""
+    """Pickle a value: Dask looks for no keys in bytes, and a worker reads them when it has ltcl."""
     from distributed.protocol.pickle import dumps
 
     try:
-        return dumps(value, **how)
-    except Exception as error:  # of whatever it holds
+        return dumps(value, **options)
+    except Exception as error:  # whatever the value holds may raise anything
         reason = " ".join(str(error).split())
-        raise InputTypeError(f"{what}: {reason:.200}") from error
+        raise InputTypeError(f"{problem}: {reason:.200}") from error
 
 
 @dataclass(eq=False)
 class _Task:
+    """One item on its way."""
+
     item: bytes
     future: Any = None
     data: Any = None  # the item on a worker
-    workers: frozenset[str] = frozenset()  # that may do it
+    workers: frozenset[str] = frozenset()  # those that may do it
     tries: int = 0
 
+    def submit_again(self) -> None:
+        """Forget the workers, so that the task counts as lost."""
+        self.workers = frozenset()
 
-@dataclass(eq=False)
+
+@dataclass(eq=False, kw_only=True)
 class _Crew:
     """The workers of a stream, and its tasks on them."""
 
@@ -227,33 +270,33 @@ class _Crew:
     scheduler: str  # its address
     function: bytes
     share_gpu: bool
-    errors: bool  # whether they are results
+    yields_errors: bool
     tasks: deque[_Task] = field(default_factory=deque)  # in order, until their results are yielded
     ready: dict[str, str | None] = field(
         default_factory=dict
     )  # addresses of workers, and their GPUs
     excluded: set[str] = field(default_factory=set)
     token: str = field(default_factory=lambda: secrets.token_hex(8))
-    lost: bool = False  # whether some worker has gone, which may be started again
-    seen: float = field(default_factory=time.monotonic)  # when some worker was last there
-    looked: float = -math.inf
+    has_lost_workers: bool = False  # they may be started again
+    last_seen: float = field(default_factory=time.monotonic)  # when some worker was there
+    last_look: float = -math.inf
 
     def submit(self, task: _Task) -> None:
-        """Send a task to the workers that are ready, when there are some."""
+        """Send a task to the workers that are ready, as soon as there are some."""
         self.release(task)
         self.look()
         while not self.ready:
-            time.sleep(_PERIOD / 10)
+            time.sleep(PERIOD / 10)
             self.look()
-        task.workers, task.tries, argument = frozenset(self.ready), task.tries + 1, task.item
-        rules: Any = {"workers": [*task.workers]}
-        # An argument stays in memory, here and on the scheduler: Dask keeps a thousand messages.
-        with contextlib.suppress(
-            OSError, KeyError
-        ):  # of workers that have gone, or are short of memory
-            argument = task.data = self.client.scatter(
-                task.item, hash=False, timeout=_PERIOD, **rules
-            )
+        task.workers = frozenset(self.ready)
+        task.tries += 1
+        rules: Any = {"workers": list(task.workers)}
+        argument: Any = task.item
+        # An argument stays in memory, here and on the scheduler: Dask keeps a thousand messages. So
+        # the item is scattered, unless its workers have gone or are short of memory.
+        with contextlib.suppress(OSError, KeyError):
+            task.data = self.client.scatter(task.item, hash=False, timeout=PERIOD, **rules)
+            argument = task.data
         task.future = self.client.submit(_work, self.token, argument, pure=False, **rules)
 
     def release(self, task: _Task) -> None:
@@ -264,125 +307,183 @@ class _Crew:
         task.data = None
 
     def result(self) -> Any:
-        """What the first task gives, however many workers it takes."""
-        from distributed import CancelledError, KilledWorker, wait
-
-        task, patience, result = self.tasks[0], _PERIOD, None
-        while True:
+        """Result of the first task, however many workers it takes."""
+        task = self.tasks[0]
+        patience = PERIOD
+        outcome = None
+        while outcome is None:
             self.look()
-            there = self.ready.keys()
-            lost = [
-                each for each in self.tasks if not each.workers & there or each.future.cancelled()
-            ]
-            if task in lost and task.tries == _TRIES:
+            if not self._submit_lost(task):
                 error = ClusterError(
-                    f"an item lost its workers {_TRIES} times; it may be what ends them"
+                    f"an item lost its workers {MAX_TRIES} times; perhaps it ends them"
                 )
+                outcome = _Outcome(error=error)
                 break
-            for each in lost:  # with the item, or all that may do it: Dask must not choose others
-                if (
-                    each is task or each.tries < _TRIES - 1
-                ):  # the last try alone: others may end workers
-                    self.submit(each)
             try:
-                with self.client.as_current():
-                    wait(
-                        task.future, timeout=_PERIOD
-                    )  # `result` that waits in vain leaves tracebacks behind
-                error, refusal = (
-                    task.future.exception() if task.future.status == "error" else None,
-                    None,
-                )
-                if isinstance(error, KilledWorker):
-                    raise error
-                if error is None:
-                    result, refusal = task.future.result(timeout=patience)
-            except (OSError, CancelledError, KilledWorker) as failure:
-                if not isinstance(failure, TimeoutError):
-                    self.looked, task.workers = -math.inf, frozenset()  # look, and submit it again
-                elif task.future.status == "finished":  # large, or on a worker that has died
+                outcome = self._wait(task, patience)
+            except TimeoutError:
+                if task.future.status == "finished":  # large, or on a worker that has died
                     patience *= 2.0
-                continue
-            if refusal is None:
-                break
-            self.admit(*refusal)
-            task.workers, task.tries = frozenset(), 0
+            except (OSError, *_lost_worker_errors()):
+                self.last_look = -math.inf  # look at once, and submit it again
+                task.submit_again()
+            if outcome is not None and outcome.refusal is not None:
+                self.admit(*outcome.refusal)
+                task.submit_again()
+                task.tries = 0
+                outcome = None
         self.release(self.tasks.popleft())
-        if error is not None and not (self.errors and isinstance(error, LtclError)):
-            raise error
-        return result if error is None else error
+        if outcome.error is None:
+            return outcome.result
+        if self.yields_errors and isinstance(outcome.error, LtclError):
+            return outcome.error
+        raise outcome.error
+
+    def _submit_lost(self, first: _Task) -> bool:
+        """Submit the tasks that have lost all their workers; False where the first has no try left."""
+        lost = []
+        for task in self.tasks:
+            has_workers = bool(task.workers & self.ready.keys())
+            if not has_workers or task.future.cancelled():
+                lost.append(task)
+        if first in lost and first.tries == MAX_TRIES:
+            return False
+        for task in lost:
+            # The last try is made alone: other items may have ended the workers.
+            if task is first or task.tries < MAX_TRIES - 1:
+                self.submit(task)
+        return True
+
+    def _wait(self, task: _Task, patience: float) -> _Outcome | None:
+        """Wait for a task for a while; raises TimeoutError, or what says that its worker is lost."""
+        from distributed import KilledWorker, wait
+
+        with self.client.as_current():
+            wait(
+                task.future, timeout=PERIOD
+            )  # `result` that waits in vain leaves tracebacks behind
+        if task.future.status == "error":
+            error = task.future.exception()
+            if isinstance(error, KilledWorker):
+                raise error
+            return _Outcome(error=error)
+        result, refusal = task.future.result(timeout=patience)
+        return _Outcome(result=result, refusal=refusal)
 
     def leave(self) -> None:
-        """Leave nothing on the scheduler and the workers, also where a traceback holds this."""
+        """Leave nothing on the scheduler and the workers, also where a traceback holds this object."""
         self.tasks.clear()
         if self.ready and self.client.status == "running":
             with contextlib.suppress(OSError):
-                self.client.run(_leave, self.token, workers=[*self.ready], on_error="ignore")
+                workers = list(self.ready)
+                self.client.run(_leave, self.token, workers=workers, on_error="ignore")
 
     def look(self) -> None:
         """Forget workers that have gone, ask new ones; ClusterError where none can be expected."""
-        running = self.client.status == "running"
-        if running and self.ready and time.monotonic() < self.looked + _PERIOD:
+        is_running = self.client.status == "running"
+        is_recent = time.monotonic() < self.last_look + PERIOD
+        if is_running and self.ready and is_recent:
             return
-        self.looked, there, answers = time.monotonic(), [], None
+        self.last_look = time.monotonic()
+        present: list[str] = []
+        answers = None
         with contextlib.suppress(OSError):
-            if running:
-                there = [*self.client.nthreads()]
-                new = [
-                    each for each in there if each not in self.ready and each not in self.excluded
-                ]
-                question = importlib.import_module("ltcl").__version__, self.token, self.function
-                # Dask sends it to the scheduler even where nobody is asked, and a function may be
-                # large.
-                answers = (
-                    self.client.run(_ask(), *question, workers=new, on_error="return")
-                    if new
-                    else {}
-                )
+            if is_running:
+                present = list(self.client.nthreads())
+                answers = self._ask_new(present)
         if answers is None:
             raise ClusterError(f"the scheduler at {self.scheduler} was lost")
-        self.lost |= not self.ready.keys() <= {*there}
-        self.ready = {address: gpu for address, gpu in self.ready.items() if address in there}
-        self.excluded &= {*there}
+        lost = self.ready.keys() - set(present)
+        if lost:
+            self.has_lost_workers = True
+        for address in lost:
+            del self.ready[address]
+        self.excluded.intersection_update(present)
         for address, answer in answers.items():
             self.admit(address, answer)
         if self.ready:
-            self.seen = time.monotonic()
-        elif (self.excluded and not self.lost) or time.monotonic() > self.seen + _PATIENCE:
-            excluded = (
-                f"; {len(self.excluded)} take no work, for the reasons above"
-                if self.excluded
-                else ""
-            )
-            raise ClusterError(f"no worker is left at {self.scheduler}{excluded}")
+            self.last_seen = time.monotonic()
+        else:
+            self._check_expected()
+
+    def _ask_new(self, present: list[str]) -> dict[str, Any]:
+        """Answers of the workers that were not asked yet, by address."""
+        known = self.ready.keys() | self.excluded
+        new = [address for address in present if address not in known]
+        if (
+            not new
+        ):  # Dask would send the function to the scheduler all the same, and it may be large
+            return {}
+        version = importlib.import_module("ltcl").__version__
+        return self.client.run(
+            _ask(), version, self.token, self.function, workers=new, on_error="return"
+        )
+
+    def _check_expected(self) -> None:
+        """ClusterError where no worker is there, and none can be expected to come."""
+        is_hopeless = bool(self.excluded) and not self.has_lost_workers
+        if not is_hopeless and time.monotonic() <= self.last_seen + PATIENCE:
+            return
+        reasons = ""
+        if self.excluded:
+            reasons = f"; {len(self.excluded)} take no work, for the reasons above"
+        raise ClusterError(f"no worker is left at {self.scheduler}{reasons}")
 
     def admit(self, address: str, answer: Any) -> None:
-        """A worker is ready, or excluded and named once; neither where it has gone or is asked again."""
+        """Make a worker ready, or exclude it and name it once.
+
+        `answer` is its device, or the reason why it can take no work, empty where it is asked again.
+        """
         self.ready.pop(address, None)
+        reason = answer
         if isinstance(answer, tuple):
             name, gpu = answer
-            others = [other for other, its in self.ready.items() if its == gpu]
-            if gpu is None or not others or self.share_gpu:
+            sharing = [other for other, other_gpu in self.ready.items() if other_gpu == gpu]
+            if gpu is None or not sharing or self.share_gpu:
                 self.ready[address] = gpu
                 return
-            answer = f"{name} is the GPU of worker {others[0]}; give it an LTCL_DEVICE, or share_gpu=True"
-        if answer and not isinstance(answer, OSError) and address not in self.excluded:
+            advice = "give it an LTCL_DEVICE, or share_gpu=True"
+            reason = f"{name} is the GPU of worker {sharing[0]}; {advice}"
+        has_gone = isinstance(reason, OSError)
+        if reason and not has_gone and address not in self.excluded:
             self.excluded.add(address)
-            logger.warning("worker %s takes no work: %s", address, " ".join(str(answer).split()))
+            text = " ".join(str(reason).split())
+            logger.warning("worker %s takes no work: %s", address, text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Outcome:
+    """How a task ended: a result, an error, or a worker that has no such function and why."""
+
+    result: Any = None
+    error: BaseException | None = None
+    refusal: tuple[str, str] | None = None
+
+
+def _lost_worker_errors() -> tuple[type[BaseException], ...]:
+    """Exceptions by which Dask says that the worker of a task is lost."""
+    from distributed import CancelledError, KilledWorker
+
+    return CancelledError, KilledWorker
 
 
 # What runs on workers
 
 
 def _ask() -> Callable[..., Any]:
-    """Keeps the function of a stream, if it can; sent as code: a worker may have another ltcl, or none."""
+    """A function that keeps the function of a stream, if the worker can.
+
+    It is sent as code: a worker may have another ltcl, or none.
+    """
 
     def ask(version: str, token: str, function: bytes) -> Any:
         try:
-            if (theirs := importlib.import_module("ltcl").__version__) != version:
-                return f"it has ltcl {theirs}, and the client {version}"
+            version_there = importlib.import_module("ltcl").__version__
+            if version_there != version:
+                return f"it has ltcl {version_there}, and the client {version}"
             module: Any = importlib.import_module("ltcl.batch.cluster")
-            answer, module._functions[token] = module.describe(), function
+            answer = module.describe()
+            module._functions[token] = function
             return answer
         except Exception as error:  # noqa: BLE001 - whatever its ltcl or its driver raises
             return f"{type(error).__name__}: {error}"
@@ -391,12 +492,15 @@ def _ask() -> Callable[..., Any]:
 
 
 def describe() -> tuple[str, str | None]:
-    """Name of the device, and of a GPU what no other has; DeviceError where there is no device."""
+    """Name of the device, and of a GPU a text that no other has; DeviceError without a device."""
     device = open_device()
+    if device.kind != "gpu":
+        return device.name, None
     place = [device.description.index]
-    with contextlib.suppress(AttributeError, device.cl.Error):  # of other drivers than NVIDIA's
-        place = [str(getattr(device.handle, name)) for name in _PCI]
-    return device.name, f"{platform.node()} {' '.join(place)}" if device.kind == "gpu" else None
+    # Drivers other than NVIDIA's lack the address on the bus.
+    with contextlib.suppress(AttributeError, device.cl.Error):
+        place = [str(getattr(device.handle, name)) for name in PCI_ADDRESS]
+    return device.name, f"{platform.node()} {' '.join(place)}"
 
 
 def _work(token: str, item: bytes) -> tuple[Any, tuple[str, str] | None]:
@@ -405,19 +509,18 @@ def _work(token: str, item: bytes) -> tuple[Any, tuple[str, str] | None]:
     from distributed.protocol.pickle import loads
 
     with _running:
-        if token not in _functions:  # started again, at the same address
+        if token not in _functions:  # the worker was started again, at the same address
             return None, (get_worker().address, "")
         try:
             if isinstance(_functions[token], bytes):
                 _functions[token] = loads(_functions[token])
-        except Exception as error:  # noqa: BLE001 - of whatever reads a part of it
+        except Exception as error:  # noqa: BLE001 - whatever reads a part of it raises
             return None, (get_worker().address, f"{type(error).__name__}: {error}")
         result = _attempt(_functions[token], loads(item))
         if isinstance(result, LtclError):
             raise result
-        _pickled(
-            result, "the result cannot be sent from a worker", buffer_callback=lambda buffer: False
-        )
+        problem = "the result cannot be sent from a worker"
+        _pickled(result, problem, buffer_callback=lambda buffer: False)
         return result, None
 
 

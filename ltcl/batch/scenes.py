@@ -21,17 +21,24 @@ def map(
     share_gpu: bool = False,
     progress: Callable[[str, int, int | None], object] | None = None,
 ) -> list[Any]:
-    """Results of a function of each scene, in order; one that fails is named, and the rest go on.
+    """Results of a function of each scene, in order; a scene that fails is named, and the rest go on.
 
-    `function` gets a path, or whatever `scenes` hold. Without a `client` it is called here, else on
-    workers, which then have to see the paths; `share_gpu` is as of `ltcl.cluster.stream`.
-    `progress("scenes", done, total)` is called after each.
+    Parameters
+    ----------
+    function : callable(scene)
+    scenes : iterable of paths, or of whatever `function` takes
+    client : distributed.Client, optional
+        Calls are made on its workers, which have to see the paths; else here.
+    share_gpu : bool
+        As in `ltcl.cluster.stream`.
+    progress : callable("scenes", done, total), optional
+        Called after each scene.
 
     Raises
     ------
     BatchError
-        Some scenes failed, by an LtclError of `function`. `results` has them all, errors in their
-        places.
+        `function` raised an LtclError for some scenes. `results` has all results, with the errors in
+        their places.
 
     Examples
     --------
@@ -42,14 +49,18 @@ def map(
     >>> ltcl.batch.map(lambda path: float(ltcl.load(path).first_bounce.sum()), paths)
     [6.0, 6.0]
     """
-    scenes, results = [*scenes], []
-    for result in stream(client, function, scenes, window=1, share_gpu=share_gpu, errors=True):
+    scenes = list(scenes)
+    results = []
+    stream_of_results = stream(client, function, scenes, window=1, share_gpu=share_gpu, errors=True)
+    for result in stream_of_results:
         results.append(result)
         if progress is not None:
             progress("scenes", len(results), len(scenes))
-    failed = [f"{s}: {r}" for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)]
-    if failed:
-        raise BatchError(
-            f"{len(failed)} of {len(scenes)} scenes failed: {'; '.join(failed)}", results
-        )
+    failures = []
+    for scene, result in zip(scenes, results, strict=True):
+        if isinstance(result, LtclError):
+            failures.append(f"{scene}: {result}")
+    if failures:
+        count = f"{len(failures)} of {len(scenes)} scenes failed"
+        raise BatchError(f"{count}: {'; '.join(failures)}", results)
     return results

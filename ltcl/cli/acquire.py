@@ -20,7 +20,7 @@ from ltcl.cli.command import WAITING, Answer, Context, command, percent, table
 from ltcl.cli.options import argument, option, pixels
 from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing, ScanRefused
-from ltcl.store import Record, formats
+from ltcl.store import StoreRecord, formats
 from ltcl.tasks.report import versions
 from ltcl.transport.verdict import verdict
 
@@ -130,13 +130,13 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
             {"sides": 5} if scene == "box" else {},
         )
         built = getattr(scenes, scene)(asked["size"] or 16, albedo=walls, **sides)
-        record: Any = Record(built.matrices(), grid=built.grid)
+        record: Any = StoreRecord(built.matrices(), grid=built.grid)
     elif not Path(scene).suffix and not Path(scene).exists():
         known = f"{', '.join(_SCENES)}, mitsuba:NAME or a transport file"
         raise InputError(f"SCENE is {scene!r}; it must be {known}")
     elif (record := formats.read(Path(scene))).grid is None and asked["grid"] is None:
         raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
-    elif isinstance(record, Record) and asked["grid"] is not None:
+    elif isinstance(record, StoreRecord) and asked["grid"] is not None:
         record = dataclasses.replace(
             record, grid=checks.grid("--grid", asked["grid"], record.shape[1])
         )
@@ -152,7 +152,7 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
         seen = camera_map(
             lambda u, v: ((u + 0.5) * w / W - 0.5, (v + 0.5) * h / H - 0.5), (H, W), (h, w)
         )
-        formats.write(folder / "camera.npz", Record((seen,), grid=(h, w), camera_grid=(H, W)))
+        formats.write(folder / "camera.npz", StoreRecord((seen,), grid=(h, w), camera_grid=(H, W)))
     return rig
 
 

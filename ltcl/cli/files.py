@@ -18,8 +18,9 @@ from ltcl.cli import options, pictures
 from ltcl.cli.command import FAILED, Answer, Context, command, fail, note, percent, table
 from ltcl.cli.options import option
 from ltcl.errors import InputError, LtclError
-from ltcl.store import BlockStore, Parts, Record, formats
-from ltcl.store.record import CSR, about
+from ltcl.store import BlockStore, CompressedRecord, StoreRecord, formats
+from ltcl.store.guards import about
+from ltcl.store.record import CSR
 from ltcl.tasks import analysis, compression, denoising
 from ltcl.transport import first_bounce
 from ltcl.transport.noise import estimate
@@ -79,11 +80,13 @@ def info(
     )
 
 
-def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.ndarray | None]:
+def _describe(
+    file: Path, record: StoreRecord | CompressedRecord
+) -> tuple[dict[str, Any], np.ndarray | None]:
     """Facts about a transport in plain types, and F; refuses what could not be loaded again."""
     sizes = {name: getattr(record, name) for name in ("shape", "grid", "camera_grid", "mixing")}
     facts: dict[str, Any] = {"file": str(file), **sizes}
-    if isinstance(record, Parts):  # whose operators are not made: that takes a device
+    if isinstance(record, CompressedRecord):  # whose operators are not made: that takes a device
         F, kinds, error = record.first_bounce, ", ".join(record.kinds), record.error
         facts |= {"channels": len(F), "entries": record.entries, "solution_error": error}
         facts |= {"dtype": f"{kinds}; error {checks.upwards(error)}", "nbytes": record.nbytes}
@@ -103,7 +106,7 @@ def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.nd
     return facts, F
 
 
-def _first_bounce(record: Record) -> np.ndarray | None:
+def _first_bounce(record: StoreRecord) -> np.ndarray | None:
     """F (channels, N), 0 where dark, which a rectangular T has not, after all of a record is checked."""
     (rows, columns), F, matrices = record.shape, record.first_bounce, list[Any](record.matrices)
     for name, pixels in (("grid", columns), ("camera_grid", rows)):
@@ -117,12 +120,17 @@ def _first_bounce(record: Record) -> np.ndarray | None:
     F = np.stack([T.diagonal() for T in matrices]) if F is None else F
     F, grid = np.atleast_2d(checks.finite("first_bounce", F)), record.grid or (1, columns)
     noise = lambda: record.noise or estimate(matrices, grid, record.camera_grid or grid)  # noqa: E731
-    dark = first_bounce.dark(matrices, first_bounce.DARK, noise, record.noise is not None, F)
-    return np.where(dark, 0.0, F)
+    rule = first_bounce.DarkRule(
+        matrices=matrices,
+        threshold=first_bounce.DARK_THRESHOLD,
+        noise=noise,
+        is_measured=record.noise is not None,
+    )
+    return np.where(rule.find_dark(F), 0.0, F)
 
 
-def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
-    if isinstance(record, Parts):
+def _verdict(record: StoreRecord | CompressedRecord, facts: dict[str, Any]) -> Verdict:
+    if isinstance(record, CompressedRecord):
         return Verdict(
             f"Unknown: stored as {facts['stored']}: run 'ltcl analyze' on what it was made of."
         )
@@ -327,7 +335,7 @@ def convert(
     record = formats.read(source, variable=context.options["variable"])
     with about(source):
         sizes = {name: size for name in ("grid", "camera_grid") if (size := context.options[name])}
-        if isinstance(record, Record):
+        if isinstance(record, StoreRecord):
             record = dataclasses.replace(record, **sizes)
         elif any(size != record.grid for size in sizes.values()):
             (h, w), size = record.grid, next(iter(sizes.values()))

@@ -26,8 +26,9 @@ from ltcl.errors import FileError, InputError
 from ltcl.operators import rank_device
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.tasks import report
-from ltcl.transport.first_bounce import DARK
-from ltcl.transport.transport import Transport, default_rtol, resolve_reference
+from ltcl.tasks.requirements import default_rtol, resolve_reference
+from ltcl.transport.first_bounce import DARK_THRESHOLD
+from ltcl.transport.transport import Transport
 from ltcl.transport.verdict import Verdict
 
 _ROUNDING = 1e-5  # of float32, in a picture
@@ -133,7 +134,7 @@ def file_options(
 def transport_options(
     first_bounce: Annotated[Literal["diagonal", "exact", "estimate"] | None, option(_FIRST)] = None,
     on_dark: OnDark = "mask",
-    dark: Annotated[float, option(_DARK)] = DARK,
+    dark: Annotated[float, option(_DARK)] = DARK_THRESHOLD,
     noise: Annotated[Path | None, file(_NOISE)] = None,
     device: Device = None,
 ) -> None:
@@ -185,16 +186,18 @@ def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
         device = rank_device(MPI.COMM_WORLD, device)
     device = open_device(device)
     context.progress(f"reading {path}")
-    names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark", "dark")
+    names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark")
     settings = {
         name: context.options[name] for name in names if context.options.get(name) is not None
     }
+    if context.options.get("dark") is not None:
+        settings["dark_threshold"] = context.options["dark"]
     if noise := context.options.get("noise"):
         context.progress(f"reading {noise}")
         second = {name: settings[name] for name in names[:3] if name in settings}
         settings["noise"] = store.load(noise, device=device, **second)
     T = store.load(path, device=device, **settings)
-    if (dark := int(T.masked.sum())) and dark_note and not T.dark:  # which was logged
+    if (dark := int(T.masked.sum())) and dark_note and not T.dark_note:  # which was logged
         note(
             f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit"
         )
@@ -233,7 +236,7 @@ def solving(context: Context, T: Transport, rtol: float, solves: int = 1) -> dic
     if path is not None:  # what T was compressed from, with its first bounce
         same = {"grid": T.grid, "first_bounce": T.first_bounce, "device": T.device}
         on_dark, variable = "mask" if T.masked.any() else "raise", asked["variable"]
-        exact = store.load(path, variable=variable, on_dark=on_dark, dark=0.0, **same)
+        exact = store.load(path, variable=variable, on_dark=on_dark, dark_threshold=0.0, **same)
         resolve_reference(T, exact)  # refuses other colours
         pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
         picture = T @ pattern

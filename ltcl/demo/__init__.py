@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The main result without hardware: a picture thrown into a coloured corner, before and after compensation.
+"""The main result without hardware: a picture in a coloured corner, before and after compensation.
 
 `experiment` computes, `output` fills the folder.
 """
@@ -47,8 +47,10 @@ def run(
         Folder; files of an earlier run are replaced only when everything has succeeded.
     size : int
         Patches along a wall, at least 4: the projector has 3 * size^2 pixels.
-    device, progress : optional
-        As `open_device` takes it; a function, called with each of `STEPS` as it begins.
+    device : Device or str, optional
+        A device as `open_device` takes it.
+    progress : callable(step), optional
+        Called with each of `STEPS` as it begins.
 
     Examples
     --------
@@ -60,10 +62,10 @@ def run(
     checks.count("size", size, least=4)
     if progress is not None and not callable(progress):
         raise errors.InputTypeError(f"progress is {progress!r}; it must be callable(step), or None")
-    starts: dict[str, float] = {}
+    begun: dict[str, float] = {}
 
     def begin(step: str) -> None:
-        starts[step] = time.perf_counter()
+        begun[step] = time.perf_counter()
         if progress is not None:
             progress(step)
 
@@ -71,13 +73,17 @@ def run(
         results = experiment.compute(size, device, begin)
         begin("pictures")
         output.write_pictures(results, folder)
-        ends = [*starts.values(), time.perf_counter()][1:]
-        seconds = {
-            step: round(end - starts[step], 3) for step, end in zip(starts, ends, strict=True)
-        }
-        text = output.report_of(results, seconds)
+        text = output.report_of(results, _seconds(begun))
         report.write(folder / "report.json", text)
-        files = sorted(
-            file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()
-        )
-    return Demo(Path(out), text, tuple(files))
+        files = [file.relative_to(folder) for file in folder.rglob("*") if file.is_file()]
+        names = sorted(file.as_posix() for file in files)
+    return Demo(Path(out), text, tuple(names))
+
+
+def _seconds(begun: dict[str, float]) -> dict[str, float]:
+    """Seconds of each step, the last of which ends now."""
+    ends = [*begun.values(), time.perf_counter()][1:]
+    seconds = {}
+    for (step, start), end in zip(begun.items(), ends, strict=True):
+        seconds[step] = round(end - start, 3)
+    return seconds

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the demo computes: a corner of three bright, differently coloured walls, lit in three ways.
+"""The demo's experiment: a corner of three bright, differently coloured walls, lit in three ways.
 
 In red all three walls are so bright that rho(R) > 1: there the paper's iteration diverges, and
 Chebyshev with the free bounds does not. The target is a sunset in just as much mist as the corner
 makes necessary: no projector can make a place darker than the light that bounces into it from the
 rest of the picture. With x = S^-1 picture and y = S^-1 mist, (N,) a channel, a target picture + b
-mist asks for the direct light x + b y; cutting off where that is negative changes what is seen by S
-min(x + b y, 0). The smallest b for which this stays below one percent is found by bisection, a
+mist asks for the direct light x + b y; cutting off where that is negative changes what is seen by
+S min(x + b y, 0). The smallest b for which this stays below one percent is found by bisection, with a
 product a step.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,26 +33,32 @@ ALBEDO = ((0.97, 0.25, 0.15), (0.96, 0.80, 0.30), (0.97, 0.45, 0.80))
 COLOURS = ("red", "green", "blue")
 STEPS = ("the room", "its light transport", "the target", "compensation", "bounces", "convergence")
 RTOL = 1e-3
-_BOUNCES = 4
-_RACE_RTOL, _RACE_LENGTH = 1e-5, 60  # far enough to see where each method goes
-_LOST = 0.01  # of the target, what the projector's black may cost
-_MIST = (1.00, 0.80, 0.65)  # its colour, lit by the sun
-_OUTSIDE, _RADIUS = (
-    0.3,
-    0.35,
-)  # share of the mist far from the corner; where it has thinned out, in heights
+BOUNCES = 4
+# The race of methods goes on until one can see where each of them goes.
+RACE_METHODS = ("chebyshev", "jacobi", "neumann", "direct")
+RACE_RTOL = 1e-5
+RACE_LENGTH = 60
+# Share of the target that the projector's black may cost.
+MAX_LOSS = 0.01
+BISECTION_STEPS = 10
+# Mist: its colour, lit by the sun; its share far from the corner; where it thins out, in heights.
+MIST_COLOUR = (1.00, 0.80, 0.65)
+MIST_OUTSIDE = 0.3
+MIST_RADIUS = 0.35
+VIEW_HEIGHT = 640
+PANORAMA_WIDTH = 1024
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Look:
-    """What is seen under one pattern; at `exposure` it comes closest to the target, with relative `error`."""
+    """What is seen under one pattern; at `exposure` it comes closest to the target, to the relative `error`."""
 
     seen: np.ndarray
     exposure: float
     error: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Experiment:
     """All results. Pictures are linear, (h, w, 3) on the walls' grid; `worst` is the channel of `race`."""
 
@@ -69,96 +75,136 @@ class Experiment:
     race: dict[str, Solution]
 
 
+class Target(NamedTuple):
+    """A picture (h, w, 3), its share of mist, and the brightest projector light that it asks for."""
+
+    picture: np.ndarray
+    mist: float
+    brightest: float
+
+
 def compute(size: int, device: Any, begin: Callable[[str], object]) -> Experiment:
     """Run everything; `begin` is called with each of `STEPS`."""
-    steps = iter(STEPS)
-    begin(next(steps))
+    room, transport, target_step, compensation_step, bounces, convergence = STEPS
+    begin(room)
     scene = scenes.box(size, sides=3, albedo=ALBEDO)
-    begin(next(steps))
+    begin(transport)
     T = scene.transport(first_bounce=scene.first_bounce, device=device)
     analysis = analyze(T, rtol=RTOL)
-    begin(next(steps))
-    target, mist, brightest = _reachable(scene, T)
-    begin(next(steps))
-    # What the demo is about, also where so few pixels would make "auto" factorize.
+
+    begin(target_step)
+    target = reachable_target(scene, T)
+
+    begin(compensation_step)
+    # Chebyshev is what the demo is about, also where so few pixels would make "auto" factorize.
     method = "chebyshev" if T.shape[0] <= auto.SMALL else "auto"
-    compensation = compensate(T, target, gain=1.0 / brightest, method=method, rtol=RTOL)
-    channels = list(zip(T.systems, target.reshape(-1, 3).T, strict=True))
+    gain = 1.0 / target.brightest
+    compensation = compensate(T, target.picture, gain=gain, method=method, rtol=RTOL)
+    columns = target.picture.reshape(-1, 3).T
     # Where the walls' colours are undone but no bounces, T F^-1 target = S target is seen.
-    colours_only = np.stack([np.asarray(S @ b) for S, b in channels], axis=-1).reshape(target.shape)
+    undone = [np.asarray(S @ column) for S, column in zip(T.systems, columns, strict=True)]
+    uncompensated = T @ target.picture
     pictures = {
-        "uncompensated": T @ target,
-        "colours_only": colours_only,
+        "uncompensated": uncompensated,
+        "colours_only": np.stack(undone, axis=-1).reshape(target.picture.shape),
         "compensated": compensation.appearance,
     }
-    begin(next(steps))
-    separation = separate(T, pictures["uncompensated"], _BOUNCES, rtol=RTOL)
-    begin(next(steps))
-    worst = int(np.argmax([channel.spectral_radius for channel in analysis.channels]))
-    S, b = channels[worst]
+
+    begin(bounces)
+    separation = separate(T, uncompensated, BOUNCES, rtol=RTOL)
+
+    begin(convergence)
+    radii = [channel.spectral_radius for channel in analysis.channels]
+    worst = int(np.argmax(radii))
+    race = {}
+    for name in RACE_METHODS:  # a method that fails is shown, too
+        race[name] = solve(
+            T.systems[worst],
+            columns[worst],
+            name,
+            rtol=RACE_RTOL,
+            maxiter=RACE_LENGTH,
+            throw=False,
+        )
     return Experiment(
         scene=scene,
         T=T,
         analysis=analysis,
-        target=target,
-        mist=mist,
+        target=target.picture,
+        mist=target.mist,
         compensation=compensation,
-        looks={name: _look(seen, target) for name, seen in pictures.items()},
+        looks={name: look_at(seen, target.picture) for name, seen in pictures.items()},
         bounces=[separation.direct, *separation.bounces],
-        bounce_errors=_bounce_errors(scene, target, separation),
+        bounce_errors=bounce_errors(scene, target.picture, separation),
         worst=worst,
-        race={  # a method that fails is shown, too
-            name: solve(S, b, name, rtol=_RACE_RTOL, maxiter=_RACE_LENGTH, throw=False)
-            for name in ("chebyshev", "jacobi", "neumann", "direct")
-        },
+        race=race,
     )
 
 
-def _look(seen: np.ndarray, target: np.ndarray) -> Look:
+def look_at(seen: np.ndarray, target: np.ndarray) -> Look:
+    """Compare what is seen with the target, at the exposure where it comes closest."""
     exposure = float(np.vdot(seen, target) / np.vdot(seen, seen))
-    return Look(
-        seen, exposure, float(np.linalg.norm(exposure * seen - target) / np.linalg.norm(target))
-    )
+    difference = np.linalg.norm(exposure * seen - target)
+    error = float(difference / np.linalg.norm(target))
+    return Look(seen=seen, exposure=exposure, error=error)
 
 
-def _bounce_errors(scene: Scene, pattern: np.ndarray, separation: Separation) -> list[float]:
+def bounce_errors(scene: Scene, pattern: np.ndarray, separation: Separation) -> list[float]:
     """Relative error of each bounce against A^k F pattern, made of the scene's own form factors."""
-    errors, truth = [], scene.albedo * pattern.reshape(-1, 3).T
+    errors = []
+    truth = scene.albedo * pattern.reshape(-1, 3).T
     for bounce in (separation.direct, *separation.bounces):
-        errors.append(
-            float(np.linalg.norm(bounce.reshape(-1, 3).T - truth) / np.linalg.norm(truth))
-        )
+        difference = np.linalg.norm(bounce.reshape(-1, 3).T - truth)
+        errors.append(float(difference / np.linalg.norm(truth)))
         truth = scene.albedo * (truth @ scene.form_factors.T)
     return errors
 
 
-def _reachable(scene: Scene, T: Transport) -> tuple[np.ndarray, float, float]:
-    """A sunset that looks flat to the viewer, its share of mist, and the brightest light it asks for."""
-    wide = scenes.landscape(640, 1024)
-    left = round(SUN[0] * 1024 - 320)  # the sun is in the middle column
-    sunset, place = wide[:, left : left + 640], (np.arange(640) + 0.5) / 640 - 0.5
+def reachable_target(scene: Scene, T: Transport) -> Target:
+    """A sunset that looks flat to the viewer, in as little mist as the projector can do with."""
+    sunset, mist = (scene.sample(picture) for picture in sunset_and_mist())
+    parts = np.stack([sunset, mist], axis=-1).reshape(-1, 3, 2)
+    columns = parts.transpose(1, 0, 2).astype(np.float64)  # (3, N, 2)
+    light = []
+    for S, column in zip(T.systems, columns, strict=True):
+        light.append(solve(S, column, rtol=RTOL).x.astype(np.float64))
+
+    too_little = 0.0
+    enough = 1.0
+    for _ in range(BISECTION_STEPS):
+        share = (too_little + enough) / 2
+        loss = lost_light(T, light, share)
+        if loss < MAX_LOSS * np.linalg.norm(columns @ (1.0, share)):
+            enough = share
+        else:
+            too_little = share
+
+    brightest = []
+    for x, F in zip(light, T.first_bounce, strict=True):
+        pattern = x @ (1.0, enough) / F
+        brightest.append(float(pattern.max()))
+    picture = sunset + np.float32(enough) * mist
+    return Target(picture, enough, max(brightest))
+
+
+def lost_light(T: Transport, light: list[np.ndarray], share: float) -> float:
+    """Norm of what is seen less where direct light (N, 2), of picture and mist, is cut off at 0."""
+    lost = []
+    for S, x in zip(T.systems, light, strict=True):
+        cut_off = np.minimum(x @ (1.0, share), 0.0)
+        lost.append(np.asarray(S @ cut_off))
+    return float(np.linalg.norm(np.stack(lost)))
+
+
+def sunset_and_mist() -> tuple[np.ndarray, np.ndarray]:
+    """Two square pictures, as the viewer is to see them; the sun is in the middle column."""
+    panorama = scenes.landscape(VIEW_HEIGHT, PANORAMA_WIDTH)
+    left = round(SUN[0] * PANORAMA_WIDTH - VIEW_HEIGHT / 2)
+    sunset = panorama[:, left : left + VIEW_HEIGHT]
+    place = (np.arange(VIEW_HEIGHT) + 0.5) / VIEW_HEIGHT - 0.5
+    squared_distance = place**2 + place[:, None] ** 2
     # Thickest in the middle, where the walls meet and most light comes back.
-    thickness = np.exp(-(place**2 + place[:, None] ** 2) / _RADIUS**2)[..., None]
-    mist = (_OUTSIDE + (1 - _OUTSIDE) * thickness) * np.array(_MIST) * (1.0 - sunset)
-    sides = [scene.sample(picture) for picture in (sunset, mist)]
-    columns = (
-        np.stack(sides, axis=-1).reshape(-1, 3, 2).transpose(1, 0, 2).astype(np.float64)
-    )  # (3, N, 2)
-    light = [
-        solve(S, b, rtol=RTOL).x.astype(np.float64) for S, b in zip(T.systems, columns, strict=True)
-    ]
-    low, high = 0.0, 1.0
-    for _ in range(10):
-        b = (low + high) / 2
-        lost = [
-            np.asarray(S @ np.minimum(x @ (1.0, b), 0.0))
-            for S, x in zip(T.systems, light, strict=True)
-        ]
-        enough = np.linalg.norm(np.stack(lost)) < _LOST * np.linalg.norm(columns @ (1.0, b))
-        low, high = (low, b) if enough else (b, high)
-    pattern = [x @ (1.0, high) / F for x, F in zip(light, T.first_bounce, strict=True)]
-    return (
-        sides[0] + np.float32(high) * sides[1],
-        high,
-        max(float(colour.max()) for colour in pattern),
-    )
+    thickness = np.exp(-squared_distance / MIST_RADIUS**2)[..., None]
+    density = MIST_OUTSIDE + (1 - MIST_OUTSIDE) * thickness
+    mist = density * np.array(MIST_COLOUR) * (1.0 - sunset)
+    return sunset, mist

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Plots: pictures under their names, how solves converge, and what an analysis says.
+"""Plots: pictures under their names, the convergence of solves, the results of an analysis.
 
 Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all.
 Figures are drawn by Agg without pyplot, so nothing here needs a screen or touches global state.

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures under their names, how solves converge, and what an analysis says."""
+"""Figures: pictures under their names, the convergence of solves, the results of an analysis."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +27,16 @@ from ltcl.plots.page import (
     label_at,
 )
 from ltcl.solvers import Solution
-from ltcl.tasks.analysis import Analysis
+from ltcl.tasks.analysis import Analysis, ChannelAnalysis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
+# Residuals below are drawn at this level: products in float32 end above it.
+LOWEST_RESIDUAL = 1e-8
+DASHES = (0, (4, 4))
+SHORT_DASHES = (0, (2, 2))
 
 
 def convergence(
@@ -41,7 +45,7 @@ def convergence(
     """Relative residual of several solves of one system against the products they took.
 
     Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level
-    line. InputError: there is nothing to draw, or rtol is outside (0, 1).
+    line. InputError if there is nothing to draw, or rtol is outside (0, 1).
 
     Examples
     --------
@@ -53,15 +57,17 @@ def convergence(
     """
     figure = figure_of(900, 560)
     heading(figure, 34, 26, title, 17)
-    _draw_convergence(figure.add_axes((0.09, 0.13, 0.73, 0.72)), solutions, rtol)
+    axes = figure.add_axes((0.09, 0.13, 0.73, 0.72))
+    _draw_convergence(axes, solutions, rtol)
     return figure
 
 
 def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
 
-    Left the interval that holds rho(R), with the 1 beyond which the paper's series diverges; right
-    the products of each method, where there is a forecast. InputError: there is nothing to draw.
+    On the left is the interval that holds rho(R), with the 1 beyond which the paper's series
+    diverges; on the right are the products of each method, where there is a forecast. InputError if
+    there is nothing to draw.
 
     Examples
     --------
@@ -73,45 +79,73 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     """
     if not analyses:
         raise InputError("analyses is empty; there must be at least one analysis to draw")
-    channels = {
-        name + (f" {colour}" if len(transport.channels) == 3 else ""): channel
-        for name, transport in analyses.items()
-        for colour, channel in zip(("red", "green", "blue"), transport.channels, strict=False)
-    }
+    channels = _named_channels(analyses)
+    first_analysis = next(iter(analyses.values()))
     figure = figure_of(1300, 330 + 46 * len(channels))
     heading(figure, 34, 26, "Before solving", 17)
-    left, right = figure.add_axes((0.16, 0.2, 0.33, 0.58)), figure.add_axes((0.58, 0.2, 0.38, 0.58))
-    labels = "rho(R), between its bounds", "products with S, sweeps of Gauss-Seidel"
-    titles = "spectral radius of R", f"products to {100 * next(iter(analyses.values())).rtol:g} %"
-    for axes, title, label in zip((left, right), titles, labels, strict=True):
-        _dress(axes, label)
-        axes.set_title(title, color=INK, fontsize=13, loc="left", fontweight="bold")
+    left = figure.add_axes((0.16, 0.2, 0.33, 0.58))
+    right = figure.add_axes((0.58, 0.2, 0.38, 0.58))
+    _dress(left, "rho(R), between its bounds", "spectral radius of R")
+    tolerance = f"{100 * first_analysis.rtol:g} %"
+    _dress(right, "products with S, sweeps of Gauss-Seidel", f"products to {tolerance}")
+    _draw_radii(left, channels)
+    _draw_products(right, list(channels.values()))
+    return figure
 
-    limit = 1.6 * max(1.0, *(channel.spectral_radius for channel in channels.values()))
+
+def _named_channels(analyses: Mapping[str, Analysis]) -> dict[str, ChannelAnalysis]:
+    """The channels of all transports, by the names of these and of their colours."""
+    channels = {}
+    for name, transport in analyses.items():
+        if len(transport.channels) == 1:
+            channels[name] = transport.channels[0]
+            continue
+        for colour, channel in zip(("red", "green", "blue"), transport.channels, strict=True):
+            channels[f"{name} {colour}"] = channel
+    return channels
+
+
+def _draw_radii(axes: Axes, channels: Mapping[str, ChannelAnalysis]) -> None:
+    """The interval of the spectral radius of each channel, with its certificate."""
+    radii = [channel.spectral_radius for channel in channels.values()]
+    limit = 1.6 * max(1.0, *radii)
     for row, channel in enumerate(channels.values()):
         lower, upper = channel.spectral_radius_bounds
-        upper = upper if math.isfinite(upper) else channel.spectral_radius
-        left.barh(row, upper - lower, 0.2, lower, color=COLOURS["chebyshev"], alpha=0.6)
-        left.plot([channel.spectral_radius], [row], "|", color=INK, ms=16, mew=2)
+        if not math.isfinite(upper):
+            upper = channel.spectral_radius
+        axes.barh(row, upper - lower, 0.2, lower, color=COLOURS["chebyshev"], alpha=0.6)
+        axes.plot([channel.spectral_radius], [row], "|", color=INK, ms=16, mew=2)
         certificate = channel.spectral_radius_certificate
-        left.text(limit, row, certificate, color=FAINT, fontsize=9, ha="right", va="center")
-    left.axvline(1.0, color=COLOURS["jacobi"], lw=1.2, ls=(0, (4, 4)))
-    left.set(xlim=(0, limit), ylim=(len(channels) - 0.4, -0.6))
-    left.set_yticks(range(len(channels)), list(channels))
+        axes.text(limit, row, certificate, color=FAINT, fontsize=9, ha="right", va="center")
+    axes.axvline(1.0, color=COLOURS["jacobi"], lw=1.2, ls=DASHES)
+    axes.set(xlim=(0, limit), ylim=(len(channels) - 0.4, -0.6))
+    axes.set_yticks(range(len(channels)), list(channels))
 
-    methods = list(next(iter(channels.values())).products)
-    height, colours = 0.8 / len(channels), _colours(methods)
-    for row, channel in enumerate(channels.values()):
+
+def _draw_products(axes: Axes, channels: list[ChannelAnalysis]) -> None:
+    """A bar for each method and channel, as long as its forecast of products."""
+    methods = list(channels[0].products)
+    colours = _colours(methods)
+    height = 0.8 / len(channels)
+    font_size = float(np.clip(60 * height, 6, 11))
+    for row, channel in enumerate(channels):
         for place, name in enumerate(methods):
-            n, y = channel.products[name], place - 0.4 + (row + 0.5) * height
-            bar = right.barh(y, n if math.isfinite(n) else 0, 0.85 * height, color=colours[name])
-            count = f"{n:g}" if math.isfinite(n) else "diverges" if n > 0 else "no forecast"
-            size = float(np.clip(60 * height, 6, 11))
-            right.bar_label(bar, [f"  {count}"], color=FAINT, fontsize=size)
-    right.margins(x=0.25)
-    right.set_ylim(len(methods) - 0.4, -0.6)
-    right.set_yticks(range(len(methods)), methods)
-    return figure
+            products = channel.products[name]
+            y = place - 0.4 + (row + 0.5) * height
+            length = products if math.isfinite(products) else 0
+            bar = axes.barh(y, length, 0.85 * height, color=colours[name])
+            label = f"  {_forecast(products)}"
+            axes.bar_label(bar, [label], color=FAINT, fontsize=font_size)
+    axes.margins(x=0.25)
+    axes.set_ylim(len(methods) - 0.4, -0.6)
+    axes.set_yticks(range(len(methods)), methods)
+
+
+def _forecast(products: float) -> str:
+    """A forecast of products in words: infinite where the method diverges, NaN where unknown."""
+    if math.isfinite(products):
+        return f"{products:g}"
+    return "diverges" if products > 0 else "no forecast"
 
 
 def pictures(
@@ -121,7 +155,7 @@ def pictures(
 
     A picture is (h, w) or (h, w, 3), cut off beyond 0 and 1; black is the page, as beside the walls
     of a view. Small ones are enlarged, each pixel a square. A second line of a name is a note, in
-    small letters. InputError: there is no picture, or one has another shape.
+    small letters. InputError if there is no picture, or one has another shape.
 
     Examples
     --------
@@ -136,45 +170,113 @@ def pictures(
     width = checks.count("width", width, least=100)
     if not rows:
         raise InputError("rows hold no picture; there must be at least one to draw")
-    shown = [{name: as_picture(name, image) for name, image in row.items()} for row in rows]
-    scale = max(width / 1000, 0.85)  # of text
-    margin, gap, top, drawn = round(0.025 * width), round(0.016 * width), 20 * scale, []
-    top += (
-        34 * scale * bool(title) + 24 * scale * (subtitle.count("\n") + bool(subtitle)) + 6 * scale
-    )
-    for row in shown:
-        side = (width - 2 * margin - (len(row) - 1) * gap) / len(row)
-        size = scale * float(np.clip(side / 300, 0.8, 1.15))
-        label, top = top, top + size * (24 + 18 * any("\n" in name for name in row))
-        for place, (name, image) in enumerate(row.items()):
-            box = margin + place * (side + gap), top, side, side * image.shape[0] / image.shape[1]
-            drawn.append((name, image, size, label, box))
-        top = max(box[1] + box[3] for *_, box in drawn) + 16 * scale
+    page = _Page(width)
+    top = page.below_heading(title, subtitle)
+    placed: list[_PlacedPicture] = []
+    for row in rows:
+        checked = {name: as_picture(name, image) for name, image in row.items()}
+        in_row = page.place_row(checked, top)
+        top = max(picture.bottom for picture in in_row) + 16 * page.scale
+        placed += in_row
+
     figure = figure_of(width, math.ceil(top))
-    heading(figure, margin, 18 * scale, title, 17 * scale)
-    label_at(
-        figure, margin, (18 + 34 * bool(title)) * scale, subtitle, size=11 * scale, color=FAINT
-    )
-    for name, image, size, line, box in drawn:
-        label, _, note = name.partition("\n")
-        heading(figure, box[0], line, label, 12 * size)
-        label_at(figure, box[0], line + 21 * size, note, size=10.5 * size, color=FAINT)
-        _draw_picture(figure, box, image)
+    page.draw_heading(figure, title, subtitle)
+    for picture in placed:
+        picture.draw(figure)
     return figure
+
+
+class _Page:
+    """Margins and sizes of a page of pictures, in pixels."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self.scale = max(width / 1000, 0.85)  # of text
+        self.margin = round(0.025 * width)
+        self.gap = round(0.016 * width)
+
+    def below_heading(self, title: str, subtitle: str) -> float:
+        """Top of the first row."""
+        top = 26.0
+        if title:
+            top += 34
+        if subtitle:
+            top += 24 * (subtitle.count("\n") + 1)
+        return top * self.scale
+
+    def draw_heading(self, figure: Figure, title: str, subtitle: str) -> None:
+        """Title and subtitle."""
+        heading(figure, self.margin, 18 * self.scale, title, 17 * self.scale)
+        top = 52 if title else 18
+        label_at(figure, self.margin, top * self.scale, subtitle, size=11 * self.scale, color=FAINT)
+
+    def place_row(self, row: Mapping[str, np.ndarray], top: float) -> list[_PlacedPicture]:
+        """Pictures side by side, as wide as the page, their names above."""
+        room = self.width - 2 * self.margin - (len(row) - 1) * self.gap
+        side = room / len(row)
+        text_scale = self.scale * float(np.clip(side / 300, 0.8, 1.15))
+        has_notes = any("\n" in name for name in row)
+        name_height = text_scale * (42 if has_notes else 24)
+        placed = []
+        for place, (name, image) in enumerate(row.items()):
+            placed.append(
+                _PlacedPicture(
+                    name=name,
+                    image=image,
+                    text_scale=text_scale,
+                    name_top=top,
+                    left=self.margin + place * (side + self.gap),
+                    top=top + name_height,
+                    width=side,
+                )
+            )
+        return placed
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PlacedPicture:
+    """A picture with its name, at a place on the page."""
+
+    name: str
+    image: np.ndarray
+    text_scale: float
+    name_top: float
+    left: float
+    top: float
+    width: float
+
+    @property
+    def height(self) -> float:
+        return self.width * self.image.shape[0] / self.image.shape[1]
+
+    @property
+    def bottom(self) -> float:
+        return self.top + self.height
+
+    def draw(self, figure: Figure) -> None:
+        """Draw the name, its note and the picture."""
+        size = self.text_scale
+        label, _, note = self.name.partition("\n")
+        heading(figure, self.left, self.name_top, label, 12 * size)
+        note_top = self.name_top + 21 * size
+        label_at(figure, self.left, note_top, note, size=10.5 * size, color=FAINT)
+        _draw_picture(figure, (self.left, self.top, self.width, self.height), self.image)
 
 
 def _draw_picture(
     figure: Figure, box: tuple[float, float, float, float], image: np.ndarray
 ) -> None:
-    left, top, w, h = (
-        max(round(side), 1) for side in box
-    )  # whole pixels, which Agg does not resample
-    black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) > 0.999
-    if times := w // image.shape[1]:  # enlarged to more than is drawn: squares with sharp edges
-        image = image.repeat(times + 1, axis=0).repeat(times + 1, axis=1)
-    codes = np.atleast_3d(to_srgb(np.clip(resize(image, (h, w)), 0, 1)))
-    codes = np.broadcast_to(codes, (h, w, 3))
-    paper = np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    """Draw a linear picture; what is black becomes the page."""
+    # Agg does not resample whole pixels.
+    left, top, w, h = (max(round(side), 1) for side in box)
+    is_black = (np.atleast_3d(image) == 0).all(axis=-1)
+    black = resize(is_black.astype(np.float32), (h, w)) > 0.999
+    enlargement = w // image.shape[1]
+    if enlargement:  # to more than is drawn: squares with sharp edges
+        image = image.repeat(enlargement + 1, axis=0).repeat(enlargement + 1, axis=1)
+    light = np.clip(resize(image, (h, w)), 0, 1)
+    codes = np.broadcast_to(np.atleast_3d(to_srgb(light)), (h, w, 3))
+    paper = np.array([int(PAPER[start : start + 2], 16) / 255 for start in (1, 3, 5)])
     codes = np.where(black[..., None], paper, codes)
     axes = axes_at(figure, (left, top, w, h))
     axes.imshow(np.rint(255 * codes).astype(np.uint8), interpolation="none", aspect="auto")
@@ -182,6 +284,7 @@ def _draw_picture(
 
 
 def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float) -> None:
+    """A line for each solve, and the tolerance."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     checks.number("rtol", rtol, above=0.0, below=1.0)
@@ -189,21 +292,23 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
         raise InputError("solutions is empty; there must be at least one to draw")
     _dress(axes, "products with S")
     axes.set_ylabel("relative residual", color=FAINT, fontsize=12, labelpad=6)
-    products = max([1, *(solution.products for solution in solutions.values())])
-    colours, lowest, highest = _colours(solutions), rtol, 1.0
+    most_products = max(1, *(solution.products for solution in solutions.values()))
+    colours = _colours(solutions)
+    lowest = rtol
+    highest = 1.0
     for name, solution in solutions.items():
-        y = np.array([value for value in solution.residuals if np.isfinite(value)] or [1.0])
-        x = np.linspace(0, max(solution.products, 1), len(y))
-        if solution.method == "direct":
-            x, y = np.array([0, products]), np.full(2, solution.residual)
-        y = np.maximum(y, _LOWEST)
-        lowest, highest = min(lowest, float(y.min())), max(highest, float(y.max()))
-        label = name if solution.residual >= _LOWEST else f"{name} \u2193"
+        products, residuals = _convergence_line(solution, most_products)
+        lowest = min(lowest, float(residuals.min()))
+        highest = max(highest, float(residuals.max()))
+        is_below = solution.residual < LOWEST_RESIDUAL
+        label = f"{name} \u2193" if is_below else name
         # Neumann runs on top of Jacobi, which must stay visible.
-        style = (0, (2, 2)) if name == "neumann" else "-"
-        axes.plot(x, y, color=colours[name], lw=2.6, ls=style, clip_on=False, label=label)
-    axes.plot([0, products], [rtol, rtol], color=FAINT, lw=1.2, ls=(0, (4, 4)), label="tolerance")
-    axes.set(yscale="log", xlim=(0, products), ylim=(lowest / 2, 2 * highest))
+        style = SHORT_DASHES if name == "neumann" else "-"
+        axes.plot(
+            products, residuals, color=colours[name], lw=2.6, ls=style, clip_on=False, label=label
+        )
+    axes.plot([0, most_products], [rtol, rtol], color=FAINT, lw=1.2, ls=DASHES, label="tolerance")
+    axes.set(yscale="log", xlim=(0, most_products), ylim=(lowest / 2, 2 * highest))
     axes.grid(color=GRID, lw=1)
     axes.yaxis.set_major_locator(LogLocator(10, numticks=8))
     axes.minorticks_off()
@@ -217,15 +322,40 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     )
 
 
-def _dress(axes: Axes, label: str) -> None:
+def _convergence_line(solution: Solution, most_products: int) -> tuple[np.ndarray, np.ndarray]:
+    """Products and residuals of one solve; a direct solve is a level line."""
+    if solution.method == "direct":
+        products = np.array([0, most_products])
+        residuals = np.full(2, solution.residual)
+    else:
+        residuals = np.array(solution.residuals)
+        residuals = residuals[np.isfinite(residuals)]
+        if residuals.size == 0:
+            residuals = np.ones(1)
+        products = np.linspace(0, max(solution.products, 1), len(residuals))
+    return products, np.maximum(residuals, LOWEST_RESIDUAL)
+
+
+def _dress(axes: Axes, label: str, title: str = "") -> None:
+    """Colours and labels of axes on the dark page."""
     axes.set_facecolor(PAPER)
     axes.set_xlabel(label, color=FAINT, fontsize=12, labelpad=6)
     axes.grid(color=GRID, lw=1, axis="x")
     axes.set_axisbelow(True)
     axes.tick_params(colors=FAINT, labelsize=11, length=0, pad=7)
     axes.spines[:].set_visible(False)
+    if title:
+        axes.set_title(title, color=INK, fontsize=13, loc="left", fontweight="bold")
 
 
-def _colours(names: Sequence[str] | Mapping[str, object]) -> dict[str, str]:
-    others = iter(OTHERS * (1 + len(names)))
-    return {name: COLOURS.get(name) or next(others) for name in names}
+def _colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each name: those of well-known methods, others in turn."""
+    colours = {}
+    others = 0
+    for name in names:
+        if name in COLOURS:
+            colours[name] = COLOURS[name]
+        else:
+            colours[name] = OTHERS[others % len(OTHERS)]
+            others += 1
+    return colours

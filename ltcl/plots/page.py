@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What all plots share: the dark page, its colours, text and axes in pixels, and saving."""
+"""Parts of all plots: the dark page, its colours, text and axes in pixels, and saving."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 100
-PAPER, INK, FAINT, GRID = "#15171b", "#f1efea", "#9aa1ab", "#2b2f36"
+PAPER = "#15171b"
+INK = "#f1efea"
+FAINT = "#9aa1ab"
+GRID = "#2b2f36"
 COLOURS = {"chebyshev": "#5cc8ff", "jacobi": "#ff5d5d", "neumann": "#ffb347", "direct": "#8bd17c"}
 OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb", "#ffd866", "#9fb4ff", "#e0a37a", "#b5e853")
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure in a format of matplotlib; an earlier file at `path` is replaced whole or not at all."""
+    """Write a figure in a format of matplotlib; an earlier file is replaced whole or not at all."""
     known = figure.canvas.get_supported_filetypes()
     extension = os.path.splitext(path)[1].lstrip(".").lower()
     if extension not in known:
-        raise InputError(
-            f"{path}: extension {extension or 'missing'!r} is unknown; plots are {', '.join(sorted(known))}"
-        )
+        name = extension or "missing"
+        formats = ", ".join(sorted(known))
+        raise InputError(f"{path}: extension {name!r} is unknown; plots are {formats}")
     with replace_file(path) as temporary:
         figure.savefig(temporary, dpi=DPI, facecolor=figure.get_facecolor())
 
@@ -44,9 +47,8 @@ def figure_of(width: int, height: int) -> Figure:
 def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:
     """Text whose top is `y` pixels below the top of the figure; sizes in points, 1.4 pixels each."""
     width, height = figure.get_size_inches() * DPI
-    figure.text(
-        x / width, 1 - y / height, text, fontsize=size, **{"va": "top", "color": INK, **style}
-    )
+    style = {"va": "top", "color": INK, **style}
+    figure.text(x / width, 1 - y / height, text, fontsize=size, **style)
 
 
 def heading(figure: Figure, x: float, y: float, text: str, size: float) -> None:

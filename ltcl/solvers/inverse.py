@@ -24,6 +24,7 @@ from ltcl.solvers.bounded import inwards
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import scale_rhs, unscale
 from ltcl.transport import frames as layout
+from ltcl.transport.matrices import check_mixing
 
 _ARRAYS = ("grid", "first_bounce", "errors", "confidence")
 
@@ -73,7 +74,9 @@ class Inverse:
             np.float64
         )
         self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
-        self.mixing = None if mixing is None else layout.mixing(mixing, len(bounces), None)
+        self.mixing = (
+            None if mixing is None else check_mixing(mixing, len(bounces), has_blocks=False)
+        )
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
 
     def __repr__(self) -> str:

@@ -2,26 +2,20 @@
 """`BlockStore`: a transport on disk that grows by batches of columns, and is never half of one.
 
 A growing store is a folder of `zarr.json` (sizes, provenance, attributes, checksum) and `log/`, an
-.npz and its SHA-256 a batch or small array, each written in a temporary and renamed. `finalize`
-lets zarr write T next to the log: rows in `channel_0/block_000000.0` and so on, in binsparse CSR
-layout, small arrays in `extra/NAME.0`, each array one chunk with crc32c. With the rename of
-zarr.json, which then has the SHA-256 of every file, the store is final, and the log goes. Ended at
-any moment, all that was committed stays.
+`ArrayLog` with an entry for each batch and small array. `finalize` turns the columns into rows, which
+zarr writes next to the log; with the rename of zarr.json, which then has the SHA-256 of every file,
+the store is final, and the log goes. Whenever a process ends, all that was committed stays.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import itertools
-import json
 import os
 import re
 import shutil
-from collections import namedtuple
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,107 +23,32 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.errors import FileError, InputError
-from ltcl.files import (
-    as_path,
-    fill_folder,
-    flush_tree,
-    input_file,
-    locked,
-    replace_file,
-    restore,
-    sweep,
+from ltcl.errors import FileError
+from ltcl.files import as_path, fill_folder, input_file, locked, restore, sweep
+from ltcl.store.array_log import ArrayLog
+from ltcl.store.document import is_store, read_document, write_document
+from ltcl.store.final_store import (
+    BINSPARSE,
+    Block,
+    FinalContent,
+    PlacedBlock,
+    check_block,
+    write_final,
 )
-from ltcl.store.record import CSR, EXTRAS, Parts, Record, StoredRows, about, declared, sparse
-from ltcl.transport import first_bounce
+from ltcl.store.guards import about, check_declared, sparse_floats
+from ltcl.store.layout import StoreLayout
+from ltcl.store.record import CSR, EXTRAS, CompressedRecord, StoreRecord
+from ltcl.store.stored_rows import StoredRows
 from ltcl.transport.noise import Noise
 
-_START, _UNSEALED = b'{"attributes": {"checksum": "', b"0" * 64
-_ENTRY = re.compile(r"([A-Za-z][A-Za-z0-9_.-]{0,120})\.npz")
-_ARRAY = re.compile(
-    r"((.+)\.\d+/(\w+))/zarr\.json"
-)  # of a final store: place, name of the group, name
-_BINSPARSE: dict[str, str] = dict(zip(("values", "indices_1", "pointers_to_1"), CSR, strict=True))
-Block = namedtuple(
-    "Block", "matrix variance"
-)  # rows of T, or columns, and the variance of their entries
+# A file of a final store: place of the array, its group, its name.
+ARRAY_FILE = re.compile(r"((.+)\.\d+/(\w+))/zarr\.json")
+CRC32C_BYTES = 4
+EXTRA = "extra."
+COLUMNS = re.compile(r"columns_(\d)\.(\d+)")
 
-
-@dataclass
-class Layout:
-    """Sizes of a stored transport: `shape` (M, N), `grid` and `camera_grid` (h, w), 1 or 3 `channels`.
-
-    A block is `block_rows` rows of T, or columns in the log; "compressed", all of T is in extra
-    arrays.
-    """
-
-    shape: tuple[int, int]
-    grid: Any
-    camera_grid: tuple[int, int] | None = None
-    channels: int = 1
-    block_rows: Any = None
-    kind: str = "blocks"
-    dtype: str = "float32"
-    schema: int = 2
-
-    def __post_init__(self) -> None:
-        M, N = self.shape = checks.grid("shape", self.shape)
-        self.grid = checks.grid("grid", self.grid, N)
-        if self.camera_grid is not None or M != N:
-            self.camera_grid = checks.grid("camera_grid", self.camera_grid, M)
-        checks.count("shape", max(M, N), most=(1 << 31) - 1)  # column indices are of 32 bits
-        checks.one_of("channels", self.channels, (1, 3))
-        checks.one_of("schema", self.schema, (1, 2))
-        if self.block_rows is None:
-            self.block_rows = max(1, min(M, (1 << 23) // N))  # 64 MiB of full rows
-        checks.count("block_rows", self.block_rows, least=(max(M, N) >> 20) + 1)  # a million blocks
-
-    def blocks(self, orientation: str = "rows") -> int:
-        """Number of blocks of a channel, of "rows" or "columns"."""
-        return -(-self.shape[orientation == "columns"] // self.block_rows)
-
-    def span(self, block: int, orientation: str = "rows") -> tuple[int, int]:
-        """First row (or column) of a block, and the one behind its last."""
-        start = block * self.block_rows
-        return start, min(start + self.block_rows, self.shape[orientation == "columns"])
-
-    def block_shape(self, block: int, orientation: str = "rows") -> tuple[int, int]:
-        """(rows, N), or (columns, M) of one that holds columns of T as rows."""
-        start, stop = self.span(block, orientation)
-        return stop - start, self.shape[orientation == "rows"]
-
-
-@dataclass
-class ArrayLog:
-    """Sets of arrays by name in the folder `path`, which the first makes: an .npz and its SHA-256 each."""
-
-    path: Path
-
-    @property
-    def names(self) -> list[str]:
-        """Of what is committed, by whatever process."""
-        with about(self.path):
-            files = os.listdir(self.path) if self.path.exists() else []
-        return sorted(entry[1] for entry in map(_ENTRY.fullmatch, files) if entry)
-
-    def put(self, name: str, **arrays: Any) -> None:
-        """Commit arrays of numbers or texts; what has that name already is replaced whole, or stays."""
-        if not _ENTRY.fullmatch(f"{name}.npz"):
-            raise InputError(
-                f"name is {name!r:.60}; it must be letters, digits, _, - and ., a letter first"
-            )
-        with replace_file(self.path / f"{name}.npz") as temporary:
-            np.savez(temporary, **arrays)
-            raw = temporary.read_bytes()
-            temporary.write_bytes(raw + hashlib.sha256(raw).hexdigest().encode())
-
-    def get(self, name: str) -> dict[str, np.ndarray]:
-        """The arrays under a name, whose checksums are compared."""
-        with about(self.path, reading=True):
-            raw = input_file(self.path / f"{name}.npz").read_bytes()
-            if hashlib.sha256(raw[:-64]).hexdigest().encode() != raw[-64:]:
-                raise FileError(f"{name}.npz is damaged: its checksum differs")
-            return dict(np.load(io.BytesIO(raw), allow_pickle=False))
+# Of channel, first row, rows (rows, N) and variance of their entries; returns the last two changed.
+RowChange = Callable[[int, int, scipy.sparse.csr_array, np.ndarray], tuple[Any, Any]]
 
 
 class BlockStore:
@@ -137,6 +56,13 @@ class BlockStore:
 
     Any number of processes may write at once; what they write is committed when the call returns.
     After `finalize` it is `final`: T is there by rows, and nothing is written any more.
+
+    Attributes
+    ----------
+    layout : StoreLayout
+    provenance, attributes : dict
+        Plain JSON: where the transport comes from; what `update` keeps.
+    final : bool
 
     Examples
     --------
@@ -148,7 +74,8 @@ class BlockStore:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._log = path, ArrayLog(path / "log")
+        self.path = path
+        self._log = ArrayLog(path / "log")
         self._refresh()
 
     def __repr__(self) -> str:
@@ -163,19 +90,21 @@ class BlockStore:
         overwrite: bool = False,
         **sizes: Any,
     ) -> BlockStore:
-        """An empty store at `path`, where nothing is yet, or a store to `overwrite`.
+        """Make an empty store at `path`, where nothing is yet, or a store to `overwrite`.
 
-        `sizes` are those of `Layout`, with `block_rows` columns a batch; `provenance` is plain
+        `sizes` are those of `StoreLayout`, with `block_rows` columns a batch; `provenance` is plain
         JSON.
         """
-        from ltcl import __version__  # here, because it is set after this module is imported
+        from ltcl import __version__  # set after this module is imported
 
-        path, layout = as_path(path), Layout(**sizes)
+        path = as_path(path)
+        layout = StoreLayout(**sizes)
         check_place(path, overwrite)
+        origin = {"versions": {"ltcl": __version__}}
+        if provenance:
+            origin |= provenance
         with fill_folder(path, replace=True) as folder:
-            _write_document(
-                folder, layout, {"versions": {"ltcl": __version__}, **(provenance or {})}, {}
-            )
+            write_document(folder, layout, origin, {})
         return cls(path)
 
     @classmethod
@@ -190,127 +119,158 @@ class BlockStore:
 
     @property
     def written(self) -> frozenset[tuple[int, int]]:
-        """(channel, batch) of all in the log; asked of the disk, so other writers' batches count."""
-        return frozenset(
-            (int(n[8]), int(n[10:])) for n in self._log.names if n.startswith("columns_")
-        )
+        """(channel, batch) of all in the log; the disk is asked, so other writers' batches count."""
+        matches = map(COLUMNS.fullmatch, self._log.names)
+        return frozenset((int(match[1]), int(match[2])) for match in matches if match)
 
     def missing(self) -> list[tuple[int, int]]:
         """(channel, batch) of all that is not committed, in order."""
-        every = itertools.product(range(self.layout.channels), range(self.layout.blocks("columns")))
-        return [] if self.final else sorted(set(every) - self.written)
+        if self.final:
+            return []
+        channels = range(self.layout.channels)
+        batches = range(self.layout.blocks("columns"))
+        return sorted(set(itertools.product(channels, batches)) - self.written)
 
     def write(self, channel: int, block: int, matrix: Any, variance: Any = None) -> None:
-        """Commit a batch: when this returns it is on the disk, whole; if it raises, what was there still is.
+        """Commit a batch: when this returns it is on the disk; if it raises, nothing has changed.
 
         `matrix` is sparse (columns, M), kept as float32; `variance` (nnz,) of entries is NaN where
         unknown.
         """
         name = self._name(channel, block)
-        C, variance = _checked(matrix, variance, self.layout.block_shape(block, "columns"))
+        shape = self.layout.block_shape(block, "columns")
+        columns = check_block(matrix, variance, shape)
+        arrays = {array: getattr(columns.matrix, array) for array in CSR}
         with self._writing():
-            self._log.put(name, **{array: getattr(C, array) for array in CSR}, variance=variance)
+            self._log.put(name, **arrays, variance=columns.variance)
 
     def block(self, channel: int, block: int) -> Block:
-        """Rows of T of a final store, else a batch as `write` took it; its checksums are compared."""
-        name, shape = self._name(channel, block), self.layout.block_shape(block, self._orientation)
+        """Rows of T of a final store, else a batch as `write` took it; checksums are compared."""
+        name = self._name(channel, block)
+        shape = self.layout.block_shape(block, self._orientation)
         with about(self.path, reading=True), about(name, reading=True):
             arrays = self._get(name)
-            data, *places = (arrays[array] for array in CSR)
-            matrix = sparse(
-                lambda: scipy.sparse.csr_array((data, *places), shape=shape), shape, len(data)
-            )
+            csr = tuple(arrays[array] for array in CSR)
+            entries = len(arrays["data"])
+            matrix = sparse_floats(lambda: scipy.sparse.csr_array(csr, shape=shape), shape, entries)
             return Block(matrix, arrays.get("variance"))
 
     def rows_again(self, channel: int, block: int) -> tuple[int, scipy.sparse.csr_array]:
         """First row and matrix of a `block` checked before, read without checks: as fast as the disk."""
-        first, shape = self.layout.span(block)[0], self.layout.block_shape(block)
-        places = (
-            self.path / self._places[self._name(channel, block)][name] / "c/0" for name in CSR
-        )
-        with contextlib.suppress(
-            OSError, ValueError, IndexError
-        ):  # an array of no entries has no file
-            bare = (np.fromfile(place, np.uint8)[:-4] for place in places)  # without crc32c
-            types = self.layout.dtype, np.int32, np.int64
-            data, indices, indptr = (
-                array.view(type_) for array, type_ in zip(bare, types, strict=True)
-            )
-            if len(data) == len(indices) == indptr[-1] and len(indptr) == shape[0] + 1:
-                kind = np.int32 if len(data) < 1 << 31 else np.int64  # SciPy makes both alike
-                return first, scipy.sparse.csr_array(
-                    (data, indices, indptr.astype(kind)), shape=shape
-                )
-        return first, self.block(channel, block).matrix  # in another layout, or damaged
+        first, _ = self.layout.span(block)
+        matrix = self._read_bare(channel, block)
+        if matrix is None:  # in another layout, or damaged
+            matrix = self.block(channel, block).matrix
+        return first, matrix
+
+    def _read_bare(self, channel: int, block: int) -> scipy.sparse.csr_array | None:
+        """Rows as the files hold them, None where these are not as `write_final` writes them."""
+        shape = self.layout.block_shape(block)
+        places = self._places[self._name(channel, block)]
+        types = {"data": self.layout.dtype, "indices": np.int32, "indptr": np.int64}
+        arrays = {}
+        # An array of no entries has no file.
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            for name, dtype in types.items():
+                stored = np.fromfile(self.path / places[name] / "c/0", np.uint8)
+                arrays[name] = stored[:-CRC32C_BYTES].view(dtype)
+            entries = len(arrays["data"])
+            pointers = arrays["indptr"]
+            if entries != len(arrays["indices"]) or entries != pointers[-1]:
+                return None
+            if len(pointers) != shape[0] + 1:
+                return None
+            # SciPy needs both of one type, and would convert the longer array.
+            pointer_type = np.int32 if entries < 1 << 31 else np.int64
+            csr = (arrays["data"], arrays["indices"], pointers.astype(pointer_type))
+            return scipy.sparse.csr_array(csr, shape=shape)
+        return None
 
     def extra(self, name: str, array: Any = None) -> np.ndarray:
         """A small array by name: committed where `array` is given, else read and checked."""
         if array is None:
             with about(self.path, reading=True):
-                return self._get(f"extra.{name}")["array"]
+                return self._get(f"{EXTRA}{name}")["array"]
         array = checks.real(name, array)
         with self._writing():
-            self._log.put(f"extra.{name}", array=array)
+            self._log.put(f"{EXTRA}{name}", array=array)
         return array
 
     @property
     def extras(self) -> list[str]:
         """Names of the extra arrays."""
-        return [name[6:] for name in self._places or self._log.names if name.startswith("extra.")]
+        names = self._places if self.final else self._log.names
+        return [name.removeprefix(EXTRA) for name in names if name.startswith(EXTRA)]
 
     def update(self, **attributes: Any) -> None:
         """Change some of the `attributes`, at once or not at all; other processes' changes are kept."""
         with self._writing():
-            _write_document(self.path, self.layout, self.provenance, self.attributes | attributes)
+            changed = self.attributes | attributes
+            write_document(self.path, self.layout, self.provenance, changed)
             self._refresh()
 
     def finalize(
         self,
         *,
-        sigmas=0.0,
-        change: Callable | None = None,
-        compressed: Parts | None = None,
-        memory=1 << 28,
+        sigmas: float = 0.0,
+        change: RowChange | None = None,
+        compressed: CompressedRecord | None = None,
+        memory: int = 1 << 28,
     ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
-        The diagonal is a first bounce where it is above 0 by `sigmas` standard deviations;
-        `change`, of channel, first row, rows (rows, N) and the variance of their entries, returns
-        the last two anew. A transport `compressed` takes the place of all columns. `memory` is
-        about how many bytes are used.
+        The diagonal is a first bounce where it is above 0 by `sigmas` standard deviations. `change`
+        of channel, first row, rows (rows, N) and the variance of their entries returns the last two
+        changed. A transport `compressed` takes the place of all columns. `memory` is about how many
+        bytes are used.
         """
         with self._writing(finished=True):
             if not self.final:
-                extras = {name: self.extra(name) for name in self.extras}
-                layout, state, rows = self.layout, self.attributes, self._rows(memory, change)
-                if compressed is not None:
-                    layout, arrays, texts = _compressed(compressed)
-                    rows, extras, state = (), extras | arrays, state | texts
-                elif missing := self.missing():
-                    raise FileError(
-                        f"lacks {len(missing)} blocks (channel, block) {missing[:6]}; resume it"
-                    )
-                _write_finished(self.path, layout, rows, extras, self.provenance, state, sigmas)
+                self._finish(sigmas, change, compressed, memory)
                 self._refresh()
             shutil.rmtree(self._log.path, ignore_errors=True)
 
+    def _finish(
+        self,
+        sigmas: float,
+        change: RowChange | None,
+        compressed: CompressedRecord | None,
+        memory: int,
+    ) -> None:
+        """Write the files of the final store."""
+        extras = {name: self.extra(name) for name in self.extras}
+        layout = self.layout
+        if compressed is not None:
+            layout, content = compressed_content(compressed)
+            content = FinalContent(
+                extras=extras | content.extras, state=self.attributes | content.state
+            )
+        else:
+            missing = self.missing()
+            if missing:
+                raise FileError(
+                    f"lacks {len(missing)} blocks (channel, block) {missing[:6]}; resume it"
+                )
+            rows = self._rows(memory, change)
+            content = FinalContent(rows=rows, extras=extras, state=self.attributes, sigmas=sigmas)
+        write_final(self.path, layout, self.provenance, content)
+
     def verify(self) -> None:
-        """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""
+        """Read everything and compare all checksums; FileError names the first that differs."""
         self._refresh()
         with about(self.path):
             for file in self._files:
                 self._check(file)
-            for name in () if self.final else self._log.names:
-                self._log.get(name)
+            if not self.final:
+                for name in self._log.names:
+                    self._log.get(name)
 
     def _name(self, channel: int, block: int) -> str:
         checks.count("channel", channel, least=0, most=self.layout.channels - 1)
         checks.count("block", block, least=0, most=self.layout.blocks(self._orientation) - 1)
-        return (
-            f"channel_{channel}/block_{block:06d}"
-            if self.final
-            else f"columns_{channel}.{block:06d}"
-        )
+        if self.final:
+            return f"channel_{channel}/block_{block:06d}"
+        return f"columns_{channel}.{block:06d}"
 
     def _get(self, name: str) -> dict[str, np.ndarray]:
         if not self.final:
@@ -318,17 +278,20 @@ class BlockStore:
         return {array: self._read(place) for array, place in self._places[name].items()}
 
     def _read(self, place: str) -> np.ndarray:
+        """An array of a final store, whose checksums are compared."""
         import zarr
 
         with about(place, reading=True):
             self._check(f"{place}/zarr.json")
             array = zarr.open_array(self.path / place, mode="r")
-            stored = self._check(f"{place}/c{'/0' * array.ndim}") if array.size else 0
-            declared("it", array.dtype, array.shape, stored)
+            stored = 0
+            if array.size:
+                stored = self._check(f"{place}/c{'/0' * array.ndim}")
+            check_declared("it", array.dtype, array.shape, stored)
             return np.asarray(array[...]).reshape(array.shape)
 
     def _check(self, file: str) -> int:
-        """The bytes of a file of a final store, whose checksum is compared."""
+        """Compare the checksum of a file of a final store; its bytes."""
         raw = input_file(self.path / file).read_bytes()
         if hashlib.sha256(raw).hexdigest() != self._files[file]:
             raise FileError(f"{file} is damaged: its checksum is not that of its bytes")
@@ -344,88 +307,151 @@ class BlockStore:
             yield
 
     def _refresh(self) -> None:
+        """Read the document again: other processes may have changed it."""
         with about(self.path, reading=True):
-            content = _read_document(self.path / "zarr.json")
-            content["ltcl"].pop("orientation", None)  # of earlier stores
-            self.layout, self.provenance = Layout(**content["ltcl"]), content["provenance"]
+            content = read_document(self.path / "zarr.json")
+            self.layout = StoreLayout(**content["ltcl"])
+            self.provenance = content["provenance"]
             self.attributes: dict[str, Any] = content["state"]
-            files = (
-                _files_1(self.path, content) if self.layout.schema == 1 else content.get("files")
-            )
-            self.final, self._files = files is not None, files or {}
+            self.final = "files" in content
+            self._files: dict[str, str] = content.get("files", {})
             self._orientation = "rows" if self.final else "columns"
-            self._places: dict[str, dict[str, str]] = {}  # of arrays in their groups
-            for place, group, array in (
-                m.groups() for m in map(_ARRAY.fullmatch, self._files) if m
-            ):
-                arrays = self._places.setdefault(group.replace("extra/", "extra."), {})
-                arrays[_BINSPARSE.get(array, array)] = place
+            self._places = places_of_arrays(self._files)
 
-    def _rows(self, memory: int, change: Callable | None) -> Iterator[tuple[int, int, Block]]:
+    def _rows(self, memory: int, change: RowChange | None) -> Iterator[PlacedBlock]:
         """All blocks of rows; as many as fit the memory are gathered in a pass over the columns."""
-        layout, span, batches = self.layout, self.layout.span, range(self.layout.blocks("columns"))
-        size = sum(file.stat().st_size for file in self._log.path.iterdir()) // layout.channels
-        passes = min(
-            4 * size // memory + 1, layout.blocks()
-        )  # entries as cut, joined and transposed
-        change = change or (lambda channel, first, *rows: rows)
+        layout = self.layout
+        log_bytes = sum(file.stat().st_size for file in self._log.path.iterdir())
+        channel_bytes = log_bytes // layout.channels
+        # Entries lie in memory four times: as they are read, cut, joined and transposed.
+        passes = min(4 * channel_bytes // memory + 1, layout.blocks())
         parts = np.array_split(np.arange(layout.blocks()), passes)
-        for channel, blocks in itertools.product(range(layout.channels), parts):
-            first, stop, columns = span(blocks[0])[0], span(blocks[-1])[1], []
-            for C, variance in (self.block(channel, batch) for batch in batches):
-                data = np.stack([C.data, variance], axis=1).view(np.complex64).ravel()  # T + i V
-                columns.append(
-                    scipy.sparse.csr_array((data, C.indices, C.indptr), C.shape)[:, first:stop]
-                )
-            T = scipy.sparse.vstack(columns, "csr").T.tocsr()
-            for block in blocks.tolist():
-                R = T[span(block)[0] - first : span(block)[1] - first]
-                rows, variance = change(channel, span(block)[0], R.real, R.data.imag.copy())
-                yield channel, block, _checked(rows, variance, layout.block_shape(block))
+        for channel, part in itertools.product(range(layout.channels), parts):
+            numbers = part.tolist()
+            first, _ = layout.span(numbers[0])
+            _, stop = layout.span(numbers[-1])
+            T, V = self._gather(channel, first, stop)
+            for number in numbers:
+                start, end = layout.span(number)
+                rows = T[start - first : end - first]
+                variance = V[start - first : end - first].data
+                if change is not None:
+                    rows, variance = change(channel, start, rows, variance)
+                block = check_block(rows, variance, layout.block_shape(number))
+                yield PlacedBlock(channel, number, block)
+
+    def _gather(
+        self, channel: int, first: int, stop: int
+    ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
+        """Rows first .. stop - 1 of T and of the variances, which have the same pattern."""
+        values = []
+        variances = []
+        for batch in range(self.layout.blocks("columns")):
+            columns, variance = self.block(channel, batch)
+            pattern = (variance, columns.indices, columns.indptr)
+            variance_columns = scipy.sparse.csr_array(pattern, shape=columns.shape)
+            values.append(columns[:, first:stop])
+            variances.append(variance_columns[:, first:stop])
+        T = scipy.sparse.vstack(values, "csr").T.tocsr()
+        V = scipy.sparse.vstack(variances, "csr").T.tocsr()
+        return scipy.sparse.csr_array(T), scipy.sparse.csr_array(V)
 
 
-def read(path: Path) -> Record | Parts:
-    """The transport in a store, none of it in memory yet; each block is checked once, here."""
+def places_of_arrays(files: Any) -> dict[str, dict[str, str]]:
+    """Folders of the arrays of a final store, by group and name."""
+    places: dict[str, dict[str, str]] = {}
+    for file in files:
+        match = ARRAY_FILE.fullmatch(file)
+        if match is None:
+            continue
+        place, group, array = match.groups()
+        arrays = places.setdefault(group.replace("extra/", EXTRA), {})
+        arrays[BINSPARSE.get(array, array)] = place
+    return places
+
+
+def read(path: Path) -> StoreRecord | CompressedRecord:
+    """The transport in a store, its matrices still on the disk; each block is checked once, here."""
     store = BlockStore.open(path)
     if not store.final:
         raise FileError("is a scan that is not finished; finalize it first")
-    if store.layout.kind == "compressed":
-        arrays = {
-            name: store.extra(name) for name in store.attributes["arrays"]
-        }  # others are no part of it
-        return Parts(
-            arrays | {name: np.array(str(text)) for name, text in store.attributes["texts"].items()}
-        )
-    matrices = tuple(StoredRows(store, channel) for channel in range(store.layout.channels))
-    extras = {n: store.extra(n) for n in store.extras if n in EXTRAS or n.startswith("noise_")}
-    F, grids = extras.get("first_bounce"), (store.layout.grid, store.layout.camera_grid)
-    F = F[0] if F is not None and len(F) == 1 else F
-    return Record(matrices, *grids, F, extras.get("mixing"), Noise.from_arrays(extras))
+    layout = store.layout
+    if layout.kind == "compressed":
+        # A scan may have left other arrays, which are no part of the transport.
+        arrays = {name: store.extra(name) for name in store.attributes["arrays"]}
+        for name, text in store.attributes["texts"].items():
+            arrays[name] = np.array(str(text))
+        return CompressedRecord(arrays)
+
+    extras = {}
+    for name in store.extras:
+        if name in EXTRAS or name.startswith("noise_"):
+            extras[name] = store.extra(name)
+    F = extras.get("first_bounce")
+    if F is not None and len(F) == 1:
+        F = F[0]
+    return StoreRecord(
+        matrices=tuple(StoredRows(store, channel) for channel in range(layout.channels)),
+        grid=layout.grid,
+        camera_grid=layout.camera_grid,
+        first_bounce=F,
+        mixing=extras.get("mixing"),
+        noise=Noise.from_arrays(extras),
+    )
 
 
-def write(path: Path, content: Record | Parts) -> None:
-    """Write a store in a temporary folder and put it at `path` when it is whole; float64 stays float64."""
+def write(path: Path, record: StoreRecord | CompressedRecord) -> None:
+    """Write a store in a temporary folder and put it at `path` when it is whole.
+
+    Entries of float64 stay float64.
+    """
     check_place(path, overwrite=True)
-    rows, state = (), {}
-    if isinstance(content, Parts):
-        layout, extras, state = _compressed(content)
+    if isinstance(record, CompressedRecord):
+        layout, content = compressed_content(record)
     else:
-        T: Any = content.matrices
-        dtype = np.result_type(*(M.dtype for M in T), np.float32).name
-        layout = Layout(content.shape, content.grid, content.camera_grid, len(T), dtype=dtype)
-        extras = {
-            n: np.atleast_2d(a)
-            for n, a in vars(content).items()
-            if n in EXTRAS[2:] and a is not None
-        }
-        extras |= {} if content.noise is None else content.noise.to_arrays()
-        every = itertools.product(range(len(T)), range(layout.blocks()))
-        rows = (
-            (c, k, Block(scipy.sparse.csr_array(T[c][slice(*layout.span(k))]), None))
-            for c, k in every
-        )
+        layout, content = _record_content(record)
     with fill_folder(path, replace=True) as folder:
-        _write_finished(folder, layout, rows, extras, {}, state)
+        write_final(folder, layout, {}, content)
+
+
+def _record_content(record: StoreRecord) -> tuple[StoreLayout, FinalContent]:
+    """Layout and content of the store of matrices."""
+    matrices: Any = record.matrices
+    dtype = np.result_type(*(matrix.dtype for matrix in matrices), np.float32).name
+    layout = StoreLayout(
+        record.shape, record.grid, record.camera_grid, channels=len(matrices), dtype=dtype
+    )
+    extras = {}
+    for name, value in (("first_bounce", record.first_bounce), ("mixing", record.mixing)):
+        if value is not None:
+            extras[name] = np.atleast_2d(value)
+    if record.noise is not None:
+        extras |= record.noise.to_arrays()
+
+    def rows() -> Iterator[PlacedBlock]:
+        for channel, matrix in enumerate(matrices):
+            for number in range(layout.blocks()):
+                start, stop = layout.span(number)
+                block = Block(scipy.sparse.csr_array(matrix[start:stop]), None)
+                yield PlacedBlock(channel, number, block)
+
+    return layout, FinalContent(rows=rows(), extras=extras, state={})
+
+
+def compressed_content(record: CompressedRecord) -> tuple[StoreLayout, FinalContent]:
+    """Layout and content of the store of a compressed transport."""
+    texts = {}
+    arrays = {}
+    for name in sorted(record.arrays):
+        array = record.arrays[name]
+        if array.dtype.kind in "SU":
+            texts[name] = str(array)
+        else:
+            arrays[name] = array
+    channels = len(record.first_bounce)
+    layout = StoreLayout(record.shape, record.grid, channels=channels, kind="compressed")
+    state = {"texts": texts, "arrays": list(arrays)}
+    return layout, FinalContent(extras=arrays, state=state)
 
 
 def check_place(path: Path, overwrite: bool) -> None:
@@ -433,124 +459,11 @@ def check_place(path: Path, overwrite: bool) -> None:
     with about(path):
         target = Path(os.path.realpath(path))
         restore(target)
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            document = target / "zarr.json"
-            is_store = document.is_file() and document.read_bytes().startswith(_START)
-            if not (is_store and overwrite):
-                raise FileError(
-                    f"exists; {'give overwrite=True' if is_store else 'it is no store of ltcl'}"
-                )
-
-
-def _compressed(parts: Parts) -> tuple[Layout, dict[str, Any], dict[str, Any]]:
-    """Layout, arrays and attributes of their store."""
-    texts = {name: str(array) for name, array in parts.arrays.items() if array.dtype.kind in "SU"}
-    arrays = {name: parts.arrays[name] for name in sorted(parts.arrays.keys() - texts.keys())}
-    layout = Layout(parts.shape, parts.grid, channels=len(parts.first_bounce), kind="compressed")
-    return layout, arrays, {"texts": texts, "arrays": list(arrays)}
-
-
-def _checked(matrix: Any, variance: Any, shape: tuple[int, int]) -> Block:
-    """What is to be written, as float32; refused before anything is."""
-    matrix = checks.csr("matrix", matrix)
-    checks.shape("matrix", matrix, shape)
-    with np.errstate(over="ignore"):
-        values = checks.finite("matrix as float32", matrix.data.astype(np.float32))
-    variance = (
-        np.full(matrix.nnz, np.nan) if variance is None else checks.real("variance", variance)
-    )
-    checks.shape("variance", variance, (matrix.nnz,))
-    if np.any(variance < 0) or np.any(np.isinf(variance)):
-        raise InputError(
-            "variance is negative or infinite; it must be at least 0, or NaN where unknown"
-        )
-    rows = scipy.sparse.csr_array((values, matrix.indices, matrix.indptr), shape=shape)
-    return Block(rows, variance.astype(np.float32))
-
-
-def _write_finished(
-    root: Path,
-    layout: Layout,
-    rows: Any,
-    extras: Any,
-    provenance: Any,
-    state: Any,
-    sigmas: float = 0.0,
-) -> None:
-    """Write T and all small arrays by zarr into `root`, flushed, and last the document with their SHA-256."""
-    groups = ["extra", *(f"channel_{c}" for c in range(layout.channels))]
-    for group in groups:
-        shutil.rmtree(root / group, ignore_errors=True)  # of a process that ended here
-        _write_group(root / group, {})
-    F = np.zeros((layout.channels, layout.shape[1]))
-    is_square = layout.camera_grid in (None, layout.grid)  # only then T has a first bounce
-    types = {"values": layout.dtype, "indices_1": "int32", "pointers_to_1": "int64"}
-    for channel, number, (T, variance) in rows:
-        arrays = {
-            name: np.asarray(getattr(T, _BINSPARSE[name]), dtype) for name, dtype in types.items()
-        }
-        arrays |= {} if variance is None else {"variance": variance}
-        header = {"version": "0.1", "format": "CSR", "shape": T.shape, "data_types": types}
-        header["number_of_stored_values"] = T.nnz
-        _write_group(root / f"channel_{channel}/block_{number:06d}.0", arrays, binsparse=header)
-        if is_square:
-            start, stop = layout.span(number)
-            V = variance if sigmas > 0 and variance is not None else np.zeros(T.nnz)
-            V = scipy.sparse.csr_array((V, T.indices, T.indptr), shape=T.shape).diagonal(start)
-            F[channel, start:stop] = first_bounce.certain(T.diagonal(start), V, sigmas)
-    if layout.kind == "blocks" and is_square:
-        extras = {"first_bounce": F, **extras}
-    for name, array in extras.items():
-        _write_group(root / "extra" / f"{name}.0", {"array": np.asarray(array)})
-    files = [file for group in groups for file in flush_tree(root / group)]
-    sums = {
-        f.relative_to(root).as_posix(): hashlib.sha256(f.read_bytes()).hexdigest() for f in files
-    }
-    _write_document(root, layout, provenance, state, files=sums)
-
-
-def _write_group(folder: Path, arrays: Mapping[str, np.ndarray], **attributes: Any) -> None:
-    import zarr.codecs
-
-    group = zarr.create_group(folder, attributes=attributes)
-    options: Any = {
-        "compressors": zarr.codecs.Crc32cCodec(),
-        "config": {"write_empty_chunks": True},
-    }
-    for name, array in arrays.items():
-        chunks = tuple(max(n, 1) for n in array.shape)
-        group.create_array(name, data=array, chunks=chunks, **options)
-
-
-def _write_document(root: Path, layout: Layout, provenance: Any, state: Any, **files: Any) -> None:
-    """Seal and write the zarr.json: its checksum is that of the same bytes with zeros in its place."""
-    content = {"ltcl": asdict(layout), "provenance": provenance, "state": state, **files}
-    group = {"attributes": {"checksum": _UNSEALED.decode(), **content}, "zarr_format": 3}
-    try:
-        raw = json.dumps(group | {"node_type": "group"}, allow_nan=False).encode()
-    except (TypeError, ValueError) as error:
-        raise InputError(f"attributes are not plain JSON: {str(error)!a:.150}") from None
-    with replace_file(root / "zarr.json") as temporary:
-        temporary.write_bytes(raw.replace(_UNSEALED, hashlib.sha256(raw).hexdigest().encode(), 1))
-
-
-def _read_document(file: Path) -> dict[str, Any]:
-    """The attributes in a zarr.json; refused if a byte of it has changed."""
-    raw, stop = input_file(file).read_bytes(), len(_START) + len(_UNSEALED)
-    checksum = hashlib.sha256(_START + _UNSEALED + raw[stop:]).hexdigest().encode()
-    if not raw.startswith(_START + checksum):
-        raise FileError(f"{file.name} is damaged, or not written by ltcl: its checksum differs")
-    return json.loads(raw)["attributes"]
-
-
-def _files_1(root: Path, content: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of the arrays of a final store of schema 1, which the zarr.json of each group has."""
-    if not content.get("final"):
-        raise FileError("was begun by an earlier ltcl; finish it with that version")
-    files = {}
-    for group in content["final"]:
-        for name, entry in _read_document(root / group / "zarr.json")["arrays"].items():
-            files[f"{group}/{name}/zarr.json"] = entry["metadata"]
-            if "sha256" in entry:  # none of an empty array
-                files[f"{group}/{name}/c{'/0' * len(entry['shape'])}"] = entry["sha256"]
-    return files
+        if not target.exists():
+            return
+        if target.is_dir() and not any(target.iterdir()):
+            return
+        if not is_store(target):
+            raise FileError("exists; it is no store of ltcl")
+        if not overwrite:
+            raise FileError("exists; give overwrite=True")

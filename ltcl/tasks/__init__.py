@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The tasks that ltcl is used for: compensation, separation, relighting, compression, analysis, denoising."""
+"""Tasks of ltcl: compensation, separation, relighting, compression, analysis and denoising."""

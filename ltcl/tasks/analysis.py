@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a transport is like before it is used: norms, spectrum, what each method costs, whether it can be."""
+"""`analyze`: norms and spectrum of a transport, the products of each method, and a verdict."""
 
 from __future__ import annotations
 
@@ -11,27 +11,29 @@ import numpy as np
 
 from ltcl import checks, theory
 from ltcl.errors import InputError
-from ltcl.operators import IdentityPlus
+from ltcl.operators import IdentityPlus, Operator
+from ltcl.operators.base import Norms
 from ltcl.solvers.auto import survey
 from ltcl.tasks import report
 from ltcl.theory.forecast import LEAST_RTOL
 from ltcl.transport import diagnostics
 from ltcl.transport.diagnostics import Energy
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 from ltcl.transport.verdict import Verdict, verdict
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ChannelAnalysis:
-    """One colour channel.
+    """Analysis of a colour channel.
 
     Attributes
     ----------
     norm_one, norm_inf, norm_frobenius : float
-        Of R; NaN where the operator cannot see its entries. ||R||_inf < 1 makes the series converge.
+        Norms of R; NaN if the operator does not show its entries. The series converges if
+        ||R||_inf < 1.
     spectral_radius, spectral_radius_change, spectral_radius_bounds, spectral_radius_certificate
-        rho(R) and what is known of it: see `theory.SpectralRadius`. The paper's iteration converges
-        below 1.
+        rho(R), its bounds and their certificate: see `theory.SpectralRadius`. The paper's iteration
+        converges below 1.
     albedo : float
         rho / (1 + rho): the uniform albedo of a closed scene with this radius (eq. 14).
     bounds : (lower, upper)
@@ -40,13 +42,13 @@ class ChannelAnalysis:
         Products (sweeps of Gauss-Seidel) each iterative method needs to reach rtol; infinite where
         it diverges, NaN where there is no forecast.
     certificates : dict
-        What each forecast rests on; see `theory.Forecast`.
+        Basis of each forecast; see `theory.Forecast`.
     series : tuple of theory.Terms
-        What 1, 2, 4, 8 and 16 terms of the series leave undone (eq. 13, 15, 16), m from the bound
-        on rho(R).
+        Light that 1, 2, 4, 8 and 16 terms of the series leave out (eq. 13, 15, 16), with m from the
+        bound on rho(R).
     first_bounce : (smallest, median, largest)
     reciprocity_defect, negative_bounce : float
-        Both 0 of a Lambertian scene without noise, the second above 0.005 of glossy ones:
+        Both are 0 in a Lambertian scene without noise; the second is above 0.005 in glossy ones:
         `ltcl.transport.diagnostics`.
     energy : Energy
     """
@@ -69,9 +71,9 @@ class ChannelAnalysis:
     energy: Energy
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Analysis:
-    """Result of `ltcl.analyze`: one entry of `channels` per colour channel, and what T is good for."""
+    """Result of `ltcl.analyze`: an analysis of each colour channel, and the verdict on T."""
 
     shape: tuple[int, int]
     grid: tuple[int, int]
@@ -82,32 +84,48 @@ class Analysis:
     verdict: Verdict
 
     def __repr__(self) -> str:
-        (h, w), radii = (
-            self.grid,
-            ", ".join(f"{channel.spectral_radius:.3g}" for channel in self.channels),
-        )
-        return f"<ltcl Analysis grid {h} x {w}, rho(R) {radii}>"
+        height, width = self.grid
+        radii = ", ".join(f"{channel.spectral_radius:.3g}" for channel in self.channels)
+        return f"<ltcl Analysis grid {height} x {width}, rho(R) {radii}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
+        # Imports OpenCV.
+        from ltcl.images.thumbnails import thumbnails
 
         bars = {}
         for channel in self.channels:
-            counts = {name: n for name, n in channel.products.items() if math.isfinite(n)}
-            label = "products: " + ", ".join(f"{name} {n:.0f}" for name, n in counts.items())
-            lengths = np.array([*counts.values()])[:, None]
-            bars[label] = np.repeat(np.linspace(0, lengths.max(), 64) <= lengths, 4, axis=0)
+            names = []
+            products = []
+            for name, count in channel.products.items():
+                if math.isfinite(count):
+                    names.append(f"{name} {count:.0f}")
+                    products.append(count)
+            bars["products: " + ", ".join(names)] = _bar_chart(products)
         return thumbnails(self, bars)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, lists and dicts for JSON; what is infinite or unknown is None."""
+        """Plain numbers, lists and dicts for JSON; infinite or unknown numbers are None."""
         return report.plain(self)
 
 
 def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
-    """Norms and spectral radius of R, the products each method would need, and checks of the measurement.
+    """Analyze the norms and the spectrum of R, the cost of each method, and the measurement.
 
-    T is square, else InputError. The forecast is for the tolerance `rtol`, from 1.2e-7 to 1.
+    Parameters
+    ----------
+    T : Transport
+        A square transport.
+    rtol : float
+        Tolerance of the forecast, from 1.2e-7 to 1.
+
+    Returns
+    -------
+    Analysis
+
+    Raises
+    ------
+    InputError
+        A T that is not square, or a tolerance out of range.
 
     Examples
     --------
@@ -116,36 +134,49 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     >>> 0.5 < a.channels[0].spectral_radius < 0.7  # m / (1 - m) = 2/3, less what diag(T) took along
     True
     """
-    require(T)
+    check_transport(T)
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
-    systems = zip(
+    channels = []
+    for matrix, F, S, negative in zip(
         T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True
+    ):
+        channels.append(_analyze_channel(matrix, F, S, negative, rtol))
+    highest_bounces = [channel.energy.bounce_highest for channel in channels]
+    judged = verdict(
+        T,
+        negative_bounce=np.fmax.reduce(T.negative_bounces),
+        bounce_highest=np.fmax.reduce(highest_bounces),
     )
-    channels = tuple(_channel(*system, rtol) for system in systems)
-    negative, highest = T.negative_bounces, [channel.energy.bounce_highest for channel in channels]
-    known = {"negative_bounce": np.fmax.reduce(negative), "bounce_highest": np.fmax.reduce(highest)}
-    judged = verdict(T, **known)
-    return Analysis(T.shape, T.grid, rtol, T.nbytes, int(T.masked.sum()), channels, judged)
+    return Analysis(
+        shape=T.shape,
+        grid=T.grid,
+        rtol=rtol,
+        nbytes=T.nbytes,
+        masked=int(T.masked.sum()),
+        channels=tuple(channels),
+        verdict=judged,
+    )
 
 
-def _channel(
-    T: Any, F: np.ndarray, S: IdentityPlus, negative: float, rtol: float
+def _analyze_channel(
+    T: Any, F: np.ndarray, S: IdentityPlus, negative_bounce: float, rtol: float
 ) -> ChannelAnalysis:
-    try:
-        norms = S.R.norms()
-    except InputError:
-        norms = None
+    norms = _known_norms(S.R)
     rho = theory.spectral_radius(S.R, norms=norms)
     bounds = theory.free_bounds(S)
     surveyed = survey(S)
     spectrum = surveyed.spectrum if surveyed.in_an_interval else None
     forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, surveyed.self_adjoint)
-    upper = rho.upper if math.isfinite(rho.upper) else rho.value
+    largest_radius = rho.upper if math.isfinite(rho.upper) else rho.value
+    # rho(R) <= m / (1 - m), eq. 14.
+    m = largest_radius / (1.0 + largest_radius)
     lit = F[F > 0]
+    if norms is None:
+        norms = Norms(one=math.nan, inf=math.nan, frobenius=math.nan, lowest=math.nan)
     return ChannelAnalysis(
-        norm_one=norms.one if norms else math.nan,
-        norm_inf=norms.inf if norms else math.nan,
-        norm_frobenius=norms.frobenius if norms else math.nan,
+        norm_one=norms.one,
+        norm_inf=norms.inf,
+        norm_frobenius=norms.frobenius,
         spectral_radius=rho.value,
         spectral_radius_change=rho.change,
         spectral_radius_bounds=(rho.lower, rho.upper),
@@ -154,9 +185,24 @@ def _channel(
         bounds=bounds,
         products={name: forecast.products for name, forecast in forecasts.items()},
         certificates={name: forecast.certificate for name, forecast in forecasts.items()},
-        series=theory.after_terms(upper / (1.0 + upper)),  # rho(R) <= m / (1 - m), eq. 14
+        series=theory.after_terms(m),
         first_bounce=(float(lit.min()), float(np.median(lit)), float(lit.max())),
         reciprocity_defect=diagnostics.reciprocity_defect(T, F),
-        negative_bounce=negative,
+        negative_bounce=negative_bounce,
         energy=diagnostics.check_energy(T, F, S),
     )
+
+
+def _known_norms(R: Operator) -> Norms | None:
+    """Norms of R; None if it does not show its entries."""
+    try:
+        return R.norms()
+    except InputError:
+        return None
+
+
+def _bar_chart(lengths: list[float]) -> np.ndarray:
+    """A picture (4 * bars, 64) of horizontal bars."""
+    bars = np.array(lengths)[:, None]
+    columns = np.linspace(0, bars.max(), 64)
+    return np.repeat(columns <= bars, 4, axis=0)

@@ -7,15 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 
 def relight(T: Transport, pattern: Any) -> np.ndarray:
-    """The picture the camera sees under `pattern`; the same as ``T @ pattern``.
+    """Compute the picture that the camera sees under `pattern`; the same as ``T @ pattern``.
 
-    `pattern` is linear projector light, (h, w), (h, w, 3), frames of these, or (N,). The picture is
-    float32, on the camera's grid, in colour where T or the pattern is. Another size or NaN raise
-    InputError.
+    Parameters
+    ----------
+    T : Transport
+    pattern : (h, w), (h, w, 3), frames of these, or (N,)
+        Linear projector light.
+
+    Returns
+    -------
+    array
+        float32, on the camera's grid, in colour if T or the pattern is.
+
+    Raises
+    ------
+    InputError
+        A pattern of another size, or with NaN.
 
     Examples
     --------
@@ -24,4 +36,5 @@ def relight(T: Transport, pattern: Any) -> np.ndarray:
     >>> print(ltcl.relight(T, numpy.array([[1.0, 1.0]])))
     [[0.6 0.6]]
     """
-    return require(T, square=False) @ pattern
+    check_transport(T, square=False)
+    return T @ pattern

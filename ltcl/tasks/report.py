@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What happened, as plain data: the JSON report beside every result, and what ``--json`` prints."""
+"""Results as plain data: the JSON report beside every result, and the output of ``--json``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ltcl.solvers import Solution
 
 
 def plain(value: Any) -> Any:
-    """`value` in the types that JSON knows; numbers that are not finite become None."""
+    """Convert `value` to the types that JSON knows; numbers that are not finite become None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, dict):
@@ -30,7 +30,9 @@ def plain(value: Any) -> Any:
         return [plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    return str(value)
 
 
 def dumps(value: Any) -> str:
@@ -46,41 +48,62 @@ def write(path: str | os.PathLike[str], value: Any) -> None:
 
 def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
     """Facts of a solve, one entry per colour channel, without the solution itself."""
-    names = (
-        "method",
-        "iterations",
-        "products",
-        "residual",
-        "residuals",
-        "seconds",
-        "reason",
-        "error",
-    )
-    return [
-        {name: getattr(channel, name) for name in names}
-        | {"status": channel.status.name.lower(), "standard_error": _spread(channel.standard_error)}
-        for channel in (solved if isinstance(solved, tuple) else (solved,))
-    ]
+    channels = solved if isinstance(solved, tuple) else (solved,)
+    return [_solution_facts(channel) for channel in channels]
 
 
-def _spread(error: np.ndarray | None) -> dict[str, float] | None:
-    """Of the standard errors of pixels that the method knows, and how many it does not."""
-    if error is None:
+def _solution_facts(solved: Solution) -> dict[str, Any]:
+    return {
+        "method": solved.method,
+        "iterations": solved.iterations,
+        "products": solved.products,
+        "residual": solved.residual,
+        "residuals": solved.residuals,
+        "seconds": solved.seconds,
+        "reason": solved.reason,
+        "error": solved.error,
+        "status": solved.status.name.lower(),
+        "standard_error": _summary(solved.standard_error),
+    }
+
+
+def _summary(standard_error: np.ndarray | None) -> dict[str, float] | None:
+    """The largest and the median error of pixels, and the number of pixels without a known one."""
+    if standard_error is None:
         return None
-    known = error[~np.isnan(error)]
-    largest, median = (np.max(known), np.median(known)) if known.size else (np.nan, np.nan)
-    return {"largest": float(largest), "median": float(median), "unknown": error.size - known.size}
+    known = standard_error[~np.isnan(standard_error)]
+    largest = math.nan
+    median = math.nan
+    if known.size > 0:
+        largest = float(np.max(known))
+        median = float(np.median(known))
+    return {
+        "largest": largest,
+        "median": median,
+        "unknown": standard_error.size - known.size,
+    }
 
 
 def device(opened: Device) -> dict[str, Any]:
-    """Which device worked."""
-    index = opened.description.index
-    return {"index": index, "name": opened.name, "kind": opened.kind, "driver": opened.driver}
+    """Facts of the device that worked."""
+    return {
+        "index": opened.description.index,
+        "name": opened.name,
+        "kind": opened.kind,
+        "driver": opened.driver,
+    }
 
 
 def versions() -> dict[str, str]:
     """Versions that a result can depend on."""
-    from ltcl import __version__  # `ltcl` itself imports this module
+    # `ltcl` itself imports this module.
+    from ltcl import __version__
 
-    own = {"ltcl": __version__, "python": platform.python_version(), "system": platform.platform()}
-    return own | {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "pyopencl")}
+    facts = {
+        "ltcl": __version__,
+        "python": platform.python_version(),
+        "system": platform.platform(),
+    }
+    for name in ("numpy", "scipy", "pyopencl"):
+        facts[name] = importlib.metadata.version(name)
+    return facts

@@ -14,7 +14,7 @@ whatever the tolerance. With one camera they are exact of Lambertian scenes only
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,47 +22,33 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.errors import ConvergenceError, InputError, InputTypeError
-from ltcl.solvers import Inverse, Solution, solve, solve_each
+from ltcl.errors import InputTypeError
+from ltcl.operators import Operator
+from ltcl.solvers import Inverse, Solution, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
+from ltcl.tasks.plausibility import bounce_warning, check_direct_light
+from ltcl.tasks.requirements import check_inverse, default_rtol, error_note, resolve_reference
 from ltcl.transport import frames as layout
-from ltcl.transport.first_bounce import ENTRIES
-from ltcl.transport.transport import (
-    Transport,
-    default_rtol,
-    diagnostics,
-    error_note,
-    require,
-    require_inverse,
-    resolve_reference,
-)
-from ltcl.transport.uncertainty import SeparationStd, of_separation
+from ltcl.transport.transport import Transport, check_transport
+from ltcl.transport.uncertainty import SeparationStd, separation_std
 
 logger = logging.getLogger(__name__)
 
-# Of a scene taken for Lambertian: noise of path tracing alone gives a defect of 0.05 and takes
-# 0.0004.
-LARGEST_DEFECT = 0.1
-LARGEST_NEGATIVE = 0.005
-LARGEST_AMBIENT = (
-    0.05  # as of the verdict; 0 of clean scenes, mostly above with 1 % of ambient light
-)
+# Tolerance of each solve if none is given.
 RTOL = 1e-3
-_SIGMAS = 5.0  # of direct light beyond what it can be: no noise
-_UNKNOWN = 0.5  # of the image: direct light that is uncertain by more is no result
-_NEGATIVE = (
-    0.01  # of the light of an image: what has more of negative light is no picture, and not judged
-)
+# Seeds of methods that sample are below this number.
+SEED_LIMIT = 1 << 64
 
 
-@dataclass(frozen=True, repr=False, eq=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Separation:
     """Result of `ltcl.separate`. Pictures have the shape of the image, linear, float32.
 
     Attributes
     ----------
     direct, indirect : array
-        Bounce 0, light that went from projector to surface to camera; and the rest of the image.
+        Bounce 0, light that went from projector to surface to camera; and all other light of the
+        image.
     bounces : array, (bounces, ...)
         bounces[0] is the first indirect bounce.
     rest : array
@@ -70,13 +56,13 @@ class Separation:
     solutions : tuple
         Solves in the order direct, first bounce, ...; per entry one Solution, or 3 in colour.
     reciprocity_defect, negative_bounce : float
-        Of T, see `ltcl.transport.diagnostics`: both 0 of a Lambertian scene measured without noise;
-        NaN where unknown. The relative error of the first bounce of a glossy scene is a few times
-        the latter, of others more.
+        Signs in T that bounces are approximate, see `ltcl.transport.diagnostics`: both 0 of a
+        Lambertian scene measured without noise; NaN where unknown. The relative error of the first
+        bounce of a glossy scene is a few times the latter, of others more.
     warning : str
-        Why the bounces are only approximate, also logged; empty where the defect is at most 0.1,
-        the negative light at most 0.005, of a compressed T more by its error, and T shows no
-        ambient light; or unknown.
+        The reasons why the bounces are only approximate, also logged. Empty where these are
+        unknown, or the defect is at most 0.1, the negative light at most 0.005, of a compressed T
+        more by its error, and T shows no ambient light.
     transport_error : float
         ``.error`` of T, or of `exact` where that was given, beyond the tolerance of each solve.
     """
@@ -90,24 +76,33 @@ class Separation:
     negative_bounce: float
     warning: str
     transport_error: float
-    _transports: tuple[Transport, Transport]  # that solves; whose noise it is
+    _solving: Transport
+    _reference: Transport
     _inverse: Inverse | None
 
     @cached_property
     def std(self) -> SeparationStd:
-        """Standard deviations by the noise of T, `ltcl.transport.uncertainty`, computed at the first call."""
-        T, true = self._transports
-        return of_separation(T, true.noise, [self.direct, *self.bounces], self._inverse)
+        """Standard deviations by the noise of T, computed at the first call.
+
+        See `ltcl.transport.uncertainty`.
+        """
+        pictures = [self.direct, *self.bounces]
+        return separation_std(self._solving, self._reference.noise, pictures, self._inverse)
 
     def __repr__(self) -> str:
-        shape, error = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
-        return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{error}>"
+        size = " x ".join(map(str, self.direct.shape))
+        error = error_note(self.transport_error)
+        return f"<ltcl Separation {size}, direct and {len(self.bounces)} bounces{error}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
+        # Imports OpenCV.
+        from ltcl.images.thumbnails import thumbnails
 
-        bounces = {f"bounce {k}": bounce for k, bounce in enumerate(self.bounces, 1)}
-        return thumbnails(self, {"direct": self.direct, **bounces, "rest": self.rest})
+        pictures = {"direct": self.direct}
+        for number, bounce in enumerate(self.bounces, 1):
+            pictures[f"bounce {number}"] = bounce
+        pictures["rest"] = self.rest
+        return thumbnails(self, pictures)
 
 
 def separate(
@@ -126,20 +121,21 @@ def separate(
     Parameters
     ----------
     T : Transport
-        Square. The bounces are as good as its first bounce: see ``first_bounce="exact"``.
+        A square transport. The bounces are as good as its first bounce: see
+        ``first_bounce="exact"``.
     image : (h, w), (h, w, 3), or frames of these
-        In the units of T.
+        Linear light in the units of T.
     bounces : int
-        How many indirect bounces to tell apart.
+        Number of indirect bounces to tell apart.
     method, rtol, **options
-        Of `ltcl.solve`; rtol is per bounce, 1e-3 when not given, or the error of a compressed T or
-        an inverse where that is more.
+        Arguments of `ltcl.solve`. rtol is per bounce, 1e-3 when not given, or the error of a
+        compressed T or an inverse where that is more.
     exact : Transport, optional
         The uncompressed transport that T was compressed from: T then solves, to an `rtol` as
         `ltcl.solve` says; residuals and warnings are computed with `exact`.
     inverse : Inverse, optional
-        Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it
-        may have.
+        The inverse of T that `ltcl.invert` makes: each bounce is then one product, and `rtol` the
+        error it may have.
 
     Raises
     ------
@@ -147,7 +143,7 @@ def separate(
         A rectangular T, other shapes, a negative number of bounces, an `rtol` below the error of a
         compressed T without `exact` or of `inverse`, an inverse of another transport; or direct
         light of less than 0 or more than all of a picture, by more than its uncertainty: F or T is
-        wrong or noisy where it says.
+        wrong or noisy at the pixels that the message names.
     ConvergenceError
         A solve did not reach `rtol`.
 
@@ -160,130 +156,117 @@ def separate(
     >>> bool(abs(b.direct - 0.5).max() < 1e-3)
     True
     """
-    require(T)
+    check_transport(T)
     checks.count("bounces", bounces, least=0)
-    if "pixels" in options:
-        raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")
-    checks.one_of("method", method, METHODS)
-    seed = checks.count("seed", options.get("seed", 0), least=0, most=(1 << 64) - 1)
+    _check_method(method, options)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
-    pictures = sum(column.size for column in columns)
-    checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
-    true, judges = resolve_reference(T, exact)
+    values = sum(column.size for column in columns)
+    checks.fits_host(f"separating {bounces} bounces", 3 * 8 * values * (bounces + 1))
+    reference, judging_systems = resolve_reference(T, exact)
     if inverse is not None:
-        require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
-        for name in options.keys() - {"callback", "throw"}:
-            raise InputTypeError(
-                f"option {name!r} is given, but with inverse there is no solve that takes it"
-            )
-    options |= {
-        "rtol": default_rtol(RTOL, T, exact, inverse) if rtol is None else rtol,
-        "exact": judges,
-    }
+        _check_inverse_options(T, inverse, rtol, exact, method, options)
+    if rtol is None:
+        rtol = default_rtol(RTOL, T, exact, inverse)
+    solver = BounceSolver(
+        T=T,
+        exact=judging_systems,
+        inverse=inverse,
+        method=method,
+        rtol=rtol,
+        options=options,
+    )
 
-    def picture(channels: list[np.ndarray]) -> np.ndarray:
-        return shape.pack(channels, T.grid).astype(np.float32, copy=False)
+    remaining = [column.astype(np.float64) for column in columns]
+    indirect = remaining
+    pictures = []
+    solutions = []
+    for number in range(bounces + 1):
+        solved = solver.solve(number, remaining)
+        bounce = [solution.x.astype(np.float64) for solution in solved]
+        remaining = [l - b for l, b in zip(remaining, bounce, strict=True)]
+        if number == 0:
+            indirect = remaining
+            residuals = [solution.residual for solution in solved]
+            check_direct_light(reference, columns, bounce, max(rtol, *residuals))
+        pictures.append(_picture(bounce, shape, T))
+        solutions.append(solved[0] if T.channels == 1 else solved)
 
-    pictures, solutions = [], []
-    indirect = rest = [l_out.astype(np.float64) for l_out in columns]
-    for k in range(bounces + 1):
-        if inverse is not None:
-            solutions.append(tuple(inverse.solve(l, channel) for channel, l in enumerate(rest)))
-        else:
-            if (
-                method in SAMPLED
-            ):  # random numbers of its own, or its noise would go with that of others
-                options["seed"] = (seed + k) % 2**64
-            solutions.append(solve_each(T.systems, rest, method, **options))
-        b_k = [solution.x.astype(np.float64) for solution in solutions[-1]]
-        rest = [l - b for l, b in zip(rest, b_k, strict=True)]
-        if k == 0:
-            indirect = rest
-            _refuse_impossible(
-                true, columns, b_k, max(options["rtol"], *(s.residual for s in solutions[0]))
-            )
-        pictures.append(picture(b_k))
-    warning = _warning(true.reciprocity_defect, max(true.negative_bounces), true.error)
-    if (ambient := _ambient(true)) > LARGEST_AMBIENT:
-        text = f"{ambient:.0%} of a bounce looks like ambient light left in T, and bounces are too bright"
-        warning = f"{text}: subtract black from each picture of T; {warning}".removesuffix("; ")
+    warning = bounce_warning(reference)
     if warning:
         logger.warning(warning)
     return Separation(
         direct=pictures[0],
-        indirect=picture(indirect),
+        indirect=_picture(indirect, shape, T),
         bounces=np.stack(pictures)[1:],
-        rest=picture(rest),
-        solutions=tuple(each[0] if T.channels == 1 else each for each in solutions),
-        reciprocity_defect=true.reciprocity_defect,
-        negative_bounce=max(true.negative_bounces),
+        rest=_picture(remaining, shape, T),
+        solutions=tuple(solutions),
+        reciprocity_defect=reference.reciprocity_defect,
+        negative_bounce=max(reference.negative_bounces),
         warning=warning,
-        transport_error=true.error,
-        _transports=(T, true),
+        transport_error=reference.error,
+        _solving=T,
+        _reference=reference,
         _inverse=inverse,
     )
 
 
-def _refuse_impossible(
-    T: Transport, image: list[np.ndarray], direct: list[np.ndarray], rtol: float
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BounceSolver:
+    """The solves of bounces, b_k = S^-1 l^(k), of all channels."""
+
+    T: Transport
+    exact: Sequence[Operator | None]
+    inverse: Inverse | None
+    method: str
+    rtol: float
+    options: dict[str, Any]
+
+    def solve(self, number: int, remaining: list[np.ndarray]) -> tuple[Solution, ...]:
+        """Bounce `number` of the remaining light (N, k) of each channel."""
+        if self.inverse is not None:
+            solutions = []
+            for channel, light in enumerate(remaining):
+                solutions.append(self.inverse.solve(light, channel))
+            return tuple(solutions)
+        options = dict(self.options)
+        if self.method in SAMPLED:
+            # Random numbers of its own: the noise of a bounce must not depend on that of others.
+            seed = options.get("seed", 0)
+            options["seed"] = (seed + number) % SEED_LIMIT
+        return solve_each(
+            self.T.systems,
+            remaining,
+            self.method,
+            exact=self.exact,
+            rtol=self.rtol,
+            **options,
+        )
+
+
+def _check_method(method: str, options: dict[str, Any]) -> None:
+    if "pixels" in options:
+        raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")
+    checks.one_of("method", method, METHODS)
+    checks.count("seed", options.get("seed", 0), least=0, most=SEED_LIMIT - 1)
+
+
+def _check_inverse_options(
+    T: Transport,
+    inverse: Inverse,
+    rtol: float | None,
+    exact: Transport | None,
+    method: str,
+    options: dict[str, Any],
 ) -> None:
-    """InputError where the direct light of a frame and channel is not from 0 to all of its light.
-
-    Its variance is at most sum_j N (sigma_j b_j / F_j)^2, with the noise sigma_j of F_j for all of
-    column j.
-    """
-    n, lit = len(image[0]), ~T.masked
-    for channel, (l, b) in enumerate(zip(image, direct, strict=True)):
-        light, share = l.sum(axis=0), b.sum(axis=0)
-        beyond = np.where(
-            np.minimum(l, 0.0).sum(axis=0) > -_NEGATIVE * light,
-            np.maximum(-share, share - light),
-            0.0,
-        )
-        if not (beyond > 0.0).any():
-            continue
-        F, margin = np.atleast_2d(T.first_bounce), _UNKNOWN * light
-        with suppress(InputError):  # of operators, whose noise is unknown
-            sigma = (T.noise.diagonal(F)[channel, lit] / F[channel, lit])[:, None]
-            noise = _SIGMAS * np.linalg.norm(sigma * b[lit], axis=0)
-            solved = 2.0 * (rtol + T.error) * np.linalg.norm(l, axis=0)
-            margin = np.minimum(np.sqrt(n) * (noise + solved), margin)
-        if not (beyond > margin).any():
-            continue
-        k = int(np.argmax(beyond - margin))
-        worst = np.argsort(np.minimum(b[:, k], l[:, k] - b[:, k]))[:8]
-        where = ", ".join(f"({j // T.grid[1]}, {j % T.grid[1]})" for j in worst)
-        direct_share, uncertainty = share[k] / light[k], margin[k] / light[k]
-        raise InputError(
-            f"direct light is {direct_share:.0%} of the image, uncertain to {uncertainty:.1%}; "
-            "it must be from 0 to 100 %: T or its first bounce is wrong or noisy, most of all at the pixels "
-            f"(row, column): {where}; mask dark ones by dark=, or measure T again"
-        )
-
-
-def _ambient(T: Transport) -> float:
-    """`diagnostics.ambient` of the worst channel, by 10 parts; 0 where T shows no entries, or few."""
-    if "_ambient" not in (facts := vars(T)):  # as a cached property
-        shown = len(T.masked) >= 64 and all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
-        solves = [
-            lambda e, S=S: solve(S.as_it_stands(), e, rtol=1e-2).x for S in T.systems if shown
-        ]
-        with suppress(ConvergenceError):
-            facts["_ambient"] = max(
-                (diagnostics.ambient(x, T.grid, 7) for x in solves), default=0.0
+    """Refuse an inverse of another T, and options of solves that it takes the place of."""
+    other_method = None if method == "auto" else method
+    check_inverse(T, inverse, rtol, exact=exact, method=other_method)
+    for name in options:
+        if name not in ("callback", "throw"):
+            raise InputTypeError(
+                f"option {name!r} is given, but with inverse there is no solve that takes it"
             )
-    return facts.setdefault("_ambient", 0.0)
 
 
-def _warning(defect: float, negative: float, error: float) -> str:
-    """Why bounces are approximate; nothing where both numbers are within the limits, or NaN."""
-    reasons = []
-    if defect > (most := LARGEST_DEFECT + error):
-        reasons.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
-    if negative > (most := LARGEST_NEGATIVE + error):
-        reasons.append(
-            f"a bounce holds a share {negative:.2g} of negative light (above {most:.2g})"
-        )
-    why = "surfaces reflect differently to different sides, or T is noisy; with one camera"
-    such = "the bounces of such a scene are approximate (section 8.4, eq. 28 and 29)"
-    return f"{' and '.join(reasons)}: {why} {such}" if reasons else ""
+def _picture(channels: list[np.ndarray], shape: layout.PictureLayout, T: Transport) -> np.ndarray:
+    return shape.pack(channels, T.grid).astype(np.float32, copy=False)

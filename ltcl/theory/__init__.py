@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What can be said before solving: spectrum of R, bounds on that of S, products each method will need.
+"""Facts that hold before a solve: spectrum of R, bounds on that of S, products of each method.
 
 Notation of the paper: A one bounce, R = A + A^2 + ..., S = I + R; m bounds the albedo.
 """
@@ -24,13 +24,22 @@ from ltcl.theory.series import (
 )
 from ltcl.theory.spectrum import SpectralRadius, free_bounds, row_sum_range, spectral_radius
 
-__all__ = ["Forecast", "SpectralRadius", "Terms", "TwoNorm"]
-__all__ += [
+__all__ = [
+    "Forecast",
+    "SpectralRadius",
+    "Terms",
+    "TwoNorm",
     "after_terms",
     "bounce_coefficients",
     "chebyshev_products",
     "forecasts",
     "forward_error_bound",
+    "free_bounds",
+    "gauss_seidel_forecast",
+    "inverse_error_bound",
+    "richardson_products",
+    "row_sum_range",
+    "series_products",
+    "spectral_radius",
+    "two_norm",
 ]
-__all__ += ["free_bounds", "gauss_seidel_forecast", "inverse_error_bound", "richardson_products"]
-__all__ += ["row_sum_range", "series_products", "spectral_radius", "two_norm"]

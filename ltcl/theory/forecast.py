@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Products that each method will need, foretold from rho(R) or from bounds on the spectrum of S."""
+"""Forecast of the products that each method needs, by rho(R) or bounds on the spectrum of S."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -15,31 +14,43 @@ from ltcl.errors import InputTypeError
 from ltcl.operators import Compressed, IdentityPlus, Operator
 from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius, require_operator
 
-FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "trial sweeps", "ritz values"
+# Certificates of a forecast, beside those of a spectral radius.
+FREE_BOUNDS = "free bounds"
+SWEEPS = "trial sweeps"
+RITZ = "ritz values"
 NOTHING = "none"
-LEAST_RTOL = 2.0**-23  # a relative residual below is rounding
-_LARGEST_SWEEP = 4096  # pixels: a sweep on the host takes hundredths of a second
-_LATE = 30  # trial sweeps at least, the later half of which tells the growth
-_TRIAL = 300_000_000  # entries that trial sweeps read at most, beyond those: about a second
-_DIVERGED = 1e30
+
+# A relative residual below is rounding.
+LEAST_RTOL = 2.0**-23
+# Pixels up to which a sweep on the host takes hundredths of a second.
+MAX_SWEEP_PIXELS = 4096
+# Trial sweeps at least, the later half of which tells the growth.
+MIN_TRIAL_SWEEPS = 30
+# Entries that trial sweeps read at most, beyond those: about a second.
+MAX_TRIAL_ENTRIES = 300_000_000
+# Relative residual at which sweeps have diverged.
+DIVERGED = 1e30
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Products (sweeps of Gauss-Seidel) a method needs to a tolerance, and what says so.
+    """Products (sweeps of Gauss-Seidel) that a method needs to a tolerance.
 
     Attributes
     ----------
     products : float
-        Infinite where the method diverges, NaN where nothing is known.
+        Infinite if the method diverges, NaN if nothing is known.
     certificate : str
-        That of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the spectrum of S,
-        which are those of Lambertian scenes; "trial sweeps" and "ritz values", estimates; or
-        "none".
+        Certificate of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the
+        spectrum of S, which are those of Lambertian scenes; "trial sweeps" and "ritz values",
+        estimates; or "none".
     """
 
     products: float
     certificate: str
+
+
+UNKNOWN = Forecast(math.nan, NOTHING)
 
 
 def forecasts(
@@ -50,14 +61,14 @@ def forecasts(
     spectrum: tuple[float, float] | None = None,
     self_adjoint: bool = True,
 ) -> dict[str, Forecast]:
-    """What each iterative method will need for S x = b to a relative residual of `rtol`, its options default.
+    """Products of each iterative method for S x = b to a relative residual of `rtol`.
 
-    Where 1 lies between certified bounds on rho(R), they do not tell whether the series converges:
-    its forecast then rests on the power iteration alone. Krylov methods are foretold by the
-    Chebyshev polynomial on `spectrum`, an estimate of the positive interval that holds the
-    eigenvalues of S, where there is one; they may well need less. Nothing foretells Southwell's
-    method, nor the blocks of block_gauss_seidel. InputError where rtol is below what float32
-    products confirm, 1.2e-7.
+    Options of methods are default. If 1 lies between certified bounds on rho(R), they do not tell
+    whether the series converges: its forecast then rests on the power iteration alone. Krylov
+    methods are forecast by the Chebyshev polynomial on `spectrum`, an estimate of the positive
+    interval that holds the eigenvalues of S, if there is one; they may need less. There is no
+    forecast for Southwell's method, nor for the blocks of block_gauss_seidel. InputError if rtol is
+    below what float32 products confirm, 1.2e-7.
 
     >>> from ltcl.operators import IdentityPlus, as_operator
     >>> S = IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]]))
@@ -78,40 +89,53 @@ def forecasts(
     """
     require_operator("S", S)
     if not isinstance(rho, SpectralRadius):
+        kind = type(rho).__name__
         raise InputTypeError(
-            f"rho is a {type(rho).__name__}; it must be what theory.spectral_radius returns"
+            f"rho is a {kind}; it must be the SpectralRadius of theory.spectral_radius"
         )
     checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
-    decided = not rho.lower < 1.0 <= rho.upper
-    series = Forecast(
-        series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION
-    )
+    series = _series_forecast(rho, rtol)
+    # omega of sor is 1 by default.
     sweeps = gauss_seidel_forecast(S, rtol)
-    degree = chebyshev_products(*spectrum, rtol) if spectrum else math.nan
-    krylov = {
-        "cg": degree + 1 if self_adjoint else math.nan,  # one to confirm the end, as of the others
-        "gmres": degree + 1,
-        "bicgstab": 2 * math.ceil(degree / 2) + 2
-        if spectrum
-        else math.nan,  # and one by S^T to begin
-    }
-    return {
+    methods = {
         "jacobi": series,
         "neumann": series,
         "richardson": Forecast(richardson_products(*bounds, rtol), FREE_BOUNDS),
         "chebyshev": Forecast(chebyshev_products(*bounds, rtol), FREE_BOUNDS),
         "gauss_seidel": sweeps,
-        "sor": sweeps,  # omega = 1
-        "block_gauss_seidel": Forecast(math.nan, NOTHING),
-        "southwell": Forecast(math.nan, NOTHING),
-        **{name: Forecast(n, NOTHING if math.isnan(n) else RITZ) for name, n in krylov.items()},
+        "sor": sweeps,
+        "block_gauss_seidel": UNKNOWN,
+        "southwell": UNKNOWN,
     }
+    return methods | _krylov_forecasts(spectrum, rtol, self_adjoint)
+
+
+def _series_forecast(rho: SpectralRadius, rtol: float) -> Forecast:
+    certificate = rho.certificate
+    if rho.lower < 1.0 <= rho.upper:
+        # The certified bounds do not decide whether the series converges.
+        certificate = POWER_ITERATION
+    return Forecast(series_products(rho.value, rtol), certificate)
+
+
+def _krylov_forecasts(
+    spectrum: tuple[float, float] | None, rtol: float, self_adjoint: bool
+) -> dict[str, Forecast]:
+    if spectrum is None:
+        return {"cg": UNKNOWN, "gmres": UNKNOWN, "bicgstab": UNKNOWN}
+    degree = chebyshev_products(*spectrum, rtol)
+    # One product confirms the end.
+    gmres = Forecast(degree + 1, RITZ)
+    # A product by S^T begins.
+    bicgstab = Forecast(2 * math.ceil(degree / 2) + 2, RITZ)
+    cg = gmres if self_adjoint else UNKNOWN
+    return {"cg": cg, "gmres": gmres, "bicgstab": bicgstab}
 
 
 def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     """Sweeps of Gauss-Seidel until the residual of a random positive picture is below `rtol`.
 
-    The first ones are made, in float64; from there on errors grow as under -(D + L)^-1 U, S = L + D
+    The first ones are done, in float64; from there on errors grow as under -(D + L)^-1 U, S = L + D
     + U. On the host, densely, so for small N only; others have no forecast.
 
     >>> from ltcl.operators import as_operator
@@ -119,34 +143,40 @@ def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     3
     """
     n = require_operator("S", S).shape[0]
-    compressed = isinstance(S, IdentityPlus) and isinstance(
-        S.R, Compressed
-    )  # sweeps go over coefficients
-    if compressed or n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
-        return Forecast(math.nan, NOTHING)
+    # Sweeps of a compressed S go over coefficients.
+    is_compressed = isinstance(S, IdentityPlus) and isinstance(S.R, Compressed)
+    needed_bytes = 2 * 8 * n * n
+    if is_compressed or n > MAX_SWEEP_PIXELS or needed_bytes > checks.host_memory():
+        return UNKNOWN
     residuals = _trial_sweeps(S.to_dense(), rtol)
-    sweeps, last = len(residuals) - 1, residuals[-1]
+    sweeps = len(residuals) - 1
+    last = residuals[-1]
     if last <= rtol:
         return Forecast(sweeps, SWEEPS)
-    if not math.isfinite(last) or not sweeps:
-        return Forecast(math.nan, NOTHING)
-    late = residuals[-_LATE // 2 :]
+    if not math.isfinite(last) or sweeps == 0:
+        return UNKNOWN
+    late = residuals[-MIN_TRIAL_SWEEPS // 2 :]
     rate = (last / late[0]) ** (1.0 / max(1, len(late) - 1))
     return Forecast(sweeps + series_products(rate, rtol / last), SWEEPS)
 
 
 def _trial_sweeps(S: np.ndarray, rtol: float) -> list[float]:
-    """Relative residuals before and after each sweep, to `rtol` at best; 1 alone without a diagonal."""
+    """Relative residuals before and after each sweep, to `rtol` at best; 1 without a diagonal."""
     residuals = [1.0]
     if not np.diagonal(S).all():
         return residuals
     S = np.asfortranarray(S)
-    upper, error = np.triu(S, 1), np.random.default_rng(0).uniform(0.5, 1.5, len(S))
-    first, right = float(np.linalg.norm(S @ error)), upper @ error
-    while rtol < residuals[-1] < _DIVERGED and len(residuals) <= max(_LATE, _TRIAL // S.size):
+    upper = np.triu(S, 1)
+    max_count = max(MIN_TRIAL_SWEEPS, MAX_TRIAL_ENTRIES // S.size)
+    error = np.random.default_rng(0).uniform(0.5, 1.5, len(S))
+    first_norm = float(np.linalg.norm(S @ error))
+    right = upper @ error
+    while rtol < residuals[-1] < DIVERGED and len(residuals) <= max_count:
+        # (D + L) e' = -U e, so that the residual is S e' = U e' - U e.
         error = -scipy.linalg.solve_triangular(S, right, lower=True, check_finite=False)
-        before, right = right, upper @ error
-        residuals.append(float(np.linalg.norm(right - before)) / first)  # S e = (D + L) e + U e
+        previous = right
+        right = upper @ error
+        residuals.append(float(np.linalg.norm(right - previous)) / first_norm)
     return residuals
 
 
@@ -156,10 +186,13 @@ def series_products(rho: float, rtol: float) -> float:
     >>> series_products(0.5, 1e-2), series_products(1.0, 1e-2)
     (7, inf)
     """
-    rho, rtol = checks.number("rho", rho), checks.number("rtol", rtol)
+    rho = checks.number("rho", rho)
+    rtol = checks.number("rtol", rtol)
     if rho >= 1.0:
         return math.inf
-    return 1 if rho <= rtol else math.ceil(math.log(rtol) / math.log(rho))
+    if rho <= rtol:
+        return 1
+    return math.ceil(math.log(rtol) / math.log(rho))
 
 
 def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
@@ -171,12 +204,11 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     >>> chebyshev_products(0.5, 5.0, 1e-2)
     9
     """
-    lower, upper, rtol = _numbers(lower, upper, rtol)
+    _check_spectrum(lower, upper, rtol)
     if upper <= lower:
         return 1
-    angle = 2.0 * math.asinh(
-        math.sqrt(lower / (upper - lower))
-    )  # acosh of the centre, which may round to 1
+    # acosh of the centre, which may round to 1.
+    angle = 2.0 * math.asinh(math.sqrt(lower / (upper - lower)))
     return max(1, math.ceil(math.acosh(1.0 / rtol) / angle))
 
 
@@ -189,14 +221,15 @@ def richardson_products(lower: float, upper: float, rtol: float) -> int:
     >>> richardson_products(0.5, 5.0, 1e-2)
     23
     """
-    lower, upper, rtol = _numbers(lower, upper, rtol)
+    _check_spectrum(lower, upper, rtol)
     factor = (upper - lower) / (upper + lower)
-    return (
-        1
-        if factor <= rtol
-        else math.ceil(math.log(rtol) / math.log1p(-2.0 * lower / (upper + lower)))
-    )
+    if factor <= rtol:
+        return 1
+    log_factor = math.log1p(-2.0 * lower / (upper + lower))
+    return math.ceil(math.log(rtol) / log_factor)
 
 
-def _numbers(lower: Any, upper: Any, rtol: Any) -> tuple[float, float, float]:
-    return checks.number("lower", lower), checks.number("upper", upper), checks.number("rtol", rtol)
+def _check_spectrum(lower: float, upper: float, rtol: float) -> None:
+    checks.number("lower", lower)
+    checks.number("upper", upper)
+    checks.number("rtol", rtol)

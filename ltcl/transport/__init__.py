@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Measured light transport T = S F: its first bounce, noise, diagnostics, and the verdict on its use."""
+"""Measured light transport T = S F: first bounce, noise, diagnostics, and verdict on its use."""
 
 from __future__ import annotations
 

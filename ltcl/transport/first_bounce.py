@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The first bounce F of a measured T = S F (eq. 3), and what to do where it is dark.
+"""The first bounce F of a measured T = S F (eq. 3), and projector pixels where it is dark.
 
-F_i = 1 / (T^-1)_ii, since T^-1 = F^-1 (I - A) and A has no diagonal. Where T is too large to
-invert, T^-1 = F0^-1 S0^-1 with F0 = diag(T), S0 = T F0^-1, and z_i (S0^-1 z)_i of random signs z
-has the mean (S0^-1)_ii and, of K probes, the variance sum_{j != i} (S0^-1)_ij^2 / K (Bekas,
-Kokiopoulou, Saad 2007).
+    F_i = 1 / (T^-1)_ii
+
+since T^-1 = F^-1 (I - A) and A has no diagonal. A T that is too large to invert is scaled by
+F0 = diag(T): T^-1 = F0^-1 S0^-1 with S0 = T F0^-1. For random signs z, z_i (S0^-1 z)_i has the mean
+(S0^-1)_ii and, over K probes, the variance sum_{j != i} (S0^-1)_ij^2 / K (Bekas, Kokiopoulou, Saad
+2007).
 """
 
 from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,65 +24,93 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
-from ltcl.operators import interreflections
+from ltcl.operators import IdentityPlus, interreflections
 from ltcl.solvers import solve
+from ltcl.transport.noise import Noise
 
 logger = logging.getLogger(__name__)
-_BYTES = 3 * 8  # of a dense inverse, per entry: the matrix, its inverse and what LAPACK works with
-_RTOL = (
-    1e-5  # of the solves of an estimate: far below the scatter of any affordable number of probes
-)
-_TOGETHER = 32  # probes in one solve
+# Types of matrices whose entries are read.
 ENTRIES = np.ndarray, scipy.sparse.csr_array
-_SIGMAS = 5.0  # standard deviations that noise does not exceed, even in a million pixels
-# of the median: 20 stops below it, beyond any camera; float32 has 3 bits left of such light
-DARK = 1e-6
-_FAINT = 0.05  # times the median first bounce: noise is estimated only where some pixel is below
+# Times the median first bounce: 20 stops below it, beyond any camera; float32 resolves such light
+# to 3 bits.
+DARK_THRESHOLD = 1e-6
+# Times the median first bounce: noise is estimated only if some pixel is below.
+FAINT_SHARE = 0.05
+# Standard deviations that noise does not exceed, even in a million pixels.
+NOISE_SIGMAS = 5.0
+# The inverse of a smaller first bounce is not a number.
+MIN_FIRST_BOUNCE = 1e-300
+# Mean of |x| to the standard deviation of normal x.
+STD_PER_MEAN_ABSOLUTE = 1.25
+
+# Bytes of a dense inverse for each entry: the matrix, its inverse and the work space of LAPACK.
+INVERSE_BYTES_PER_ENTRY = 3 * 8
+# Solves of an estimate: far below the scatter of any affordable number of probes.
+ESTIMATE_RTOL = 1e-5
+PROBES_PER_SOLVE = 32
 
 
-def find(
+def find_first_bounce(
     matrices: Sequence[Any],
     requested: Any,
-    device: Any,
+    device: Callable[[], Device],
     probes: int = 128,
     seed: int = 0,
-    dark: Any = None,
+    rule: DarkRule | None = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """F (channels, N) float64 of any sign, diag(T) where that is `dark`; standard error of an estimate."""
-    n: int = matrices[0].shape[0]
+    """F (channels, N) float64, and the standard error of an estimate.
+
+    F has any sign, and is diag(T) at the pixels that `rule` finds dark.
+    """
     checks.count("probes", probes, least=2)
     checks.count("seed", seed, least=0)
     if not isinstance(requested, str):
-        F = checks.finite("first_bounce", checks.real("first_bounce", requested)).astype(np.float64)
-        F = checks.shape("first_bounce", F, (n,), (len(matrices), n))
-        return np.broadcast_to(F, (len(matrices), n)), None
+        return _check_first_bounce(matrices, requested), None
     checks.one_of("first_bounce", requested, ("diagonal", "exact", "estimate"))
-    if requested == "exact" and (
-        bare := [type(T).__name__ for T in matrices if not isinstance(T, ENTRIES)]
-    ):
-        raise InputTypeError(
-            f"first_bounce is 'exact', but a {bare[0]} has no entries; give 'estimate' or F"
-        )
+    if requested == "exact":
+        _require_entries(matrices)
     F = np.stack([_diagonal(T) for T in matrices])
     if requested == "diagonal":
-        if (brightest := float(np.max(F))) > float(np.finfo(np.float32).max):
-            raise InputError(
-                f"matrix reaches {brightest:.3g}, beyond float32; give it in other units"
-            )
+        _refuse_beyond_float32(F)
         return F, None
-    lit = np.ones(F.shape, bool) if dark is None else ~dark(F)
+    is_lit = np.ones(F.shape, bool)
+    if rule is not None:
+        is_lit = ~rule.find_dark(F)
     if requested == "exact":
+        n = F.shape[1]
         try:
-            checks.fits_host(f"a dense inverse of {n} pixels", _BYTES * n**2)
-            return np.where(
-                lit, [_exact(*each) for each in zip(matrices, lit, strict=True)], F
-            ), None
+            checks.fits_host(f"a dense inverse of {n} pixels", INVERSE_BYTES_PER_ENTRY * n**2)
+            exact = [_exact(T, lit) for T, lit in zip(matrices, is_lit, strict=True)]
+            return np.where(is_lit, exact, F), None
         except MemoryError:
             logger.warning("T of %d pixels is too large for a dense inverse; F is estimated", n)
-    estimate, error = _estimate(
-        matrices, np.where(lit, np.maximum(F, 0.0), 0.0), device(), probes, seed
-    )
-    return np.where(lit, estimate, F), error
+    F0 = np.where(is_lit, np.maximum(F, 0.0), 0.0)
+    estimate, error = _estimate(matrices, F0, device(), probes, seed)
+    return np.where(is_lit, estimate, F), error
+
+
+def _check_first_bounce(matrices: Sequence[Any], F: Any) -> np.ndarray:
+    """A given first bounce, (N,) or (channels, N), as (channels, N) float64."""
+    n: int = matrices[0].shape[0]
+    channels = len(matrices)
+    F = checks.finite("first_bounce", checks.real("first_bounce", F)).astype(np.float64)
+    F = checks.shape("first_bounce", F, (n,), (channels, n))
+    return np.broadcast_to(F, (channels, n))
+
+
+def _require_entries(matrices: Sequence[Any]) -> None:
+    for T in matrices:
+        if not isinstance(T, ENTRIES):
+            kind = type(T).__name__
+            raise InputTypeError(
+                f"first_bounce is 'exact', but a {kind} has no entries; give 'estimate' or F"
+            )
+
+
+def _refuse_beyond_float32(F: np.ndarray) -> None:
+    brightest = float(np.max(F))
+    if brightest > float(np.finfo(np.float32).max):
+        raise InputError(f"matrix reaches {brightest:.3g}, beyond float32; give it in other units")
 
 
 def _diagonal(matrix: Any) -> np.ndarray:
@@ -91,102 +122,161 @@ def _diagonal(matrix: Any) -> np.ndarray:
     return np.asarray(matrix.diagonal(), np.float64)
 
 
-def _exact(matrix: Any, lit: np.ndarray) -> np.ndarray:
+def _exact(matrix: Any, is_lit: np.ndarray) -> np.ndarray:
     """1 / diag(T^-1), by a dense inverse of the pixels that are lit."""
-    dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
-    lit = lit & dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular
-    dense = dense[np.ix_(lit, lit)]
+    dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
+    dense = dense.astype(np.float64)
+    # A dark pixel would make T singular.
+    is_lit = is_lit & dense.any(axis=0) & dense.any(axis=1)
+    dense = dense[np.ix_(is_lit, is_lit)]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", scipy.linalg.LinAlgWarning)  # no digit would be right
+            # No digit of such an inverse would be right.
+            warnings.simplefilter("error", scipy.linalg.LinAlgWarning)
             inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
-    except RuntimeError as error:  # SciPy's of work arrays that LAPACK did not get
+    except RuntimeError as error:
+        # SciPy raises it for work arrays that LAPACK did not get.
         raise MemoryError(str(error)) from error
     except (np.linalg.LinAlgError, scipy.linalg.LinAlgWarning) as error:
         raise InputError(
             "first_bounce is 'exact', but T is singular in float64; give 'diagonal'"
         ) from error
-    F = np.zeros(lit.shape)
+    F = np.zeros(is_lit.shape)
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        F[lit] = 1.0 / np.diagonal(inverse)
+        F[is_lit] = 1.0 / np.diagonal(inverse)
     return np.nan_to_num(F, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _estimate(
     matrices: Sequence[Any], F0: np.ndarray, device: Device, probes: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """F and its standard error, (channels, N) float64 each; F is 0 where `F0` is."""
-    F, error = np.zeros_like(F0), np.zeros_like(F0)
-    signs = np.random.default_rng(seed).choice(np.array([-1, 1], np.float32), (F0.shape[1], probes))
-    together = np.split(signs, range(_TOGETHER, probes, _TOGETHER), axis=1)
-    for channel, S in enumerate(interreflections(matrices, F0, device)):
-        try:
-            solutions = [solve(S.as_it_stands(), z, "chebyshev", rtol=_RTOL) for z in together]
-        except ConvergenceError as failed:
-            raise InputError(
-                f"first_bounce is 'estimate', whose solves end at a residual {failed.solution.residual:.2g}: "
-                "T is far from that of a diffuse scene; give 'diagonal' or an array (N,)"
-            ) from failed
-        samples = signs * np.hstack([s.x for s in solutions])  # z_i (S^-1 z)_i, (N, probes)
-        mean, left = samples.mean(axis=1, dtype=np.float64), max(s.residual for s in solutions)
-        spread = np.hypot(samples.std(axis=1, ddof=1, dtype=np.float64) / np.sqrt(probes), left)
-        np.divide(F0[channel], mean, out=F[channel], where=mean > 0)
-        np.divide(F[channel] * spread, mean, out=error[channel], where=mean > 0)
+    """F and its standard error, (channels, N) float64 each; F is 0 where `F0` is 0."""
+    random = np.random.default_rng(seed)
+    signs = random.choice(np.array([-1, 1], np.float32), (F0.shape[1], probes))
+    F = np.zeros_like(F0)
+    error = np.zeros_like(F0)
+    for channel, S0 in enumerate(interreflections(matrices, F0, device)):
+        mean, spread = _probe_inverse_diagonal(S0, signs)
+        is_known = mean > 0
+        np.divide(F0[channel], mean, out=F[channel], where=is_known)
+        np.divide(F[channel] * spread, mean, out=error[channel], where=is_known)
     return F, error
 
 
-def dark(
-    matrices: Sequence[Any], share: float, noise: Any, known: bool, F: np.ndarray
-) -> np.ndarray:
-    """Where F (channels, N) or diag(T) is not above 0, `share` of the median, and `noise()`.
+def _probe_inverse_diagonal(S0: IdentityPlus, signs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """diag(S0^-1) by random `signs` (N, probes), and its standard error, (N,) each."""
+    probes = signs.shape[1]
+    groups = np.split(signs, range(PROBES_PER_SOLVE, probes, PROBES_PER_SOLVE), axis=1)
+    operator = S0.as_it_stands()
+    try:
+        solutions = [solve(operator, z, "chebyshev", rtol=ESTIMATE_RTOL) for z in groups]
+    except ConvergenceError as failed:
+        raise InputError(
+            "first_bounce is 'estimate', whose solves end at a residual "
+            f"{failed.solution.residual:.2g}: T is far from that of a diffuse scene; "
+            "give 'diagonal' or an array (N,)"
+        ) from failed
+    # z_i (S0^-1 z)_i
+    samples = signs * np.hstack([solution.x for solution in solutions])
+    residual = max(solution.residual for solution in solutions)
+    mean = samples.mean(axis=1, dtype=np.float64)
+    scatter = samples.std(axis=1, ddof=1, dtype=np.float64) / np.sqrt(probes)
+    return mean, np.hypot(scatter, residual)
 
-    What is not `known` but estimated counts up to the scatter of the pixel's column: dim light is
-    not dark.
+
+@dataclass(frozen=True, kw_only=True)
+class DarkRule:
+    """Rule for projector pixels without direct light.
+
+    A pixel is dark if its first bounce or its entry of diag(T) is not above all of: 0, `threshold`
+    times the median one, and 5 standard deviations of its noise.
+
+    Attributes
+    ----------
+    matrices : sequence of (N, N)
+        T of each channel.
+    threshold : float
+        Share of the median first bounce.
+    noise : callable
+        Returns the noise of T; called only if it is needed, as it may have to be estimated.
+    is_measured : bool
+        Whether that noise was measured. Estimated noise counts up to the scatter of the pixel's
+        column, so that dim light is not dark.
     """
-    light, sigma = F, 0.0
-    if entries := all(isinstance(T, ENTRIES) for T in matrices):
-        light = np.minimum(F, [_diagonal(T) for T in matrices])
-    median = np.array([[np.median(f[f > 0]) if np.any(f > 0) else 0.0] for f in light])
-    least = np.maximum(1e-300, share * median)  # 0 is dark as well, whose inverse is no number
-    below = _SIGMAS * np.maximum(
-        -light.min(axis=1, keepdims=True), 0.0
-    )  # light is never negative, noise is
-    faint = (light > least) & (light < np.maximum(_FAINT * median, below))
-    if known or (entries and faint.any()):
-        sigma = noise().diagonal(light)
-        for T, own, j in zip(matrices, sigma, faint, strict=True) if not known else ():
-            column = abs(T[:, j])
-            scatter = (
-                1.25
-                * column.sum(axis=0, dtype=np.float64)
-                / np.maximum((column != 0).sum(axis=0), 1)
-            )
-            own[:], own[j] = (
-                0.0,
-                np.minimum(own[j], scatter),
-            )  # 1.25 times the mean, as of normal noise
-    return light <= np.maximum(least, _SIGMAS * sigma)
+
+    matrices: Sequence[Any]
+    threshold: float
+    noise: Callable[[], Noise]
+    is_measured: bool
+
+    def find_dark(self, F: np.ndarray) -> np.ndarray:
+        """Dark pixels of F (channels, N) of any sign, bool of the same shape."""
+        light = F
+        has_entries = all(isinstance(T, ENTRIES) for T in self.matrices)
+        if has_entries:
+            light = np.minimum(F, [_diagonal(T) for T in self.matrices])
+        median = _median_of_lit(light)
+        least = np.maximum(MIN_FIRST_BOUNCE, self.threshold * median)
+        # Light is never negative, noise is.
+        most_negative = np.maximum(-light.min(axis=1, keepdims=True), 0.0)
+        faint_limit = np.maximum(FAINT_SHARE * median, NOISE_SIGMAS * most_negative)
+        is_faint = (light > least) & (light < faint_limit)
+        if self.is_measured:
+            least = np.maximum(least, NOISE_SIGMAS * self.noise().diagonal(light))
+        elif has_entries and is_faint.any():
+            least = np.maximum(least, NOISE_SIGMAS * self._estimated_sigma(light, is_faint))
+        return light <= least
+
+    def _estimated_sigma(self, light: np.ndarray, is_faint: np.ndarray) -> np.ndarray:
+        """Standard deviation (channels, N) by estimated noise; 0 at pixels that are not faint."""
+        sigma = self.noise().diagonal(light)
+        for T, channel_sigma, pixels in zip(self.matrices, sigma, is_faint, strict=True):
+            column = abs(T[:, pixels])
+            nonzeros = np.maximum((column != 0).sum(axis=0), 1)
+            scatter = STD_PER_MEAN_ABSOLUTE * column.sum(axis=0, dtype=np.float64) / nonzeros
+            faint_sigma = np.minimum(channel_sigma[pixels], scatter)
+            channel_sigma[:] = 0.0
+            channel_sigma[pixels] = faint_sigma
+        return sigma
+
+
+def _median_of_lit(light: np.ndarray) -> np.ndarray:
+    """Median (channels, 1) of the values above 0; 0 if there are none."""
+    medians = np.zeros((len(light), 1))
+    for channel, values in enumerate(light):
+        if np.any(values > 0):
+            medians[channel] = np.median(values[values > 0])
+    return medians
 
 
 def mask_dark(
-    F: np.ndarray, dark: np.ndarray, grid: tuple[int, int], may_mask: bool
-) -> tuple[Any, Any, str]:
-    """F with 0 and True (N,) where it is `dark` in some channel, and why; refused unless it may be masked."""
-    dark = np.logical_or.reduce(dark, axis=0)
-    pixels, zero = np.flatnonzero(dark), np.count_nonzero(dark & np.any(F <= 0.0, axis=0))
-    if dark.all():
+    F: np.ndarray, is_dark: np.ndarray, grid: tuple[int, int], may_mask: bool
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Leave out the pixels that are dark in some channel, or refuse them unless they may be masked.
+
+    Returns F (channels, N) with 0 at these pixels, the pixels (N,) bool, and the reason in words.
+    """
+    is_masked = np.logical_or.reduce(is_dark, axis=0)
+    if is_masked.all():
         raise InputError(
             "first_bounce is zero or negative at every pixel, or noise: check black level of T"
         )
-    why = f"zero or negative at {zero}, within its noise or below dark at {len(pixels) - zero}"
-    why = f"first_bounce is dark at {len(pixels)} of {len(dark)} pixels ({why})"
-    if not len(pixels) or may_mask:
-        return np.where(dark, 0.0, F), dark, why
+    pixels = np.flatnonzero(is_masked)
+    zero = np.count_nonzero(is_masked & np.any(F <= 0.0, axis=0))
+    reason = (
+        f"first_bounce is dark at {len(pixels)} of {len(is_masked)} pixels (zero or negative at "
+        f"{zero}, within its noise or below the dark threshold at {len(pixels) - zero})"
+    )
+    if may_mask or len(pixels) == 0:
+        return np.where(is_masked, 0.0, F), is_masked, reason
     first = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
     advice = "give on_dark='mask' to leave them unlit, which a LinearOperator cannot"
-    raise InputError(f"{why} at (row, column): {first}; {advice}")
+    raise InputError(f"{reason} at (row, column): {first}; {advice}")
 
 
-def certain(F: np.ndarray, variance: np.ndarray, sigmas: float) -> np.ndarray:
-    """`F` where it is so many standard deviations above 0, else 0: with noise for F, S would be anything."""
+def drop_uncertain(F: np.ndarray, variance: np.ndarray, sigmas: float) -> np.ndarray:
+    """`F` with 0 where it is not `sigmas` standard deviations above 0.
+
+    A first bounce that is noise would make S arbitrary.
+    """
     return np.where(sigmas * np.sqrt(variance) < F, F, 0.0)

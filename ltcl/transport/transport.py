@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Transport`: a measured light transport T = S F of first bounce and interreflection (eq. 3).
 
-F is diagonal: projector pixel j lights what camera pixel j sees. S = T F^-1 = I + R is on the
-device.
+    T   (M, N)   picture = T pattern, M camera pixels and N projector pixels
+    F   (N,)     diagonal: the light that projector pixel j throws on what camera pixel j sees
+    S   (N, N)   T F^-1 = I + R, on the device
+
+The host keeps T as it was given. S and T are uploaded at their first use.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Callable, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,19 +30,25 @@ from ltcl.operators import (
     as_operator,
     interreflections,
 )
-from ltcl.operators import stored as stored_operators
 from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
-from ltcl.transport import diagnostics
-from ltcl.transport import first_bounce as _first_bounce
+from ltcl.transport import diagnostics, stored
 from ltcl.transport import frames as layout
+from ltcl.transport.first_bounce import (
+    DARK_THRESHOLD,
+    ENTRIES,
+    DarkRule,
+    find_first_bounce,
+    mask_dark,
+)
+from ltcl.transport.matrices import check_mixing, split_channels
 from ltcl.transport.noise import Noise, estimate
 
 logger = logging.getLogger(__name__)
-_SAME = 1e-6  # relative difference of first bounces that float32 does not resolve
-_ROUNDING = 1e-5  # of float32, in the products that show whether an inverse belongs to a transport
-_CANCELLATION = 0.5  # of diag(S) = 1 + diag(R): from here on, I + R has all digits of T F^-1
-_ON_DEVICE = ("device", "systems", "operators", "_inverses", "reload")  # do not leave this process
+# Share of diag(S) = 1 + diag(R) that is diag(T) / F: from here on, I + R has all digits of T F^-1.
+MIN_DIAGONAL_SHARE = 0.5
+# Attributes that do not leave this process.
+NOT_PICKLED = ("device", "systems", "operators", "checked_inverses", "reload")
 
 
 class Transport:
@@ -50,51 +59,56 @@ class Transport:
     matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of
     them
         T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j,
-        row-major. matrix[c][d] is what camera channel c sees of projector channel d; such a T has
-        no S, it relights and compensates. Arrays are kept, not copied: they must not be changed
-        afterwards. A numpy.memmap, or rows of a store, that do not fit the device or the host stay
-        on the disk and are read at each product.
+        row-major. matrix[c][d] is the light that camera channel c sees of projector channel d; such
+        a T has no S, it relights and compensates. Arrays are kept, not copied: they must not be
+        changed afterwards. A numpy.memmap, or rows of a store, that do not fit the device or the
+        host stay on the disk and are read at each product.
     grid : (h, w)
-        Of the projector; N = h * w. A warning is logged where rows of T are much smoother on
-        another grid.
+        Projector pixels, N = h * w. A warning is logged if rows of T are much smoother on another
+        grid.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
-        diag(T), which also holds light that came back; 1 / diag(T^-1), by a dense inverse, which
-        does not, of Lambertian scenes; an estimate of this by products, as "exact" is where the
-        host lacks memory; or F.
+        "diagonal" is diag(T), which also holds light that returns to its pixel. "exact" is
+        1 / diag(T^-1) by a dense inverse, without this light in Lambertian scenes. "estimate"
+        estimates the same by products, as "exact" does if the host lacks memory. An array is F.
     camera_grid : (h, w), optional
-        Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and
+        Camera pixels of a rectangular T, M = h * w. S then does not exist: T relights and
         compensates.
     device : Device or str, optional
-        As `open_device` takes it, "all" for rows on several; opened at the first product. Operators
-        have one.
+        Device as `open_device` takes it, "all" for rows on several; opened at the first product. A
+        matrix that is an operator has its own.
     on_dark : "mask" or "raise"
-        Pixels whose first bounce is 0 or within 5 standard deviations of its noise, estimated if
-        need be: leave them dark in compensations and warn of it, or refuse them. Relighting stays
-        exact.
-    dark : float
-        First bounces below that many times the median one are dark, too; 0 leaves them lit.
+        Treatment of pixels whose first bounce is 0 or within 5 standard deviations of its noise,
+        estimated if need be: leave them dark in compensations and warn of it, or refuse them.
+        Relighting stays exact.
+    dark_threshold : float
+        First bounces below this share of the median one are dark, too; 0 leaves them lit.
     mixing : (3, 3), optional
-        Of the projector's colours: channel c of T answers to mixing[c] @ (red, green, blue) of the
-        pattern.
+        Mixing of the projector's colours: channel c of T answers to mixing[c] @ (red, green, blue)
+        of the pattern.
     noise : Noise or Transport, optional
         Standard deviations of the entries (`ltcl.noise.Noise`), or a second measurement of the same
         scene, whose entries are compared at the first use of `noise`.
     probes, seed : int
-        Of the estimate, at least 2 probes of about 20 products each; its error falls as 1 /
-        sqrt(probes).
+        Number of probes of an estimate, at least 2, of about 20 products each, and their random
+        seed. The error of the estimate falls as 1 / sqrt(probes).
 
     Attributes
     ----------
     channels : 1 or 3
+    shape : (M, N)
     matrices : tuple of 1 or 3
-        T on the host, checked. Of 3 x 3 matrices those on the diagonal; all are in `blocks`, else
-        None.
+        T on the host, checked. For 3 x 3 matrices those on the diagonal; `blocks` has all.
+    blocks : tuple of 3 tuples of 3, or None
     is_compressed : bool
         Whether some channel is an operator S F; see `error` and `compression`, `ltcl.Compression`
         or None.
-    masked : (N,) bool, projector pixels dropped by ``on_dark="mask"``, in any channel
-    dark : str, how many these are and why; empty where all of them are 0 in an array `first_bounce`
-    first_bounce_error : array like first_bounce, or None, the standard error of an estimate
+    masked : (N,) bool
+        Projector pixels dropped by ``on_dark="mask"``, in any channel.
+    dark_note : str
+        Number of masked pixels and the reason; empty if all of them are 0 in an array
+        `first_bounce`.
+    first_bounce_error : array like first_bounce, or None
+        Standard error of an estimate.
 
     Raises
     ------
@@ -118,164 +132,253 @@ class Transport:
         device: Device | str | None = None,
         *,
         on_dark: str = "mask",
-        dark: float = _first_bounce.DARK,
+        dark_threshold: float = DARK_THRESHOLD,
         mixing: Any = None,
         noise: Any = None,
         probes: int = 128,
         seed: int = 0,
     ) -> None:
-        self.blocks = layout.blocks(matrix)
-        diagonal = [row[c] for c, row in enumerate(self.blocks or ())]
-        self.matrices = tuple[Any, ...](diagonal or layout.matrices(matrix))
+        self.blocks, self.matrices = split_channels(matrix)
         self.channels = len(self.matrices)
-        self.mixing = None if mixing is None else layout.mixing(mixing, self.channels, self.blocks)
         self.shape: tuple[int, int] = self.matrices[0].shape
-        M, N = self.shape
-        self.grid = checks.grid("grid", grid, N)
-        if camera_grid is None and M != N:
-            raise InputError(
-                f"camera_grid is None, but matrix has shape {self.shape}; h * w must be {M}"
-            )
-        self.camera_grid = (
-            self.grid if camera_grid is None else checks.grid("camera_grid", camera_grid, M)
-        )
+        self.mixing: np.ndarray | None = None
+        if mixing is not None:
+            self.mixing = check_mixing(mixing, self.channels, has_blocks=self.blocks is not None)
+        self.grid = checks.grid("grid", grid, self.shape[1])
+        self.camera_grid = self._check_camera_grid(camera_grid)
+
         self.compression: Any = None
-        self.reload: Callable[[], Transport] | None = None  # as `ltcl.load` made it
-        self.masked: np.ndarray = np.zeros(N, bool)
-        self.dark = ""
-        self.first_bounce_error: np.ndarray | None = None
-        self._arrays: dict[str, np.ndarray] = {}  # of an unpickled compressed T
-        self.is_compressed = self.is_square and any(
-            underlying_system(T) is not None for T in self.matrices
-        )
-        self._inverses: weakref.WeakSet[Inverse] = (
-            weakref.WeakSet()
-        )  # that were found to be of this T
+        self.is_compressed = self._has_underlying_system()
+        # Loads T again in another process; set by `ltcl.load`.
+        self.reload: Callable[[], Transport] | None = None
+        # Inverses that were found to be of this T.
+        self.checked_inverses: weakref.WeakSet[Inverse] = weakref.WeakSet()
+        # Stored form of an unpickled compressed T.
+        self._arrays: dict[str, np.ndarray] = {}
+
         self._requested_device = device
-        if (own := common_device(self.blocks or [self.matrices], device)) is not None:
-            self.device = own
-        self._noise = self._checked_noise(noise)
-        self._F: np.ndarray | None = None  # (channels, N)
+        matrix_device = common_device(self.blocks or [self.matrices], device)
+        if matrix_device is not None:
+            self.device = matrix_device
+        self._noise = self._check_noise(noise)
+
+        self._F: np.ndarray | None = None
+        self.masked: np.ndarray = np.zeros(self.shape[1], bool)
+        self.dark_note = ""
+        self.first_bounce_error: np.ndarray | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
-        share = checks.number("dark", dark, least=0.0, below=1.0)
+        rule = self._dark_rule(dark_threshold)
         if self.is_square:
-            known = noise is not None and getattr(noise, "source", "") != "estimated"
-            rule = partial(_first_bounce.dark, self.matrices, share, lambda: self.noise, known)
-            own, may_mask = (
-                lambda: self.device,
-                on_dark == "mask" and all(map(can_mask_pixels, self.matrices)),
-            )
-            F, error = _first_bounce.find(self.matrices, first_bounce, own, probes, seed, rule)
-            self._F, self.masked, why = _first_bounce.mask_dark(F, rule(F), self.grid, may_mask)
-            if self.masked.any() and (
-                isinstance(first_bounce, str) or np.any(self.masked & (F > 0))
-            ):
-                self.dark = why
-                logger.warning("%s; they stay unlit", why)
-            if (other := diagnostics.other_grid(self.matrices[0], self.grid)) is not None:
-                logger.warning("grid is %s, but T is much smoother on a grid %s", self.grid, other)
-            self.first_bounce_error = (
-                error[0] if error is not None and self.channels == 1 else error
-            )
-        elif not isinstance(first_bounce, str) or first_bounce != "diagonal":
-            kind = self.shape if self.blocks is None else "of 3 x 3 blocks"
-            raise InputError(
-                f"first_bounce is given, but T is {kind}; only a square T of channels has one"
-            )
+            self._set_first_bounce(first_bounce, rule, on_dark == "mask", probes, seed)
+            self._warn_of_other_grid()
+        else:
+            self._refuse_first_bounce(first_bounce)
 
     def __repr__(self) -> str:
-        (M, N), (h, w), kind = self.shape, self.grid, "grey" if self.channels == 1 else "colour"
-        text = f"{M} x {N}, {kind}, grid {h} x {w}"
+        M, N = self.shape
+        height, width = self.grid
+        kind = "grey" if self.channels == 1 else "colour"
+        text = f"{M} x {N}, {kind}, grid {height} x {width}"
         if self.is_compressed:
             text += f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
         return f"<ltcl Transport {text}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.thumbnails import thumbnails  # brings OpenCV
+        # Imported here, as it brings OpenCV.
+        from ltcl.images.thumbnails import thumbnails
 
         if self._F is None:
             return thumbnails(self, {"picture under white": self @ np.ones(self.grid)})
         first_bounce = np.moveaxis(self._F.reshape(-1, *self.grid), 0, -1).squeeze()
         return thumbnails(self, {"first bounce": first_bounce})
 
-    def to_numpy(self) -> np.ndarray:
-        """T on the host, dense: (M, N), (3, M, N) in colour, (3, 3, M, N) of blocks; `mixing` is left out."""
-        rows = self.blocks or (self.matrices,)
-        checks.fits_host(
-            "T as an array", 8 * len(rows) * len(rows[0]) * self.shape[0] * self.shape[1]
-        )
+    # Construction.
 
-        def dense(T: Any) -> np.ndarray:
-            T = (
-                T.tocsr().toarray() if hasattr(T, "tocsr") else T
-            )  # of memory, or of the rows of a store
-            return (
-                check_mapped_file(T)
-                if isinstance(T, np.ndarray)
-                else as_operator(T, self.device).to_dense()
+    def _check_camera_grid(self, camera_grid: Any) -> tuple[int, int]:
+        M, N = self.shape
+        if camera_grid is not None:
+            return checks.grid("camera_grid", camera_grid, M)
+        if M != N:
+            raise InputError(
+                f"camera_grid is None, but matrix has shape {self.shape}; h * w must be {M}"
             )
+        return self.grid
 
-        whole = np.array([[dense(T) for T in row] for row in rows])
-        return whole if self.blocks else whole[0] if self.channels == 3 else whole[0, 0]
+    def _has_underlying_system(self) -> bool:
+        """Whether some channel is an operator S diag(d)."""
+        if not self.is_square:
+            return False
+        return any(underlying_system(T) is not None for T in self.matrices)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """For `pickle` and `copy.deepcopy`: without the device, which is opened again when it is needed."""
-        state = {name: value for name, value in vars(self).items() if name not in _ON_DEVICE}
-        if isinstance(device := self._requested_device, Device):
-            state["_requested_device"] = device.description.index
-        rows = self.blocks or ([self.matrices] if "matrices" in state else [])
-        if any(isinstance(T, Operator) for row in rows for T in row):
-            state["_arrays"] = to_arrays(self)
-            del state["matrices"]
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _inverses=weakref.WeakSet(), reload=None)
-
-    @cached_property
-    def matrices(self) -> tuple[Any, ...]:
-        """As `__init__` sets them; those of an unpickled compressed T are uploaded at their first use."""
-        return from_arrays(self._arrays, on_dark="mask", device=self.device).matrices
-
-    @cached_property
-    def noise(self) -> Noise:
-        """Standard deviations of the entries: as given or measured, else estimated from T at the first call.
-
-        InputError where T does not show its entries (compressed, or a LinearOperator) and none is
-        given.
-        """
-        if isinstance(self._noise, Transport):
-            return Noise.measured_twice(self.matrices, self._noise.matrices)
-        return self._noise or estimate(self.matrices, self.grid, self.camera_grid)
-
-    @property
-    def measured_noise(self) -> Noise | None:
-        """`noise`, or None where it is an estimate from T alone."""
-        return None if self._noise is None else self.noise
-
-    def _checked_noise(self, noise: Any) -> Noise | Transport | None:
+    def _check_noise(self, noise: Any) -> Noise | Transport | None:
+        if noise is None:
+            return None
         if isinstance(noise, Noise):
-            entries = all(isinstance(T, _first_bounce.ENTRIES) for T in self.matrices)
-            known = entries or (
-                self.is_square and all(hasattr(T, "diagonal") for T in self.matrices)
-            )
-            light = [(T if entries else T.diagonal()).max() for T in self.matrices if known]
-            noise.require(self.channels, self.shape, light or 0.0)
+            noise.check_fits(self.channels, self.shape, self._brightest_entries())
         elif isinstance(noise, Transport):
-            for name in ("grid", "camera_grid", "channels"):
-                if getattr(noise, name) != getattr(self, name):
-                    both = f"{getattr(noise, name)}; a second measurement has {name} {getattr(self, name)}"
-                    raise InputError(f"noise is a T of {name} {both}, as matrix")
-        elif noise is not None:
+            self._check_second_measurement(noise)
+        else:
             kind = type(noise).__name__
             raise InputTypeError(
                 f"noise is a {kind}; it must be a Noise, or a Transport measured once more"
             )
         return noise
 
+    def _brightest_entries(self) -> Any:
+        """Brightest entry of each channel, or of its diagonal; 0 if T does not show them."""
+        if all(isinstance(T, ENTRIES) for T in self.matrices):
+            return [T.max() for T in self.matrices]
+        if self.is_square and all(hasattr(T, "diagonal") for T in self.matrices):
+            return [T.diagonal().max() for T in self.matrices]
+        return 0.0
+
+    def _check_second_measurement(self, second: Transport) -> None:
+        for name in ("grid", "camera_grid", "channels"):
+            value = getattr(second, name)
+            expected = getattr(self, name)
+            if value != expected:
+                raise InputError(
+                    f"noise is a T of {name} {value}; a second measurement has {name} {expected}, "
+                    "as matrix"
+                )
+
+    def _dark_rule(self, threshold: float) -> DarkRule:
+        is_measured = self._noise is not None
+        if isinstance(self._noise, Noise):
+            is_measured = self._noise.source != "estimated"
+        return DarkRule(
+            matrices=self.matrices,
+            threshold=checks.number("dark_threshold", threshold, least=0.0, below=1.0),
+            noise=lambda: self.noise,
+            is_measured=is_measured,
+        )
+
+    def _set_first_bounce(
+        self, requested: Any, rule: DarkRule, mask: bool, probes: int, seed: int
+    ) -> None:
+        """Find F, its error, and the pixels where it is dark."""
+        F, error = find_first_bounce(
+            self.matrices, requested, lambda: self.device, probes, seed, rule
+        )
+        is_dark = rule.find_dark(F)
+        may_mask = mask and all(map(can_mask_pixels, self.matrices))
+        self._F, self.masked, reason = mask_dark(F, is_dark, self.grid, may_mask)
+        # The zeros of a first bounce that the caller gave are no news to the caller.
+        is_news = isinstance(requested, str) or np.any(self.masked & (F > 0))
+        if is_news and self.masked.any():
+            self.dark_note = reason
+            logger.warning("%s; they stay unlit", reason)
+        if error is not None and self.channels == 1:
+            error = error[0]
+        self.first_bounce_error = error
+
+    def _warn_of_other_grid(self) -> None:
+        better = diagnostics.other_grid(self.matrices[0], self.grid)
+        if better is not None:
+            logger.warning("grid is %s, but T is much smoother on a grid %s", self.grid, better)
+
+    def _refuse_first_bounce(self, requested: Any) -> None:
+        """Refuse a `first_bounce` other than the default for a T without S."""
+        if isinstance(requested, str) and requested == "diagonal":
+            return
+        kind = self.shape if self.blocks is None else "of 3 x 3 blocks"
+        raise InputError(
+            f"first_bounce is given, but T is {kind}; only a square T of channels has one"
+        )
+
+    # Stored form, pickling and copying.
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays by name of a compressed T, as files hold them (`ltcl.transport.stored`)."""
+        return stored.to_arrays(self)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: Mapping[str, np.ndarray],
+        *,
+        grid: Any = None,
+        first_bounce: Any = None,
+        on_dark: str = "mask",
+        dark_threshold: float = DARK_THRESHOLD,
+        device: Device | str | None = None,
+        noise: Any = None,
+    ) -> Transport:
+        """The transport of the arrays of `to_arrays`, on a device that is opened at once.
+
+        A `grid` must be the stored one; `first_bounce` and `noise` replace the stored ones.
+        """
+        stored_grid = checks.grid("grid", arrays["grid"].tolist())
+        if grid is not None and checks.grid("grid", grid) != stored_grid:
+            raise InputError(
+                f"grid is {grid!r}; this transport is compressed on its own, {stored_grid}"
+            )
+        matrices = stored.matrices_from_arrays(arrays, open_device(device))
+        if first_bounce is None:
+            first_bounce = arrays["first_bounce"]
+        if noise is None:
+            noise = Noise.from_arrays(arrays)
+        return cls(
+            matrices,
+            stored_grid,
+            first_bounce,
+            on_dark=on_dark,
+            dark_threshold=dark_threshold,
+            mixing=arrays.get("mixing"),
+            noise=noise,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for `pickle` and `copy.deepcopy`, without the device, which is opened again."""
+        state = {name: value for name, value in vars(self).items() if name not in NOT_PICKLED}
+        device = self._requested_device
+        if isinstance(device, Device):
+            state["_requested_device"] = device.description.index
+        # An unpickled T that was not used yet has no matrices, but still its arrays.
+        matrices = state.get("matrices", ())
+        if self.blocks is not None:
+            matrices = [block for row in self.blocks for block in row]
+        if any(isinstance(T, Operator) for T in matrices):
+            state["_arrays"] = self.to_arrays()
+            del state["matrices"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
+        self.reload = None
+        self.checked_inverses = weakref.WeakSet()
+
+    @cached_property
+    def matrices(self) -> tuple[Any, ...]:
+        """T of each channel on the host; of an unpickled compressed T uploaded at the first use."""
+        return stored.matrices_from_arrays(self._arrays, self.device)
+
+    # Noise.
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Standard deviations of the entries: given, measured, or estimated at the first call.
+
+        InputError if T does not show its entries (compressed, or a LinearOperator) and no noise is
+        given.
+        """
+        if isinstance(self._noise, Transport):
+            return Noise.measured_twice(self.matrices, self._noise.matrices)
+        if self._noise is not None:
+            return self._noise
+        return estimate(self.matrices, self.grid, self.camera_grid)
+
+    @property
+    def measured_noise(self) -> Noise | None:
+        """`noise`, or None if it is an estimate from T alone."""
+        return None if self._noise is None else self.noise
+
+    # First bounce and interreflection.
+
     @property
     def is_square(self) -> bool:
-        """Whether S exists: camera and projector have the same pixels, and colours no blocks between them."""
+        """Whether S exists: one grid of camera and projector, and no blocks between colours."""
         return self.camera_grid == self.grid and self.blocks is None
 
     @property
@@ -289,18 +392,40 @@ class Transport:
         F = self._require_first_bounce()
         return F[0] if self.channels == 1 else F
 
+    def _require_first_bounce(self) -> np.ndarray:
+        """Diagonal of F (channels, N) float64; InputError if T has no S."""
+        if self._F is None:
+            kind = f"a camera_grid {self.camera_grid}"
+            if self.blocks is not None:
+                kind = "blocks between colours"
+            raise InputError(
+                f"T has a grid {self.grid} and {kind}; S = T F^-1 needs one grid and no blocks: "
+                "this T can only relight and compensate"
+            )
+        return self._F
+
     @cached_property
     def reciprocity_defect(self) -> float:
         """Deviation of the worst channel from reciprocity, by a sample of pixels; computed once."""
-        pairs = zip(self.matrices, self._require_first_bounce(), strict=True)
-        return max(
-            diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK) for T, F in pairs
-        )
+        defects = []
+        for T, F in zip(self.matrices, self._require_first_bounce(), strict=True):
+            defects.append(diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK_ENTRIES))
+        return max(defects)
 
     @cached_property
     def negative_bounces(self) -> tuple[float, ...]:
-        """Light that one bounce takes away, of each channel (`ltcl.transport.diagnostics`); computed once."""
+        """Share of light that one bounce takes away, for each channel; computed once."""
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
+
+    @cached_property
+    def ambient_share(self) -> float:
+        """Ambient light left in T, as a share of a bounce; 0 if T shows no entries, or few."""
+        has_entries = all(isinstance(T, ENTRIES) for T in self.matrices)
+        if not has_entries:
+            return 0.0
+        return diagnostics.ambient_share(self.systems, self.grid)
+
+    # Operators on the device.
 
     @cached_property
     def device(self) -> Device:
@@ -324,60 +449,82 @@ class Transport:
 
     @property
     def error(self) -> float:
-        """Relative error of solutions that compression leaves, as its `norm` states it: of pictures, or all.
+        """Relative error of solutions that compression leaves, besides rounding, 1e-7.
 
-        Rounding, 1e-7, comes on top.
+        It holds for pictures, or for all right-hand sides, as the `norm` of the compression states.
         """
-        return max(S.solution_error for S in self.systems) if self.is_compressed else 0.0
+        if not self.is_compressed:
+            return 0.0
+        return max(S.solution_error for S in self.systems)
 
     @property
     def error_bound(self) -> float:
         """Bound on that error for every right-hand side, pictures or not."""
-        return max(S.error_bound for S in self.systems) if self.is_compressed else 0.0
+        if not self.is_compressed:
+            return 0.0
+        return max(S.error_bound for S in self.systems)
 
     @cached_property
     def operators(self) -> tuple[Operator, ...]:
         """T of each channel on the device, or one `Coupled` of all, channel below channel."""
         if self.blocks is not None:
-            return (Coupled([[as_operator(T, self.device) for T in row] for row in self.blocks]),)
-        own = tuple(self._operator(channel) for channel in range(self.channels))
-        return own if self.mixing is None else (Coupled.mixed(own, self.mixing),)
+            rows = []
+            for row in self.blocks:
+                rows.append([as_operator(T, self.device) for T in row])
+            return (Coupled(rows),)
+        operators = tuple(self._operator(channel) for channel in range(self.channels))
+        if self.mixing is not None:
+            return (Coupled.mixed(operators, self.mixing),)
+        return operators
 
     def _operator(self, channel: int) -> Operator:
-        """T of one channel: S F where that has all of its digits, so that nothing is stored twice."""
+        """T of one channel: S F if that has all of its digits, so that nothing is stored twice."""
         T = check_mapped_file(self.matrices[channel])
-        if self._F is not None and not self.masked.any() and not isinstance(T, Operator):
-            F = self._F[channel]
-            if hasattr(T, "diagonal") and np.all(np.asarray(T.diagonal()) >= _CANCELLATION * F):
-                return ScaledColumns(self.systems[channel], F)
+        if self._F is None or self.masked.any() or isinstance(T, Operator):
+            return as_operator(T, self.device)
+        F = self._F[channel]
+        if hasattr(T, "diagonal") and np.all(np.asarray(T.diagonal()) >= MIN_DIAGONAL_SHARE * F):
+            return ScaledColumns(self.systems[channel], F)
         return as_operator(T, self.device)
 
+    # Use.
+
     def __matmul__(self, pattern: Any) -> np.ndarray:
-        """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
+        """Relight: the picture (float32) under `pattern`, as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
-        columns = [np.concatenate(columns)] if self.couples else columns
-        uploaded = [(T, T.device.upload(x)) for T, x in zip(self.operators, columns, strict=True)]
-        pictures = [
-            T.apply(x) for T, x in uploaded
-        ]  # all are queued before the first is waited for
+        if self.couples:
+            columns = [np.concatenate(columns)]
+        uploaded = []
+        for T, column in zip(self.operators, columns, strict=True):
+            uploaded.append((T, T.device.upload(column)))
+        # All products are queued before the first one is waited for.
+        pictures = [T.apply(x) for T, x in uploaded]
         return shape.pack([picture.get() for picture in pictures], self.camera_grid)
 
-    def _require_first_bounce(self) -> np.ndarray:
-        if self._F is None:
-            kind = (
-                f"a camera_grid {self.camera_grid}"
-                if self.blocks is None
-                else "blocks between colours"
-            )
-            needs = (
-                "S = T F^-1 needs one grid and no blocks: this T can only relight and compensate"
-            )
-            raise InputError(f"T has a grid {self.grid} and {kind}; {needs}")
-        return self._F
+    def to_numpy(self) -> np.ndarray:
+        """T on the host, dense, without `mixing`: (M, N), (3, M, N), or (3, 3, M, N) of blocks."""
+        M, N = self.shape
+        count = self.channels if self.blocks is None else 9
+        checks.fits_host("T as an array", 8 * count * M * N)
+        if self.blocks is not None:
+            rows = []
+            for row in self.blocks:
+                rows.append([self._to_dense(T) for T in row])
+            return np.array(rows)
+        dense = np.array([self._to_dense(T) for T in self.matrices])
+        return dense[0] if self.channels == 1 else dense
+
+    def _to_dense(self, matrix: Any) -> np.ndarray:
+        if hasattr(matrix, "tocsr"):
+            # A sparse matrix in memory, or the rows of a store.
+            matrix = matrix.tocsr().toarray()
+        if isinstance(matrix, np.ndarray):
+            return check_mapped_file(matrix)
+        return as_operator(matrix, self.device).to_dense()
 
 
-def require(T: Any, *, square: bool = True, name: str = "T") -> Transport:
-    """T itself; refused, before any upload, where it is no Transport or has no S."""
+def check_transport(T: Any, *, square: bool = True, name: str = "T") -> Transport:
+    """Return T if it is a Transport, and has an S or need not be `square`; refuse others."""
     if not isinstance(T, Transport):
         raise InputTypeError(
             f"{name} is a {type(T).__name__}; it must be a ltcl.Transport(matrix, grid)"
@@ -385,122 +532,3 @@ def require(T: Any, *, square: bool = True, name: str = "T") -> Transport:
     if square:
         T._require_first_bounce()
     return T
-
-
-def refuse_other(name: str, other: Any, T: Transport, advice: str) -> None:
-    """Refuse what was made of a transport with other pixels, colours or first bounce than T."""
-    for what in ("grid", "channels"):
-        value, expected = getattr(other, what), getattr(T, what)
-        if value != expected:
-            raise InputError(f"{name} has {what} {value}; it must be that of T, {expected}")
-    if not np.allclose(other.first_bounce, T.first_bounce, rtol=_SAME, atol=0.0):
-        raise InputError(f"{name} has another first bounce than T; {advice}")
-    own, others = (np.eye(3) if M is None else M for M in (T.mixing, other.mixing))
-    if not np.array_equal(own, others):
-        raise InputError(f"{name} mixes colours in another way than T; {advice}")
-
-
-def require_inverse(T: Transport, inverse: Any, rtol: float | None, **others: Any) -> None:
-    """Refuse an `inverse` of another T, which a random light shows, or of less than `rtol`, and `others`."""
-    if not isinstance(inverse, Inverse):
-        raise InputTypeError(
-            f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives"
-        )
-    for name, value in others.items():
-        if value is not None:
-            raise InputError(
-                f"{name} is given, but inverse takes the place of all solves; leave one out"
-            )
-    inverse.refuse_beyond(rtol)
-    if inverse in T._inverses:
-        return
-    refuse_other("inverse", inverse, T, "make it with ltcl.invert(T)")
-    v = np.random.default_rng(0).standard_normal(T.shape[1]).astype(np.float32)
-    misses = [
-        np.linalg.norm(X @ (S @ v) - v) for X, S in zip(inverse.systems, T.systems, strict=True)
-    ]
-    deviation = float(max(misses) / np.linalg.norm(v))
-    allowed = inverse.error + T.error * (1.0 + inverse.error) + _ROUNDING
-    if not deviation <= allowed:
-        raise InputError(
-            f"inverse is not that of T: light comes back off by {deviation:.2g}, which may be "
-            f"{checks.upwards(allowed)} at most; make it with ltcl.invert(T)"
-        )
-    T._inverses.add(inverse)
-
-
-def default_rtol(
-    least: float, T: Transport, exact: Any = None, inverse: Inverse | None = None
-) -> float:
-    """Of a task without one: `least`, or the error of a compressed T or of an inverse where that is more."""
-    error = inverse.error if inverse is not None else T.error if exact is None else 0.0
-    return max(least, error) if error < 1.0 else least  # which is refused, with the reason
-
-
-def to_arrays(T: Transport) -> dict[str, np.ndarray]:
-    """The arrays of a compressed T, S diag(d) in each channel, for files and pickles.
-
-    Those of `ltcl.operators.stored`, grid, first_bounce, mixing and noise if any, columns_0, ...
-    where d is another F.
-    """
-    systems = [S for S in map(underlying_system, T.matrices) if S is not None]
-    if not T.is_square or len(systems) < T.channels:
-        kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
-        raise InputTypeError(
-            f"T is made of {kinds}; only arrays, sparse matrices and S diag(F) are stored"
-        )
-    F = np.atleast_2d(T.first_bounce)
-    arrays = {"grid": np.array(T.grid), "first_bounce": F}
-    if T.mixing is not None:
-        arrays["mixing"] = T.mixing
-    if T.measured_noise is not None:
-        arrays |= T.measured_noise.to_arrays()
-    for channel, (matrix, f) in enumerate(zip(T.matrices, F, strict=True)):
-        if not np.array_equal(matrix.d, f):
-            arrays[f"columns_{channel}"] = np.asarray(matrix.d, np.float64)
-    return arrays | stored_operators.to_arrays(systems)
-
-
-def from_arrays(
-    arrays: Mapping[str, np.ndarray],
-    *,
-    grid: Any = None,
-    first_bounce: Any = None,
-    on_dark: str = "mask",
-    dark: float = _first_bounce.DARK,
-    device: Device | str | None = None,
-    noise: Any = None,
-) -> Transport:
-    """The transport of such arrays, on a device that is opened at once; `grid`, if any, must be theirs."""
-    F, own = arrays["first_bounce"], checks.grid("grid", arrays["grid"].tolist())
-    if grid is not None and checks.grid("grid", grid) != own:
-        raise InputError(f"grid is {grid!r}; this transport is compressed on its own, {own}")
-    systems = stored_operators.from_arrays(open_device(device), arrays)
-    if len(systems) != len(F):
-        raise InputError(
-            f"first_bounce has {len(F)} channels, but there are {len(systems)} operators"
-        )
-    matrices = [ScaledColumns(S, arrays.get(f"columns_{c}", F[c])) for c, S in enumerate(systems)]
-    first = F if first_bounce is None else first_bounce
-    others: dict[str, Any] = {
-        "mixing": arrays.get("mixing"),
-        "noise": noise or Noise.from_arrays(arrays),
-    }
-    return Transport(matrices, own, first, on_dark=on_dark, dark=dark, **others)
-
-
-def resolve_reference(
-    T: Transport, exact: Any
-) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:
-    """The transport that results are of, and the S that judges each channel: T and none without `exact`."""
-    if exact is None:
-        return T, (None,) * T.channels
-    require(T)
-    require(exact, name="exact")
-    refuse_other("exact", exact, T, "it must be that of T, or T made from exact")
-    return exact, exact.systems
-
-
-def error_note(error: float) -> str:
-    """Behind a result: by how much its T deviates."""
-    return f" with a T that itself is off by {checks.upwards(error)}" if error else ""

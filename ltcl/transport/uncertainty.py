@@ -1,71 +1,81 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Standard deviations of patterns and bounces that the noise of T causes, pixel by pixel.
 
-A measured T is the true one and an error E, whose entries have the variances v_ij of `T.noise`.
-Errors E a and E b of pixel i have the covariance
+To first order in the error E of T, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, the bounces
+b_k of eq. 27 and p_k = F^-1 b_k:
 
-    q_ab = sum_j v_ij a_j b_j = rows_i (photons T (columns a b) + floor^2 columns . (a b))_i
+    picture T p     E p
+    pattern p       -F^-1 X E p
+    bounce b_k      db_k = X (dl^(k) - E p_k) + D p_k,    dl^(k+1) = dl^(k) - db_k,    dl^(0) = 0
 
-of a and b as `Noise.filtered` has them, or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the
-row adds up to a measured white of variance u. To first order, with F = diag(T), D = diag(E), X =
-S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
+Two parts of X = I - R X give the variance:
 
-    T p:    E p
-    p:      -F^-1 X E p
-    b_k:    db_k = X (dl^(k) - E p_k) + D p_k,    dl^(k+1) = dl^(k) - db_k,    dl^(0) = 0
+1. I: noise of the pixel's own row of T, -F^-1 E p, for bounces (D - E) (p_k - p_(k-1)). It has a
+   closed form, by products (`ltcl.transport.covariance`).
+2. R X: noise of other rows. It is the mean of many, and small, except where gloss lights a pixel by
+   few others. Its mean square over some random errors, drawn row by row with the covariances of
+   `EntryErrors` and solved together, is enough, less the share that the noise of R itself adds,
+   which the first order counts twice.
 
-X = I - R X. What I makes of it is noise of the pixel's own row of T, -F^-1 E p, of bounces
-(D - E) (p_k - p_(k-1)): in closed form, by products. What R X makes of it is noise of other rows:
-the mean of many, and small, except where gloss lights a pixel by few others. Its mean square over
-some random errors, drawn row by row with the covariances above and solved together, is enough; less
-what the noise of R itself adds, which the first order counts twice. Light that returns to its pixel
-correlates both, and is left out.
+Light that returns to its pixel correlates both parts, and is left out. For a clipped pattern the
+errors are those of the least squares problem of its free pixels; E^T times the residual is left
+out.
 
-Where a pattern is clipped, errors are those of the least squares problem of its free pixels; E^T
-times the residual is left out. Known limits: F is taken to have the errors of diag(T). What is no
-noise is not contained: compression, a tolerance, response, blur, and changes of the scene.
+Known limits: F is taken to have the errors of diag(T). Errors other than noise are not contained:
+compression, a tolerance, response, blur, and changes of the scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from ltcl.operators import Operator
-from ltcl.solvers import Inverse, solve
+from ltcl.solvers import Inverse
 from ltcl.solvers.bounded import least_squares
 from ltcl.transport import frames as layout
+from ltcl.transport.covariance import SOLVE_RTOL, EntryErrors, ratio
 from ltcl.transport.noise import Noise
-from ltcl.transport.transport import Transport, default_rtol
+from ltcl.transport.transport import Transport
 
-_DRAWS, _FRAME_DRAWS, _WHOLE_DRAWS = (
-    8,
-    4,
-    16,
-)  # of one picture, of each of several, without a closed form
-_TOGETHER = 8  # pictures whose draws are solved at once
-_ROUNDING = 1e-12  # relative, of a variance
-_RTOL = 0.05  # of solves, whose solutions are the smaller part
+# Random errors of one picture, and of each of several pictures.
+DRAWS = 8
+FRAME_DRAWS = 4
+# Random errors without a closed form beside them.
+DRAWS_WITHOUT_CLOSED_FORM = 16
+# Pictures whose draws are solved at once.
+PICTURES_PER_SOLVE = 8
+# Relative to a variance: a smaller pivot of Cholesky's method is rounding.
+VARIANCE_ROUNDING = 1e-12
 
 
+@dataclass(frozen=True, repr=False, eq=False)
 class _Deviations:
+    """Text of a result: the root mean square of each of its fields."""
+
     def __repr__(self) -> str:
-        rms = (
-            f"{k} {np.sqrt(np.mean(np.square(x, dtype=np.float64))):.2g}"
-            for k, x in vars(self).items()
-        )
-        return f"<ltcl standard deviations, rms of {', '.join(rms)}>"
+        texts = []
+        for each in fields(self):
+            values = getattr(self, each.name)
+            rms = np.sqrt(np.mean(np.square(values, dtype=np.float64)))
+            texts.append(f"{each.name} {rms:.2g}")
+        return f"<ltcl standard deviations, rms of {', '.join(texts)}>"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class SeparationStd(_Deviations):
     """Standard deviations of the result of `ltcl.separate`, in the units of the image, float32.
 
-    `direct` is like the image, `bounces` (bounces, ...): of errors against what the true T makes of
-    the same image. Noise of the image itself is not contained: s a pixel adds about s to the direct
-    part. At masked pixels they are those of the light that T leaves unexplained.
+    Attributes
+    ----------
+    direct : array like the image
+    bounces : (bounces, ...) array of these
+        Errors against the bounces that the true T makes of the same image. Noise of the image
+        itself is not contained: s a pixel adds about s to the direct part. At masked pixels they
+        are those of the light that T leaves unexplained.
     """
 
     direct: np.ndarray
@@ -76,52 +86,83 @@ class SeparationStd(_Deviations):
 class CompensationStd(_Deviations):
     """Standard deviations of the result of `ltcl.compensate`, float32.
 
-    `pattern` at this gain, in light of the projector: 0 where it is masked, or at a bound and
-    clipped. `appearance`: of what the camera will see under this pattern, against what T says.
+    Attributes
+    ----------
+    pattern : array like the pattern
+        At this gain, in light of the projector; 0 where a pixel is masked, or at a bound and
+        clipped.
+    appearance : array like the picture
+        Deviation of the picture that the camera will see under this pattern from the one that T
+        predicts.
     """
 
     pattern: np.ndarray
     appearance: np.ndarray
 
 
-def of_separation(
+def separation_std(
     T: Transport, noise: Noise, pictures: Sequence[np.ndarray], inverse: Inverse | None = None
 ) -> SeparationStd:
-    """Of `pictures`: the direct part and the bounces."""
-    columns = [layout.unpack("bounces", picture, T.grid, T.channels) for picture in pictures]
-    shape, n = columns[0][1], len(pictures)
-    random, deviations = np.random.default_rng(0), []
-    for c, f in enumerate(np.atleast_2d(T.first_bounce)):
-        b = np.stack([each[c] for each, _ in columns], axis=-1).astype(
-            np.float64
-        )  # (N, k, bounces)
-        whole = _ratio(b, f[:, None, None])
-        variances = np.empty(b.shape)
-        for start in range(0, b.shape[1], _TOGETHER):
-            p = whole[:, start : start + _TOGETHER]
-            q = covariance(T, noise, c, p, diagonal=True)
-            # (D - E) (p_k - p_(k-1)) as weights of E p_0, E p_1, ... and D: (N, k, bounces, bounces
-            # + 1)
-            difference = np.broadcast_to(np.eye(n, k=-1) - np.eye(n), (*p.shape, n))
-            weights = np.concatenate([difference, np.diff(p, prepend=0.0)[..., None]], axis=-1)
-            variance = np.einsum("xkna,xkab,xknb->xkn", weights, q, weights)
-            E = _draws(q, random, b.shape[1])  # (N, k, draws, bounces + 1)
-            own = np.einsum("xkna,xkda->xkdn", weights, E)
-            dl, before = np.zeros(E.shape[:3]), np.zeros(E.shape[:3])
-            for k in range(n):
-                x = _solve(T, c, dl - E[..., k], inverse)
-                db = x + E[..., -1] * p[:, :, None, k]
-                variance[..., k] += _square(T, noise, c, before - x, db - own[..., k])
-                dl, before = dl - db, x
-            variances[:, start : start + _TOGETHER] = variance
+    """Standard deviations of `pictures`: the direct part and the bounces."""
+    errors = EntryErrors(T, noise, inverse)
+    unpacked = [layout.unpack("bounces", picture, T.grid, T.channels) for picture in pictures]
+    shape = unpacked[0][1]
+    random = np.random.default_rng(0)
+    deviations = []
+    for channel in range(T.channels):
+        columns = [picture_columns[channel] for picture_columns, _ in unpacked]
+        b = np.stack(columns, axis=-1).astype(np.float64)
+        variances = bounce_variances(errors, channel, b, random)
         deviations.append(np.sqrt(np.maximum(variances, 0.0)))
-    packed = [
-        shape.pack([d[..., k] for d in deviations], T.grid).astype(np.float32) for k in range(n)
-    ]
+    packed = []
+    for k in range(len(pictures)):
+        picture = shape.pack([deviation[..., k] for deviation in deviations], T.grid)
+        packed.append(picture.astype(np.float32))
     return SeparationStd(packed[0], np.stack(packed)[1:])
 
 
-def of_compensation(
+def bounce_variances(
+    errors: EntryErrors, channel: int, b: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
+    """Variances (N, k, n) of bounces b (N, k, n) of k pictures, b[..., 0] the direct part."""
+    F = np.atleast_2d(errors.T.first_bounce)[channel]
+    p = ratio(b, F[:, None, None])
+    pictures = b.shape[1]
+    draws = FRAME_DRAWS if pictures > 1 else DRAWS
+    variances = np.empty(b.shape)
+    for group in _groups(pictures):
+        variances[:, group] = _group_bounce_variances(errors, channel, p[:, group], draws, random)
+    return variances
+
+
+def _group_bounce_variances(
+    errors: EntryErrors, channel: int, p: np.ndarray, draws: int, random: np.random.Generator
+) -> np.ndarray:
+    """Variances (N, k, n) of the bounces of patterns p (N, k, n)."""
+    n = p.shape[-1]
+    q = errors.covariance(channel, p, with_diagonal=True)
+    # 1. (D - E) (p_k - p_(k-1)) as weights of E p_0, E p_1, ... and D, (N, k, n, n + 1), in closed
+    # form.
+    difference = np.broadcast_to(np.eye(n, k=-1) - np.eye(n), (*p.shape, n))
+    steps = np.diff(p, prepend=0.0)[..., None]
+    weights = np.concatenate([difference, steps], axis=-1)
+    variance = np.einsum("xkna,xkab,xknb->xkn", weights, q, weights)
+    # 2. Errors of other rows, by draws (N, k, draws, n + 1) and one solve for each bounce.
+    E = draw_errors(q, draws, random)
+    own_row = np.einsum("xkna,xkda->xkdn", weights, E)
+    D = E[..., -1]
+    dl = np.zeros(E.shape[:3])
+    previous = np.zeros(E.shape[:3])
+    for k in range(n):
+        x = errors.solve(channel, dl - E[..., k])
+        db = x + D * p[:, :, None, k]
+        variance[..., k] += _other_rows(errors, channel, previous - x, db - own_row[..., k])
+        dl = dl - db
+        previous = x
+    return variance
+
+
+def compensation_std(
     T: Transport,
     noise: Noise,
     pattern: np.ndarray,
@@ -130,135 +171,142 @@ def of_compensation(
     systems: Sequence[tuple[Operator, np.ndarray]] = (),
     weights: Sequence[np.ndarray] | None = None,
 ) -> CompensationStd:
-    """Of a pattern that was clipped to `bounds`.
+    """Standard deviations of a pattern that was clipped to `bounds`, and of the picture under it.
 
-    `systems` and `weights`, as `ltcl.compensation` has them, where it is the best within bounds.
+    If the pattern is the best one within bounds, `systems` and `weights` are the operators with
+    their scales and the weights of its least squares problem, as `ltcl.compensate` has them.
     """
-    p, shape = layout.unpack("pattern", pattern, T.grid, T.channels)
-    free = [(bounds[0] < light) & (light < bounds[1]) & ~T.masked[:, None] for light in p]
-    mixed = p if T.mixing is None else list(np.einsum("cd,dnk->cnk", T.mixing, np.stack(p)))
-    mixed = mixed if T.blocks is None else [np.concatenate(p)] * 3
-    q = [
-        covariance(T, noise, c, a[..., None].astype(np.float64))[..., 0, 0]
-        for c, a in enumerate(mixed)
-    ]
-    q = [np.maximum(variance, 0.0) for variance in q]
-    appearance = shape.pack([np.sqrt(variance) for variance in q], T.camera_grid)
-    scales = [scale for _, scale in systems] or list(np.atleast_2d(T.first_bounce))
-    own, random, variances = (
-        not (systems and T.couples) and T.is_square,
-        np.random.default_rng(0),
-        [],
+    errors = EntryErrors(T, noise, inverse)
+    columns, shape = layout.unpack("pattern", pattern, T.grid, T.channels)
+    is_free = []
+    for light in columns:
+        is_inside = (bounds[0] < light) & (light < bounds[1])
+        is_free.append(is_inside & ~T.masked[:, None])
+    picture_variances = _picture_variances(errors, columns)
+    appearance = shape.pack([np.sqrt(variance) for variance in picture_variances], T.camera_grid)
+    if systems:
+        free = is_free
+        if len(systems) < T.channels:
+            # One coupled system of all channels, channel below channel.
+            free = [np.concatenate(is_free)]
+            picture_variances = [np.concatenate(picture_variances)]
+        variances = _bounded_variances(errors, picture_variances, free, systems, weights)
+        if len(systems) < T.channels:
+            variances = np.split(variances[0], 3)
+    else:
+        variances = _unbounded_variances(errors, picture_variances, is_free)
+    deviations = []
+    for variance, free_pixels in zip(variances, is_free, strict=True):
+        deviations.append(np.sqrt(variance * free_pixels))
+    return CompensationStd(
+        shape.pack(deviations, T.grid).astype(np.float32), appearance.astype(np.float32)
     )
-    errors, lit = (x if len(scales) == len(q) else [np.concatenate(x)] for x in (q, free))
-    for c, (variance, f, scale) in enumerate(zip(errors, lit, scales, strict=True)):
-        k, w = variance.shape[1], np.broadcast_to(weights[c] if weights else 1.0, variance.shape)
-        light, f = np.empty(f.shape), f & (scale > 0)[:, None]
-        for some in (slice(start, start + _TOGETHER) for start in range(0, k, _TOGETHER)):
-            e = _draws(variance[:, some, None, None], random, k if own else 0)[..., 0]
-            if systems:
-                x = least_squares(systems[c][0], e, f[:, some, None], w[:, some, None], rtol=_RTOL)
+
+
+def _picture_variances(errors: EntryErrors, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Variances (M, k) of the picture of each channel under a pattern."""
+    T = errors.T
+    if T.blocks is not None:
+        patterns = [np.concatenate(columns)] * 3
+    elif T.mixing is not None:
+        patterns = list(np.einsum("cd,dnk->cnk", T.mixing, np.stack(columns)))
+    else:
+        patterns = list(columns)
+    variances = []
+    for channel, light in enumerate(patterns):
+        q = errors.covariance(channel, light[..., None].astype(np.float64))
+        variances.append(np.maximum(q[..., 0, 0], 0.0))
+    return variances
+
+
+def _unbounded_variances(
+    errors: EntryErrors, picture_variances: Sequence[np.ndarray], is_free: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Variances (N, k) of the pattern F^-1 S^-1 d of each channel."""
+    T = errors.T
+    random = np.random.default_rng(0)
+    variances = []
+    for channel, variance in enumerate(picture_variances):
+        scale = np.atleast_2d(T.first_bounce)[channel]
+        pictures = variance.shape[1]
+        light = np.empty(is_free[channel].shape)
+        for group in _groups(pictures):
+            e = _draw_light(variance[:, group], _draw_count(pictures), random)
+            x = errors.solve(channel, e)
+            light[:, group] = variance[:, group] + _other_rows(errors, channel, x, x - e)
+        variances.append(ratio(light, scale[:, None] ** 2))
+    if T.mixing is None:
+        return variances
+    unmixing = np.linalg.inv(T.mixing)
+    return list(np.einsum("cd,dnk->cnk", unmixing**2, np.stack(variances)))
+
+
+def _bounded_variances(
+    errors: EntryErrors,
+    picture_variances: Sequence[np.ndarray],
+    is_free: Sequence[np.ndarray],
+    systems: Sequence[tuple[Operator, np.ndarray]],
+    weights: Sequence[np.ndarray] | None,
+) -> list[np.ndarray]:
+    """Variances (N, k) of the pattern that is the best within bounds, for each system."""
+    T = errors.T
+    # Only S of one channel has a closed form.
+    has_closed_form = T.is_square and not T.couples
+    random = np.random.default_rng(0)
+    variances = []
+    for number, (A, scale) in enumerate(systems):
+        variance = picture_variances[number]
+        pictures = variance.shape[1]
+        free = is_free[number] & (scale > 0)[:, None]
+        w = np.broadcast_to(weights[number] if weights else 1.0, variance.shape)
+        draws = _draw_count(pictures) if has_closed_form else DRAWS_WITHOUT_CLOSED_FORM
+        light = np.empty(free.shape)
+        for group in _groups(pictures):
+            e = _draw_light(variance[:, group], draws, random)
+            x = least_squares(A, e, free[:, group, None], w[:, group, None], rtol=SOLVE_RTOL)
+            if has_closed_form:
+                light[:, group] = variance[:, group] + _other_rows(errors, number, x, x - e)
             else:
-                x = _solve(T, c, e, inverse)
-            light[:, some] = np.mean(x**2, axis=-1)
-            if own:  # of S: e of the pixel itself, and a rest as above
-                light[:, some] = variance[:, some] + _square(T, noise, c, x, x - e)
-        variances.append(_ratio(light, scale[:, None] ** 2))
-    if T.mixing is not None and not systems:
-        variances = list(
-            np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances))
-        )
-    variances = variances if len(scales) == len(q) else np.split(variances[0], 3)
-    deviations = [np.sqrt(variance * f) for variance, f in zip(variances, free, strict=True)]
-    pictures = shape.pack(deviations, T.grid), appearance
-    return CompensationStd(*(picture.astype(np.float32) for picture in pictures))
+                light[:, group] = np.mean(x**2, axis=-1)
+        variances.append(ratio(light, scale[:, None] ** 2))
+    return variances
 
 
-def covariance(
-    T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False
-) -> np.ndarray:
-    """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
-    n, known = a.shape[-1], np.isfinite(noise.white[c])
-    own = (
-        noise.diagonal(T.first_bounce)[c, :, None, None] ** 2
-        if T.is_square
-        else np.zeros((1, 1, 1))
-    )
-    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1)[..., : n + known.any()]
-    i, j = np.triu_indices(w.shape[-1])
-    seen = noise.filtered(w, T.grid, c)
-    pairs = seen[..., i] * seen[..., j]
-    sums = variance(T, noise, c, pairs.reshape(len(pairs), -1)).reshape(-1, *pairs.shape[1:])
-    if noise.neighbours[c]:
-        sums += own * (
-            w[..., i] * w[..., j] - pairs
-        )  # the first bounce has no part in its neighbours
-    q = np.zeros((*sums.shape[:2], *2 * (w.shape[-1] + diagonal,)))
-    q[..., i, j] = q[..., j, i] = sums
-    if diagonal:
-        q[..., -1, :-1] = q[..., :-1, -1] = own * w
-        q[..., -1, -1] = own[..., 0]
-    if not known.any():
-        return q
-    V = np.where(known[:, None], np.maximum(q[..., n, n], 1e-300), 1.0)
-    factor = np.where(
-        known[:, None], (np.where(known, noise.white[c], 0.0)[:, None] / V - 1.0) / V, 0.0
-    )
-    q += factor[..., None, None] * q[..., n, :, None] * q[..., n, None, :]
-    return np.delete(np.delete(q, n, axis=-1), n, axis=-2)
+def _other_rows(errors: EntryErrors, channel: int, z: np.ndarray, Rz: np.ndarray) -> np.ndarray:
+    """Mean square (N, k) over draws of R z (N, k, draws), beyond the share of the noise of R."""
+    F = np.atleast_2d(errors.T.first_bounce)[channel][:, None]
+    mean_square = ratio(np.mean(z**2, axis=-1), F**2)
+    noise_of_R = errors.variance(channel, mean_square)
+    # Plus one standard deviation of a mean square of so many draws.
+    scatter = (2.0 / z.shape[-1]) ** 0.5
+    return np.maximum(np.mean(Rz**2, axis=-1) - (1.0 + scatter) * noise_of_R, 0.0)
 
 
-def variance(T: Transport, noise: Noise, c: int, squares: np.ndarray) -> np.ndarray:
-    """sum_j v_ij squares_j, (M, k), of (N, k) and channel c; of blocks (3 N, k), channel below channel."""
-    matrices = [T.matrices[c]] if T.blocks is None else T.blocks[c]
-    columns = np.tile(noise.columns[c], len(matrices))[:, None]
-    light = np.zeros((T.shape[0], squares.shape[1])) + noise.floor[c] ** 2 * (columns.T @ squares)
-    if noise.photons[c] > 0.0:
-        weighted = (columns * squares).astype(np.float32)
-        if T.is_square:
-            seen = T.systems[c].matmat(np.atleast_2d(T.first_bounce)[c][:, None] * weighted)
-        else:
-            seen = sum(
-                A @ s for A, s in zip(matrices, np.split(weighted, len(matrices)), strict=True)
-            )
-        light += noise.photons[c] * seen
-    light *= noise.rows[c][:, None]
-    if T.is_square:
-        light -= noise.less_direct(T.first_bounce)[c][:, None] * squares
-    return light
+def _draw_count(pictures: int) -> int:
+    return DRAWS if pictures == 1 else FRAME_DRAWS
 
 
-def _square(T: Transport, noise: Noise, c: int, z: np.ndarray, Rz: np.ndarray) -> np.ndarray:
-    """Mean square over draws of R z, (N, k, draws), where it stands out of what the noise of R makes of z."""
-    f = np.atleast_2d(T.first_bounce)[c][:, None]
-    of_noise = variance(T, noise, c, _ratio(np.mean(z**2, axis=-1), f**2))
-    return np.maximum(np.mean(Rz**2, axis=-1) - (1.0 + (2.0 / z.shape[-1]) ** 0.5) * of_noise, 0.0)
+def _groups(pictures: int) -> Iterator[slice]:
+    for start in range(0, pictures, PICTURES_PER_SOLVE):
+        yield slice(start, start + PICTURES_PER_SOLVE)
 
 
-def _draws(q: np.ndarray, random: np.random.Generator, pictures: int) -> np.ndarray:
-    """Random errors (M, k, draws, n) of the covariances q (M, k, n, n), for a task of so many pictures."""
-    draws = {0: _WHOLE_DRAWS, 1: _DRAWS}.get(pictures, _FRAME_DRAWS)
-    roots, rest = np.zeros(q.shape), q.copy()
-    for n in range(
-        q.shape[-1]
-    ):  # Cholesky's, of all pixels at once; what rounding leaves is no direction
-        pivot = np.where(rest[..., n, n] > _ROUNDING * q[..., n, n], rest[..., n, n], 0.0)
-        roots[..., n] = column = _ratio(rest[..., n], np.sqrt(pivot)[..., None])
-        rest -= column[..., None] * column[..., None, :]
-    return random.standard_normal((*q.shape[:2], draws, q.shape[-1])) @ np.swapaxes(roots, -1, -2)
+def _draw_light(variance: np.ndarray, draws: int, random: np.random.Generator) -> Any:
+    """Independent random errors (M, k, draws) of variances (M, k)."""
+    return draw_errors(variance[..., None, None], draws, random)[..., 0]
 
 
-def _solve(T: Transport, c: int, light: np.ndarray, inverse: Inverse | None) -> np.ndarray:
-    """X of light (N, k, draws)."""
-    b = light.reshape(len(light), -1)
-    x = (
-        inverse.solve(b, c)
-        if inverse is not None
-        else solve(T.systems[c], b, rtol=default_rtol(_RTOL, T))
-    )
-    return x.x.astype(np.float64).reshape(light.shape)
-
-
-def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a / b; 0 where b is."""
-    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(a.shape, b.shape)), where=b > 0)
+def draw_errors(q: np.ndarray, draws: int, random: np.random.Generator) -> np.ndarray:
+    """Random errors (M, k, draws, n) of the covariances q (M, k, n, n)."""
+    # Cholesky's method for all pixels at once; a pivot that is rounding is no direction.
+    n = q.shape[-1]
+    roots = np.zeros(q.shape)
+    rest = q.copy()
+    for column in range(n):
+        pivot = rest[..., column, column]
+        pivot = np.where(pivot > VARIANCE_ROUNDING * q[..., column, column], pivot, 0.0)
+        root = ratio(rest[..., column], np.sqrt(pivot)[..., None])
+        roots[..., column] = root
+        rest -= root[..., None] * root[..., None, :]
+    normal = random.standard_normal((*q.shape[:2], draws, n))
+    return normal @ np.swapaxes(roots, -1, -2)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 if TYPE_CHECKING:
     from ltcl.viewer.server import Viewer
@@ -42,7 +42,7 @@ def view(
     from ltcl.viewer.answers import Scene
     from ltcl.viewer.server import Viewer
 
-    require(T, square=False)
+    check_transport(T, square=False)
     pictures = (
         picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
     )

@@ -86,7 +86,7 @@ def test_a_function_is_sent_once_to_each_worker(client, monkeypatch):
         asked.append(len(workers))
         return run(function, *arguments, workers=workers, **options)
 
-    monkeypatch.setattr("ltcl.cluster._PERIOD", 0.02)
+    monkeypatch.setattr("ltcl.batch.cluster.PERIOD", 0.02)
     monkeypatch.setattr(client, "run", count)
     list(stream(client, lambda number: time.sleep(0.05), range(12)))
     assert asked == [2, 2]  # before the first task, and at the end

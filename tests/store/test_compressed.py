@@ -23,7 +23,7 @@ from ltcl.operators import (
     Tiles,
     Wavelet,
 )
-from ltcl.store import Parts, formats
+from ltcl.store import CompressedRecord, formats
 from tests.problems import enclosure, lambertian
 
 random = np.random.default_rng()
@@ -106,7 +106,7 @@ def test_what_is_known_without_a_device(device: Any, tmp_path: Path) -> None:
     C = compressed(device, 3, "tiles")
     ltcl.save(tmp_path / "C.npz", C)
     parts = formats.read(tmp_path / "C.npz")
-    assert isinstance(parts, Parts)
+    assert isinstance(parts, CompressedRecord)
     assert (parts.shape, parts.grid, parts.error, parts.kinds) == (
         (N, N),
         GRID,

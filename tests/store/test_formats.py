@@ -18,7 +18,7 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import FileError, InputTypeError, LtclError, MemoryLimitError
-from ltcl.store import Record, formats
+from ltcl.store import StoreRecord, formats
 from ltcl.store.record import Matrix
 from ltcl.transport.noise import Noise
 
@@ -40,7 +40,7 @@ NO_NUMBERS = (
 ARRAY = b"%%MatrixMarket matrix array real general\n"
 
 
-def same(a: Record, b: Record) -> None:
+def same(a: StoreRecord, b: StoreRecord) -> None:
     """Assert that two records are equal in every value and type."""
     assert (a.grid, a.camera_grid) == (b.grid, b.camera_grid)
     for x, y in zip(a.matrices, b.matrices, strict=True):
@@ -76,7 +76,7 @@ def test_everything_comes_back(
         sparse(12, dtype, k, k) if square else dense(10, 12, dtype, k) for k in range(channels)
     ]
     F = random.uniform(1, 2, (12,) if channels == 1 else (3, 12)) if square else None
-    record = Record(
+    record = StoreRecord(
         tuple(T), (3, 4), None if square else (2, 5), F, np.eye(3) + 0.1 if channels == 3 else None
     )
     path = tmp_path / f"T{extension}"
@@ -94,31 +94,32 @@ def test_everything_comes_back(
 @pytest.mark.parametrize("T", [(dense(5, 12),), (dense(), dense(seed=2), dense(seed=3))])
 def test_npy_keeps_the_matrix_alone(tmp_path: Path, T: Any, caplog: Any) -> None:
     with caplog.at_level(logging.WARNING):
-        formats.write(tmp_path / "T.npy", Record(T))
+        formats.write(tmp_path / "T.npy", StoreRecord(T))
         assert not caplog.messages
         formats.write(
-            tmp_path / "T.mat", replace(Record(T), noise=Noise.uniform(T[0].shape, [0.1] * len(T)))
+            tmp_path / "T.mat",
+            replace(StoreRecord(T), noise=Noise.uniform(T[0].shape, [0.1] * len(T))),
         )
         assert "T.mat: .mat does not keep the noise" in caplog.text
         if len(T) == 3:
-            formats.write(tmp_path / "T.npy", Record(T, first_bounce=np.ones(12)))
+            formats.write(tmp_path / "T.npy", StoreRecord(T, first_bounce=np.ones(12)))
             assert "first bounce" in caplog.text
-    same(read(tmp_path / "T.npy"), Record(T))
+    same(read(tmp_path / "T.npy"), StoreRecord(T))
     with pytest.raises(FileError, match=r"T\.npy: T is sparse"):
-        formats.write(tmp_path / "T.npy", Record((sparse(),)))
+        formats.write(tmp_path / "T.npy", StoreRecord((sparse(),)))
 
 
 @pytest.mark.parametrize("make", [sparse, dense])
 @pytest.mark.parametrize("grids", [(None, None), ((3, 4), None), ((3, 4), (2, 6))])
 def test_mtx_keeps_one_matrix_and_the_grids(tmp_path: Path, make: Any, grids: Any) -> None:
     path, T = tmp_path / "T.MTX", tuple(make(seed=k).astype(np.float64) for k in (1, 2, 3))
-    formats.write(path, Record(T[:1], *grids))
-    same(read(path), Record(T[:1], *grids))
+    formats.write(path, StoreRecord(T[:1], *grids))
+    same(read(path), StoreRecord(T[:1], *grids))
     np.testing.assert_array_equal(
         as_dense(scipy.sparse.csr_array(scipy.io.mmread(path))), as_dense(T[0])
     )
     with pytest.raises(FileError, match=r"three channels"):
-        formats.write(path, Record(T, *grids))
+        formats.write(path, StoreRecord(T, *grids))
 
 
 @pytest.mark.parametrize("kind", ["array", "matrix"])
@@ -131,7 +132,7 @@ def test_every_layout_of_scipy_is_read_and_one_is_written(
     (result,) = read(tmp_path / "T.npz").matrices
     assert isinstance(result, scipy.sparse.csr_array)
     np.testing.assert_array_equal(result.toarray(), T.toarray())
-    formats.write(tmp_path / "T.npz", Record((result,), (3, 4)))
+    formats.write(tmp_path / "T.npz", StoreRecord((result,), (3, 4)))
     loaded = scipy.sparse.load_npz(tmp_path / "T.npz")
     assert isinstance(loaded, scipy.sparse.csr_array)
     np.testing.assert_array_equal(loaded.toarray(), T.toarray())
@@ -173,7 +174,7 @@ def test_named_arrays_are_read(tmp_path: Path, arrays: Any) -> None:
     camera_grid = (2, 6) if "camera_grid" in arrays else None
     same(
         read(tmp_path / "T.npz"),
-        Record((dense(),), (3, 4), camera_grid, arrays.get("first_bounce")),
+        StoreRecord((dense(),), (3, 4), camera_grid, arrays.get("first_bounce")),
     )
 
 
@@ -335,7 +336,7 @@ def test_hostile_hdf5(tmp_path: Path, name: str, value: Any, text: str) -> None:
 )
 def test_sparse_groups_that_lie(tmp_path: Path, name: str, change: Any, text: str) -> None:
     path, T = tmp_path / "T.h5", sparse().tocsc()
-    formats.write(path, Record((sparse(),), (3, 4)))
+    formats.write(path, StoreRecord((sparse(),), (3, 4)))
     with h5py.File(path, "r+") as file:
         place: Any = file["T"] if name != "MATLAB_sparse" else file["T"].attrs
         del place[name]
@@ -364,7 +365,7 @@ def test_an_honest_giant_is_a_matter_of_memory(
     if extension == "5.mat":
         scipy.io.savemat(path, {"LTM": np.zeros((400, 400))}, do_compression=True)
     else:
-        formats.write(path, Record((np.ones((400, 400)),), (20, 20)))
+        formats.write(path, StoreRecord((np.ones((400, 400)),), (20, 20)))
     monkeypatch.setattr("ltcl.checks.host_memory", lambda: 9_000)
     assert "host has" in refusal(path, MemoryLimitError)
 
@@ -411,5 +412,5 @@ def test_what_holds_no_transport_is_refused(
 def test_without_h5py_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     with pytest.raises(FileError, match=r"T\.h5: \.h5 files need h5py; pip install 'ltcl\[hdf5\]'"):
-        formats.write(tmp_path / "T.h5", Record((dense(),), (3, 4)))
+        formats.write(tmp_path / "T.h5", StoreRecord((dense(),), (3, 4)))
     assert not list(tmp_path.iterdir())

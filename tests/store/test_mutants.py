@@ -26,7 +26,7 @@ import scipy.sparse
 import ltcl
 from ltcl.device import Device
 from ltcl.errors import LtclError
-from ltcl.store import Record, formats
+from ltcl.store import StoreRecord, formats
 
 from .stores import dense, sparse
 
@@ -86,12 +86,13 @@ def write_samples(folder: Path, device: Device) -> None:
     """Small good files of each kind and layout."""
     grid, rgb = (3, 4), tuple(sparse(seed=seed, pattern=seed) for seed in range(3))
     for extension in (".npz", ".npy", ".mtx", ".h5", ".mat", ".zarr"):
-        formats.write(folder / f"dense{extension}", Record((dense(),), grid))
+        formats.write(folder / f"dense{extension}", StoreRecord((dense(),), grid))
         if extension != ".npy":
             formats.write(
-                folder / f"sparse{extension}", Record((sparse(),), grid, first_bounce=np.ones(12))
+                folder / f"sparse{extension}",
+                StoreRecord((sparse(),), grid, first_bounce=np.ones(12)),
             )
-    formats.write(folder / "rgb.npz", Record(rgb, grid, mixing=np.eye(3)))
+    formats.write(folder / "rgb.npz", StoreRecord(rgb, grid, mixing=np.eye(3)))
     np.savez_compressed(folder / "deflated.npz", T=dense(), grid=grid)
     for layout in ("csc", "coo", "bsr", "dia"):
         scipy.sparse.save_npz(

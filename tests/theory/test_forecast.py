@@ -23,7 +23,7 @@ from tests.problems import enclosure, lambertian
 @pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
 @pytest.mark.parametrize("f", [0.0, 1e-3, 0.3, 0.77, 0.99])
 def test_products_are_the_first_with_a_polynomial_below_the_tolerance(f, rtol):
-    """f^k of the series and of Richardson; that of Chebyshev has the maximum 1 / T_k(centre / radius)."""
+    """The series and Richardson have f^k; Chebyshev has the maximum 1 / T_k(centre / radius)."""
     bounds = 2 * (1 - f), 2 * (1 + f), rtol
     table: list[tuple[float, Callable[[Any], Any]]] = [
         (theory.series_products(f, rtol), lambda k: f**k),
@@ -39,7 +39,7 @@ def test_products_are_the_first_with_a_polynomial_below_the_tolerance(f, rtol):
 
 @pytest.mark.parametrize("upper", [1e3, 1e16, 1e30])
 def test_products_of_the_widest_spectra_are_counted(upper):
-    """As sqrt(upper) and as upper, also where (upper + lower) / (upper - lower) rounds to 1."""
+    """Products grow as sqrt(upper), and as upper, even if the quotient of both rounds to 1."""
     chebyshev = theory.chebyshev_products(1.0, upper, 1e-2)
     assert chebyshev == pytest.approx(np.arccosh(100.0) / 2.0 * np.sqrt(upper), rel=0.02)
     richardson = theory.richardson_products(1.0, upper, 1e-2)
@@ -61,8 +61,8 @@ def test_gauss_seidel_takes_the_sweeps_foreseen(device, seed, rho, rtol):
 def test_sweeps_beyond_those_tried_go_on_at_their_rate(device, monkeypatch):
     S = IdentityPlus(Dense(device, enclosure(40, 0.97).R))
     every = theory.gauss_seidel_forecast(S, 1e-5).products
-    monkeypatch.setattr(forecast, "_TRIAL", 0)
-    assert every > 2 * forecast._LATE
+    monkeypatch.setattr(forecast, "MAX_TRIAL_ENTRIES", 0)
+    assert every > 2 * forecast.MIN_TRIAL_SWEEPS
     assert theory.gauss_seidel_forecast(S, 1e-5).products == pytest.approx(every, rel=0.1)
 
 
@@ -84,8 +84,8 @@ def test_sweeps_that_diverge_or_break_down_are_foreseen(S, products, certificate
 
 
 @pytest.mark.parametrize("albedo", [0.45, 0.51, 0.8])
-def test_what_is_foreseen_and_what_nothing_foretells(device, albedo):
-    """Gauss-Seidel converges where Jacobi does not; Krylov methods need a spectrum, cg a self- adjoint S."""
+def test_methods_with_and_without_a_forecast(device, albedo):
+    """Gauss-Seidel converges even if Jacobi does not; cg needs a spectrum and a self-adjoint S."""
     S = IdentityPlus(Dense(device, enclosure(40, albedo).R))
     known = S, theory.spectral_radius(S.R, norms=S.R.norms()), theory.free_bounds(S)
     found = theory.forecasts(*known, 1e-2)
@@ -114,7 +114,7 @@ def test_bounds_on_both_sides_of_one_leave_the_series_uncertified(device):
 @pytest.mark.parametrize("rho", [0.8, 4.0, 9.0])
 @pytest.mark.parametrize("method", ["cg", "gmres", "bicgstab"])
 def test_krylov_methods_take_no_more_than_foreseen(device, method, rho, rtol):
-    """With the true spectrum of a symmetric S the bound is strict; least energy is not least residual."""
+    """The bound is strict for the true spectrum of a symmetric S, but for the residual of cg."""
     scene = enclosure(60, rho / (1 + rho))
     S = IdentityPlus(Dense(device, scene.R))
     eigenvalues = np.linalg.eigvalsh(scene.S)

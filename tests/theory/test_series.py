@@ -35,10 +35,11 @@ def test_bounces_2_to_n_cancel_and_the_rest_has_a_closed_form(n, bounces):
 
 @pytest.mark.parametrize("m", [0.1, 0.3, 0.45, 0.49])
 def test_errors_in_a_closed_box_stay_below_the_bounds_with_the_same_slope(m):
-    """There ||A|| = m in the 2-norm and in the largest row sum, so that the forward bound is met exactly."""
+    """||A|| = m in the 2-norm and in the largest row sum: the forward bound is met exactly."""
     box = enclosure(30, m)
     exact = np.eye(30) - box.A
-    inverse, forward = [], []
+    inverse = []
+    forward = []
     for n in range(8):
         partial = inverse_series(-box.A, n)
         for norm in (2, np.inf):
@@ -54,7 +55,7 @@ def test_errors_in_a_closed_box_stay_below_the_bounds_with_the_same_slope(m):
 
 
 @pytest.mark.parametrize("m", [0.2, 0.45, 0.6])
-def test_what_terms_leave_is_within_the_bounds(m):
+def test_errors_after_terms_are_the_bounds(m):
     for terms in theory.after_terms(m, (1, 3, 6)):
         assert terms.forward == pytest.approx(theory.forward_error_bound(m, terms.n))
         inverse = theory.inverse_error_bound(m, terms.n) if m < 0.5 else np.nan

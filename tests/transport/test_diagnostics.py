@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Reciprocity, light that a bounce takes away, energy: against matrices in float64 and known scenes."""
+"""Reciprocity, negative bounces, energy: against matrices in float64 and known scenes."""
 
 from __future__ import annotations
 
@@ -30,19 +30,23 @@ def check(device, T, F, form=np.asarray):
 @pytest.mark.parametrize("rho", [0.2, 0.9, 4.0])
 def test_row_sums_are_those_of_A(device, form, rho):
     scene = lambertian(50, rho)
-    found = check(device, scene.T, scene.F, form)
-    sums, column = scene.A.sum(axis=1), scene.R.sum(axis=0).max()
-    extremes = found.bounce_lowest, found.bounce_highest
+    energy = check(device, scene.T, scene.F, form)
+    sums = scene.A.sum(axis=1)
+    column = scene.R.sum(axis=0).max()
+    extremes = (energy.bounce_lowest, energy.bounce_highest)
     assert extremes == pytest.approx((sums.min(), sums.max()), abs=2e-3 * (1 + rho))
-    of_entries = found.albedo_from_columns, found.negative_entries, found.negative_light
-    if form is aslinearoperator:  # hidden
-        assert np.isnan([*of_entries, diagnostics.reciprocity_defect(form(scene.T), scene.F)]).all()
+    from_entries = [energy.albedo_from_columns, energy.negative_entries, energy.negative_light]
+    if form is aslinearoperator:
+        # Entries are hidden.
+        defect = diagnostics.reciprocity_defect(form(scene.T), scene.F)
+        assert np.isnan([*from_entries, defect]).all()
     else:
-        assert of_entries == pytest.approx((column / (1 + column), 0.0, 0.0), rel=1e-5)
+        assert from_entries == pytest.approx([column / (1 + column), 0.0, 0.0], rel=1e-5)
 
 
 def test_a_surface_that_returns_more_than_it_gets_is_found(device):
-    room, gains = enclosure(40, 0.6), np.where(np.arange(40) == 3, 2.0, 1.0)
+    room = enclosure(40, 0.6)
+    gains = np.where(np.arange(40) == 3, 2.0, 1.0)
     scene = dataclasses.replace(room, A=gains[:, None] * room.A)  # albedo 1.2
     found = check(device, scene.T, scene.F)
     assert found.bounce_highest == pytest.approx(1.2, abs=0.01)
@@ -52,7 +56,9 @@ def test_a_surface_that_returns_more_than_it_gets_is_found(device):
 @FORMS
 def test_negative_entries_are_counted_and_weighed(device, form):
     T = np.eye(10)
-    T[0, 1], T[2, 3], T[4, 5] = -0.5, -1.5, 2.0
+    T[0, 1] = -0.5
+    T[2, 3] = -1.5
+    T[4, 5] = 2.0
     found = check(device, T, np.ones(10), form)
     assert (found.negative_entries, found.negative_light) == pytest.approx((0.02, 2.0 / 14.0))
 
@@ -79,7 +85,8 @@ def test_diffuse_scenes_are_reciprocal_whatever_gains_the_pixels_have(seed, rho,
 
 
 NOISE = np.random.default_rng(0).normal(size=(300, 300))
-DIFFUSE, ONE_WAY = lambertian(300, 0.8).T, np.eye(20) + np.triu(np.abs(NOISE[:20, :20]), 1)
+DIFFUSE = lambertian(300, 0.8).T
+ONE_WAY = np.eye(20) + np.triu(np.abs(NOISE[:20, :20]), 1)
 
 
 @FORMS
@@ -111,7 +118,8 @@ def test_a_sample_is_like_the_whole(form):
 @FORMS
 def test_masked_pixels_and_negative_entries_are_no_obstacle(form):
     scene = lambertian(60, 0.8)
-    T, F = scene.T, scene.F * (np.arange(60) != 7)
+    T = scene.T
+    F = scene.F * (np.arange(60) != 7)
     T[:, 7] = 5.0
     T[3, 4] = T[4, 3] = -1e-3
     assert diagnostics.reciprocity_defect(form(T), F) < 0.05
@@ -124,20 +132,22 @@ def test_diffuse_boxes_take_nothing(device, sides, albedo, first_bounce):
     assert max(T.negative_bounces) < 1e-3
 
 
-def test_it_is_that_of_the_dense_inverse(device):
-    """Between the 16 rectangles of an 8 x 8 picture, of a matrix that takes light away."""
+def test_negative_light_is_that_of_the_dense_inverse(device):
+    """Light between 16 rectangles of an 8 x 8 picture, of a matrix that takes light away."""
     random = np.random.default_rng(3)
     matrix = np.eye(64) + 0.02 * random.normal(size=(64, 64))
     T = ltcl.Transport(matrix, (8, 8), first_bounce=np.ones(64), device=device)
     A = np.eye(64) - np.linalg.inv(matrix)
     parts = A.reshape(4, 2, 4, 2, 4, 2, 4, 2).sum(axis=(1, 3, 5, 7)).reshape(16, 16)
     np.fill_diagonal(parts, 0.0)
-    wanted = -parts[parts < 0].sum() / np.abs(parts).sum()
-    assert T.negative_bounces[0] == pytest.approx(wanted, rel=2e-2)
+    expected = -parts[parts < 0].sum() / np.abs(parts).sum()
+    assert T.negative_bounces[0] == pytest.approx(expected, rel=2e-2)
 
 
 def test_gloss_takes_more_the_more_there_is(device, caplog):
-    shares, projector, camera = [], (2.0, 1.4, 1.2), (1.5, 1.2, 1.9)
+    shares = []
+    projector = (2.0, 1.4, 1.2)
+    camera = (1.5, 1.2, 1.9)
     for gloss in (0.1, 0.3, 0.8):
         scene = glossy(
             box(1, sides=3), 6, gloss=gloss, directions=16, projector=projector, camera=camera

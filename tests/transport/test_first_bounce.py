@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""F from T, in closed form where nothing sees itself; what it leaves of T; pixels that it leaves dark."""
+"""The first bounce F: closed form, S F against T, dark pixels, and estimates."""
 
 from __future__ import annotations
 
@@ -25,23 +25,21 @@ def test_exact_is_exact_where_nothing_sees_itself(seed, rho, density):
     """(T^-1)_ii = (1 - A_ii) / F_i with A_ii = 0; diag(T) holds returned light and so is larger."""
     scene = lambertian(N, rho, seed, density)
     for matrix in (scene.T, scipy.sparse.csr_array(scene.T)):
-        exact, diagonal = (
-            ltcl.Transport(matrix, GRID, first_bounce=how).first_bounce
-            for how in ("exact", "diagonal")
-        )
+        exact = ltcl.Transport(matrix, GRID, first_bounce="exact").first_bounce
+        diagonal = ltcl.Transport(matrix, GRID, first_bounce="diagonal").first_bounce
         np.testing.assert_allclose(exact, scene.F, rtol=1e-9 * (1 + rho))
         np.testing.assert_array_equal(diagonal, np.diag(scene.T))
         assert np.all(diagonal >= exact * (1 - 1e-9 * (1 + rho)))
 
 
-# What F leaves of T: R = T F^-1 - I.
+# R = T F^-1 - I.
 
 
 @pytest.mark.parametrize("form", [np.asarray, np.float32, scipy.sparse.csr_array])
 @pytest.mark.parametrize("first_bounce", ["diagonal", "exact"])
 @pytest.mark.parametrize("gain", [1.0, 49.0, 0.1])
 def test_S_F_is_T(device, form, first_bounce, gain):
-    """R is rounded once; x * (1 / x) is not always 1, and junk of 1e-16 must not keep a diagonal alive."""
+    """R is rounded once: x * (1 / x) is not always 1, and 1e-16 must not remain as a diagonal."""
     matrix = lambertian(N, 0.9).T * gain
     T = ltcl.Transport(form(matrix), GRID, first_bounce, device=device)
     (S,) = T.systems
@@ -69,7 +67,8 @@ def test_masked_pixels_stay_unlit_and_the_others_are_right(device, how, first_bo
     p = random.uniform(0.1, 0.9, N) * ~DARK
     np.testing.assert_allclose((T @ p.reshape(GRID)).ravel(), T64 @ p, rtol=1e-6)
     desired = T64 @ p
-    desired[DARK] = 0.5  # what is wanted there cannot matter
+    # The picture at dark pixels cannot matter.
+    desired[DARK] = 0.5
     c = ltcl.compensate(T, desired.reshape(GRID), rtol=1e-5)
     np.testing.assert_allclose(c.pattern.ravel(), p, rtol=0, atol=1e-3)
     assert not c.pattern.ravel()[DARK].any()
@@ -79,7 +78,8 @@ def test_masked_pixels_stay_unlit_and_the_others_are_right(device, how, first_bo
 
 # An estimate: inside its error, which falls as theory says.
 
-MANY, WIDE = 200, (10, 20)
+MANY = 200
+WIDE = (10, 20)
 
 
 def estimated(
@@ -94,7 +94,7 @@ def estimated(
 @pytest.mark.parametrize("form", [np.asarray, np.float32, scipy.sparse.csr_array])
 @pytest.mark.parametrize(("rho", "options"), [(0.1, {}), (0.9, {"probes": 400}), (5.0, {})])
 def test_the_estimate_is_within_four_standard_errors(device, form, rho, options):
-    """And scatters as they say: 1 +- 0.2 of 200 pixels, which share their probes, is not too much."""
+    """Deviations scatter by one standard error, +- 0.2 for 200 pixels that share their probes."""
     scene = lambertian(MANY, rho)
     F, error = estimated(device, scene, form, **options)
     deviations = (F - scene.F) / error
@@ -106,10 +106,8 @@ def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
     scenes = [lambertian(MANY, rho) for rho in (0.3, 0.9, 2.0)]
     matrices = [scene.T for scene in scenes]
     matrices[1][:, 5] = 0.0
-    T, exact = (
-        ltcl.Transport(matrices, WIDE, how, device=device, on_dark="mask")
-        for how in ("estimate", "exact")
-    )
+    T = ltcl.Transport(matrices, WIDE, "estimate", device=device, on_dark="mask")
+    exact = ltcl.Transport(matrices, WIDE, "exact", device=device, on_dark="mask")
     np.testing.assert_array_equal(np.flatnonzero(T.masked), [5])
     assert not T.first_bounce[:, 5].any()
     for c in (0, 2):
@@ -117,9 +115,8 @@ def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
     deviations = np.abs(T.first_bounce - exact.first_bounce)[:, ~T.masked]
     assert T.first_bounce_error is not None
     assert np.all(deviations <= 4.5 * T.first_bounce_error[:, ~T.masked])
-    dim = ltcl.compensate(T, np.full(WIDE, 0.1), bounds=(0.2, 1.0), throw=False).pattern.reshape(
-        MANY, 3
-    )
+    c = ltcl.compensate(T, np.full(WIDE, 0.1), bounds=(0.2, 1.0), throw=False)
+    dim = c.pattern.reshape(MANY, 3)
     assert not dim[5].any()
     assert dim[~T.masked].min() >= np.float32(0.2)
 
@@ -128,7 +125,7 @@ def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
 def test_exact_becomes_an_estimate_where_a_dense_inverse_does_not_fit(
     device, monkeypatch, caplog, known
 ):
-    """As the host says before, or SciPy of a limit that nobody knew."""
+    """The host tells its memory before, or SciPy fails at a limit that was not known."""
 
     def inv(*_: object, **__: object) -> None:
         raise RuntimeError("Memory error in scipy.linalg.inv.")

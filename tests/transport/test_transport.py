@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Transport` takes what users hold, splits it into F and S, and refuses the rest before opening a device."""
+"""`Transport` takes matrices of any form, splits them into F and S, and refuses others early."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ GRID = (5, 7)
 SCENES = [lambertian(35, rho, seed=20 + channel) for channel, rho in enumerate((0.4, 0.9, 2.0))]
 SCENE = SCENES[1]
 SPARSE_FORMATS = ("csr", "csc", "coo", "bsr", "dia", "lil", "dok")
-ROUNDING = 2.0**-22  # of float32 sums of 35 products of like sign
+# Rounding of float32 sums of 35 products of like sign.
+ROUNDING = 2.0**-22
 
 FORMS: dict[str, Any] = {
     "array": lambda T: T,
@@ -43,17 +44,20 @@ FORMS: dict[str, Any] = {
     },
     "sparse matrix": scipy.sparse.csr_matrix,
     "64-bit indices": lambda T: _wide(scipy.sparse.csr_array(T)),
-    "duplicates": lambda T: scipy.sparse.coo_array(
-        (
-            np.tile(T.ravel() / 2, 2),
-            tuple(np.tile(i, 2) for i in np.indices(T.shape).reshape(2, -1)),
-        )
-    ),
+    "duplicates": lambda T: _duplicated(T),
 }
 
 
+def _duplicated(T):
+    """Each entry as two halves."""
+    rows, columns = np.indices(T.shape).reshape(2, -1)
+    values = np.tile(T.ravel() / 2, 2)
+    return scipy.sparse.coo_array((values, (np.tile(rows, 2), np.tile(columns, 2))))
+
+
 def _wide(matrix):
-    matrix.indices, matrix.indptr = matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64)
+    matrix.indices = matrix.indices.astype(np.int64)
+    matrix.indptr = matrix.indptr.astype(np.int64)
     return matrix
 
 
@@ -83,12 +87,13 @@ def test_every_form_relights_alike(device, form):
     [("array", np.stack), ("array", tuple), ("csr", list), ("operator", tuple), ("lists", list)],
 )
 def test_three_make_colour_and_one_is_grey(device, form, collect):
-    p, F = pattern(*GRID, 3), [scene.F for scene in SCENES]
-    T = transport(
-        collect([FORMS[form](scene.T) for scene in SCENES]), first_bounce=F, device=device
-    )
-    wanted = np.stack([scene.T @ p[..., c].ravel() for c, scene in enumerate(SCENES)], axis=-1)
-    np.testing.assert_allclose(T @ p, wanted.reshape(*GRID, 3), rtol=ROUNDING)
+    p = pattern(*GRID, 3)
+    F = [scene.F for scene in SCENES]
+    matrices = collect([FORMS[form](scene.T) for scene in SCENES])
+    T = transport(matrices, first_bounce=F, device=device)
+    pictures = [scene.T @ p[..., c].ravel() for c, scene in enumerate(SCENES)]
+    expected = np.stack(pictures, axis=-1).reshape(*GRID, 3)
+    np.testing.assert_allclose(T @ p, expected, rtol=ROUNDING)
     assert (T.channels, len(T.systems), T.first_bounce.shape) == (3, 3, (3, 35))
     assert T.interreflection is T.systems
     assert transport(collect([FORMS[form](SCENE.T)]), first_bounce=SCENE.F).channels == 1
@@ -106,19 +111,22 @@ def test_pictures_keep_their_layout(device, shape, camera, channels):
     matrices = 1.0 + np.random.default_rng(22).random((channels, camera[0] * camera[1], 35))
     T = transport(list(matrices), camera_grid=camera, device=device)
     light = pattern(*shape)
-    picture, colour = ltcl.relight(T, light), shape[-1] == 3
+    picture = ltcl.relight(T, light)
     assert picture.dtype == np.float32
     np.testing.assert_array_equal(picture, T @ light)
-    frames = light.reshape(-1, 35, 3 if colour else 1)
+    is_colour = shape[-1] == 3
+    frames = light.reshape(-1, 35, 3 if is_colour else 1)
     colours = max(channels, frames.shape[2])
     exact = [frames[..., c % frames.shape[2]] @ matrices[c % channels].T for c in range(colours)]
     pixels = (matrices.shape[1],) if shape == (35,) else camera
-    layout = (*shape[: len(shape) - colour - 2], *pixels, *(3,) * (colours == 3))
-    np.testing.assert_allclose(picture, np.stack(exact, axis=-1).reshape(layout), rtol=1e-6)
+    leading = shape[: len(shape) - is_colour - 2]
+    expected_shape = (*leading, *pixels, *(3,) * (colours == 3))
+    expected = np.stack(exact, axis=-1).reshape(expected_shape)
+    np.testing.assert_allclose(picture, expected, rtol=1e-6)
 
 
 def test_ambiguous_shapes_are_colour(device):
-    """Three frames of 3 x 3 pixels look like one picture of three colours: a colour picture is meant."""
+    """Three frames of 3 x 3 pixels have the shape of one colour picture, which is meant."""
     colour = pattern(3, 3, 3)
     T = transport(np.eye(9)[::-1] + np.eye(9), grid=(3, 3), first_bounce=np.ones(9), device=device)
     np.testing.assert_allclose(ltcl.relight(T, colour), colour + colour[::-1, ::-1], rtol=1e-6)
@@ -142,7 +150,7 @@ def test_no_device_is_opened_before_the_first_product(small_device):
 @pytest.mark.parametrize("form", ["array", "csr", "operator"])
 @pytest.mark.parametrize("camera", [(3, 4), (7, 5)])
 def test_a_camera_of_another_grid_relights_and_has_no_S(device, form, camera):
-    """Of 7 x 5 pixels T is square, but they are not those of the projector."""
+    """A camera of 7 x 5 pixels has a square T, but its pixels are not those of the projector."""
     matrix = pattern(camera[0] * camera[1], 35)
     T = transport(FORMS[form](matrix), camera_grid=camera, device=device)
     np.testing.assert_allclose((T @ pattern(*GRID)).ravel(), matrix @ pattern(35), rtol=ROUNDING)
@@ -160,9 +168,11 @@ KNOWN: dict[str, Any] = {
     "matvec": SCENE.T.dot,
     "dtype": np.float64,
 }  # no diagonal
-T35, BARE = SCENE.T, LinearOperator(**KNOWN)
+T35 = SCENE.T
+BARE = LinearOperator(**KNOWN)
 DARK = np.isin(np.arange(35), [2, 9, 23])
-COLOUR, THREE = [T35] * 3, r"3 of 35 pixels.*: \(0, 2\), \(1, 2\), \(3, 2\)"
+COLOUR = [T35] * 3
+THREE = r"3 of 35 pixels.*: \(0, 2\), \(1, 2\), \(3, 2\)"
 AROUND_0 = np.random.default_rng(5).normal(size=(35, 35))  # eigenvalues
 np.fill_diagonal(AROUND_0, 1.0)
 SINGULAR = [1.0 + defect * np.eye(35) for defect in (0.0, 1e-17, 1e-16)]
@@ -224,7 +234,7 @@ BAD: list[tuple[Any, dict[str, Any], type[LtclError], str]] = [
     ],
     ([T35, T35 - np.diag(2.0 * DARK), np.eye(35)], {"on_dark": "raise"}, InputError, THREE),
     *[
-        (T35, {"dark": dark}, InputError, "dark .*at least 0 and below 1")
+        (T35, {"dark_threshold": dark}, InputError, "dark_threshold .*at least 0 and below 1")
         for dark in (-0.1, 1.0, "a")
     ],
     (np.zeros((35, 35)), {"on_dark": "mask"}, InputError, "zero or negative at every pixel"),
@@ -332,9 +342,10 @@ def test_a_bare_operator_cannot_leave_its_device(device):
 
 
 def test_a_compressed_transport_and_an_inverse_are_unpickled_without_a_device(device, monkeypatch):
-    """A pool of processes waits for ever for a worker that fails while it unpickles its work."""
+    """Else a pool of processes would wait for ever for a worker that fails to unpickle its work."""
     T = ltcl.compress(ltcl.scenes.dihedral(4).transport(device=device), 0.05)
-    inverse, p = ltcl.invert(T, 0.1), np.full(T.grid, 0.5)
+    inverse = ltcl.invert(T, 0.1)
+    p = np.full(T.grid, 0.5)
     texts = pickle.dumps(T), pickle.dumps(inverse)
     with monkeypatch.context() as patch:
         patch.setattr("ltcl.device.discovery.open_device", None)
@@ -350,7 +361,7 @@ def test_a_compressed_transport_and_an_inverse_are_unpickled_without_a_device(de
 @pytest.mark.parametrize("form", ["array", "csr", "operator"])
 @pytest.mark.parametrize("share", [1e-4, 1e-30])
 def test_relighting_has_all_digits_whatever_the_first_bounce(device, form, share):
-    """I + R holds no digit of a diagonal of T that is far below F: no picture is undone with it."""
+    """I + R has no digit of a diagonal of T that is far below F, and is not solved with."""
     F = np.diag(SCENE.T) / share
     T = transport(FORMS[form](SCENE.T), first_bounce=F, device=device)
     p = pattern(*GRID)
@@ -362,7 +373,9 @@ def test_relighting_has_all_digits_whatever_the_first_bounce(device, form, share
 
 @pytest.mark.filterwarnings("error")
 def test_a_first_bounce_too_small_for_float32_is_refused():
-    T = ltcl.Transport([[1, 0.5], [0.3, 1e-39]], (1, 2), noise=Noise.uniform((2, 2), 0.0), dark=0.0)
+    T = ltcl.Transport(
+        [[1, 0.5], [0.3, 1e-39]], (1, 2), noise=Noise.uniform((2, 2), 0.0), dark_threshold=0.0
+    )
     with pytest.raises(InputError, match=r"float32.* first bounce"):
         ltcl.relight(T, np.ones((1, 2)))
 

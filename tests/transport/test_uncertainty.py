@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Standard deviations of patterns and bounces against errors of many measurements whose truth is known."""
+"""Standard deviations of patterns and bounces against errors of many measurements."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FLOOR = 1e-3
 
 @pytest.fixture(autouse=True)
 def _seed(request: pytest.FixtureRequest) -> None:
-    """Numbers of each test its own."""
+    """Give each test random numbers of its own."""
     seed = zlib.crc32(request.node.name.encode())
     random.bit_generator.state = np.random.default_rng(seed).bit_generator.state
 
@@ -42,7 +42,7 @@ def within(ratios: Any) -> np.ndarray:
 
 
 def calibrated(ratios: Any, rtol: float = 1.0) -> bool:
-    """68 % and 95 % of normal errors, as near as few measurements with errors of their own show them."""
+    """Whether 68 % and 95 % of errors are within one and two deviations, as of normal errors."""
     return bool((np.abs(within(ratios) - (0.68, 0.95)) < rtol * np.array([0.07, 0.04])).all())
 
 
@@ -50,11 +50,14 @@ def calibrated(ratios: Any, rtol: float = 1.0) -> bool:
     ("scene", "level"), [(scene, (1e-4, 1e-3, 1e-2)[k % 3]) for k, scene in enumerate(SCENES)]
 )
 def test_errors_are_as_large_as_their_deviations(scene: str, level: float) -> None:
-    """A cut of bench/uncertainty.py: bounces 0 to 3, patterns, and what is seen under them."""
+    """Bounces 0 to 3, patterns, and pictures under them; bench/uncertainty.py has more cases."""
     T = truth(scene)
-    noise, light = noise_of(T, level, photons=1.0), picture(T)
+    noise = noise_of(T, level, photons=1.0)
+    light = picture(T)
     image = (T @ light).astype(np.float64)
-    true, ratios, bounces = ltcl.separate(T, image, 3, rtol=1e-5), [], []
+    true = ltcl.separate(T, image, 3, rtol=1e-5)
+    ratios = []
+    bounces = []
     for seed in range(8):
         measured = measure(T, noise, seed)
         b = ltcl.separate(measured, image, 3)
@@ -67,11 +70,13 @@ def test_errors_are_as_large_as_their_deviations(scene: str, level: float) -> No
 
 
 def test_noise_of_the_own_row_is_in_closed_form() -> None:
-    """A T without bounces: sigma |p| over F, without the pixel itself of bounces; white where it is known."""
+    """A T without bounces: sigma |p| over F, without the pixel itself in bounces; known white."""
     F = random.uniform(0.5, 1.0, 12)
     noise = Noise.uniform((12, 12), FLOOR)
-    T, p = ltcl.Transport(np.diag(F), (3, 4), noise=noise), random.uniform(0.2, 0.8, (3, 4))
-    b, c = ltcl.separate(T, T @ p, 1), ltcl.compensate(T, T @ p)
+    T = ltcl.Transport(np.diag(F), (3, 4), noise=noise)
+    p = random.uniform(0.2, 0.8, (3, 4))
+    b = ltcl.separate(T, T @ p, 1)
+    c = ltcl.compensate(T, T @ p)
     others = FLOOR * np.sqrt(np.sum(p**2) - p**2)
     for deviation, expected in (
         (b.std.direct, others),
@@ -96,15 +101,14 @@ def test_frames_and_colours(mixing: Any) -> None:
     T = colours(mixing, None)
     noise = Noise.uniform(T.shape, [1e-3, 2e-3, 4e-3])
     light = np.stack([picture(T, 3), picture(T, 3)])
-    image, ratios = T @ light, []
+    image = T @ light
+    ratios = []
     true = parts(ltcl.separate(T, image, 1, rtol=1e-5))
     for _ in range(8):
         error = noise.floor[:, None, None] * random.standard_normal((3, *T.shape))
         measured = colours(mixing, noise, error)
-        b, c = (
-            ltcl.separate(measured, image, 1),
-            ltcl.compensate(measured, image, rtol=1e-3, bounds=(-9, 9)),
-        )
+        b = ltcl.separate(measured, image, 1)
+        c = ltcl.compensate(measured, image, rtol=1e-3, bounds=(-9, 9))
         assert parts(b.std).shape == true.shape
         ratios.append([*(parts(b) - true) / parts(b.std), (c.pattern - light) / c.std.pattern])
     for each in np.moveaxis(np.array(ratios), (1, -1), (0, 1)).reshape(9, -1):
@@ -113,8 +117,9 @@ def test_frames_and_colours(mixing: Any) -> None:
 
 @pytest.mark.parametrize("case", ["bounds", "rows", "blocks"])
 def test_patterns_of_least_squares(case: str) -> None:
-    """Clipped ones, of twice as many camera pixels, and of light that changes its colour: free pixels."""
-    A, grid = truth("corner", 8).to_numpy(), truth("corner", 8).grid
+    """Free pixels of clipped patterns, of twice as many camera pixels, and of coupled colours."""
+    A = truth("corner", 8).to_numpy()
+    grid = truth("corner", 8).grid
     options: dict[str, Any] = {"camera_grid": (2 * grid[0], grid[1])} if case == "rows" else {}
     bounds = (0.0, 0.65) if case == "bounds" else (-9.0, 9.0)
     matrices = {
@@ -123,17 +128,15 @@ def test_patterns_of_least_squares(case: str) -> None:
         "blocks": np.eye(3)[:, :, None, None] * A + 0.1 * A,
     }
     true = matrices[case]
-    T, noise = (
-        ltcl.Transport(true, grid, **options),
-        Noise.uniform(true.shape[-2:], [FLOOR] * (3 if case == "blocks" else 1)),
-    )
-    light = picture(T, *([3] if case == "blocks" else []))
-    image, ratios = T @ light, []
+    T = ltcl.Transport(true, grid, **options)
+    noise = Noise.uniform(true.shape[-2:], [FLOOR] * T.channels)
+    light = picture(T, 3) if T.channels == 3 else picture(T)
+    image = T @ light
+    ratios = []
     best = ltcl.compensate(T, image, rtol=1e-5, bounds=bounds).pattern
     for _ in range(10):
-        measured = ltcl.Transport(
-            true + FLOOR * random.standard_normal(true.shape), grid, noise=noise, **options
-        )
+        entries = true + FLOOR * random.standard_normal(true.shape)
+        measured = ltcl.Transport(entries, grid, noise=noise, **options)
         c = ltcl.compensate(measured, image, rtol=1e-5, bounds=bounds)
         free = (c.pattern > bounds[0]) & (c.pattern < bounds[1])
         assert (c.std.pattern[~free] == 0).all()
@@ -147,7 +150,8 @@ def test_compressed_inverted_and_masked_transports_have_the_same_deviations() ->
     T = truth("box", 8)
     noise = noise_of(T, 1e-3)
     exact = ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
-    C, inverse = ltcl.compress(exact, rtol=1e-3), ltcl.invert(exact, rtol=1e-3)
+    C = ltcl.compress(exact, rtol=1e-3)
+    inverse = ltcl.invert(exact, rtol=1e-3)
     dark = T.to_numpy().copy()
     dark[:, 5] = 0.0
     masked = ltcl.Transport(dark, T.grid, on_dark="mask", noise=noise)
@@ -158,16 +162,18 @@ def test_compressed_inverted_and_masked_transports_have_the_same_deviations() ->
     assert C.noise is noise
     tasks = [(C, {"exact": exact}), (C, {}), (exact, {"inverse": inverse}), (masked, {})]
     for T_, options in tasks:
-        s, p = ltcl.separate(T_, image, 2, **options).std, ltcl.compensate(T_, image, **options).std
+        s = ltcl.separate(T_, image, 2, **options).std
+        p = ltcl.compensate(T_, image, **options).std
         assert np.median(np.abs(np.log(parts(s) / parts(b.std)))) < 0.02
-        seen = np.arange(image.size).reshape(image.shape) != (5 if T_ is masked else -1)
-        assert np.median(np.abs(np.log(p.pattern[seen] / c.std.pattern[seen]))) < 0.02
-        assert (p.pattern[~seen] == 0).all()
+        is_lit = ~T_.masked.reshape(image.shape)
+        assert np.median(np.abs(np.log(p.pattern[is_lit] / c.std.pattern[is_lit]))) < 0.02
+        assert (p.pattern[~is_lit] == 0).all()
 
 
-def test_it_costs_nothing_before_it_is_asked_for() -> None:
+def test_noise_and_deviations_are_computed_at_the_first_use() -> None:
     T = ltcl.Transport(truth("corner", 8).to_numpy(), truth("corner", 8).grid)
-    b, c = ltcl.separate(T, np.ones(T.grid), 1), ltcl.compensate(T, np.full(T.grid, 0.3))
+    b = ltcl.separate(T, np.ones(T.grid), 1)
+    c = ltcl.compensate(T, np.full(T.grid, 0.3))
     assert "noise" not in vars(T)
     assert b.std is b.std
     assert c.std is c.std

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a damaged transport is good for, and why not: two sentences that name the damage and nothing else."""
+"""Verdicts on damaged transports: two sentences that name the damage and nothing else."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from tests import json_schema
 from tests.transport.noise.measured import measure, noise_of, truth
 
 random = np.random.default_rng()
-LEVEL = 1e-4  # of noise beneath all damages
-NOISE, EXPOSURES, GOOD = (
-    "because of noise",
-    "times as many exposures",
-    "errors by noise are .* in pictures",
-)
+# Noise beneath all damages, to the median first bounce.
+LEVEL = 1e-4
+# Words of verdicts.
+NOISE = "because of noise"
+EXPOSURES = "times as many exposures"
+GOOD = "errors by noise are .* in pictures"
 
 
 @pytest.fixture(autouse=True)
 def reseed(request):
-    random.bit_generator.state = np.random.default_rng(
-        [*request.node.name.encode()]
-    ).bit_generator.state
+    """Give each test random numbers of its own."""
+    seeded = np.random.default_rng([*request.node.name.encode()])
+    random.bit_generator.state = seeded.bit_generator.state
 
 
 def measured(A: np.ndarray, noise: Noise) -> tuple[np.ndarray, Noise]:
@@ -44,18 +44,23 @@ def noisy(level: float, photons: float = 0.0) -> Callable[..., Any]:
 
 
 def dark_wall(A: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, Noise]:
-    """The right third is as dark as a third, and its noise 20 times as large."""
-    right = np.tile(np.arange(grid[1]) >= 2 * grid[1] // 3, grid[0])
-    noise = dataclasses.replace(
-        noise_of(ltcl.Transport(A, grid), LEVEL), rows=1.0 + 399.0 * right[None]
-    )
-    return measured(np.where(right[:, None], 0.3, 1.0) * A, noise)
+    """The right third reflects a third, and its noise is 20 times as large."""
+    height, width = grid
+    is_right = np.tile(np.arange(width) >= 2 * width // 3, height)
+    uniform = noise_of(ltcl.Transport(A, grid), LEVEL)
+    noise = dataclasses.replace(uniform, rows=1.0 + 399.0 * is_right[None])
+    return measured(np.where(is_right[:, None], 0.3, 1.0) * A, noise)
 
 
 def dark_pixels(A: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
     """12 pixels in a corner; the last of them lights nothing at all."""
-    pixels = (grid[1] * (grid[0] - 1 - np.arange(3)[:, None]) + np.arange(4)).ravel()
-    return A * ~np.isin(np.arange(len(A)), pixels)[:, None] * (np.arange(len(A)) != pixels[-1])
+    height, width = grid
+    rows = height - 1 - np.arange(3)
+    pixels = (width * rows[:, None] + np.arange(4)).ravel()
+    numbers = np.arange(len(A))
+    is_seen = ~np.isin(numbers, pixels)
+    is_lit = numbers != pixels[-1]
+    return A * is_seen[:, None] * is_lit
 
 
 def shift(rows: int, columns: int, share: float = 1.0) -> Callable[..., np.ndarray]:
@@ -67,9 +72,18 @@ def shift(rows: int, columns: int, share: float = 1.0) -> Callable[..., np.ndarr
 
 
 def entries(i: Any, j: Any, value: float) -> Callable[..., np.ndarray]:
-    """Some are a share of the median first bounce."""
-    at = np.ix_(np.atleast_1d(i), np.atleast_1d(j)) if j is not None else (i,)
-    return lambda A, grid: [B := A.copy(), B.__setitem__(at, value * np.median(A.diagonal()))][0]
+    """Set entry (i, j), or row i if j is None, to a share of the median first bounce."""
+
+    def damage(A: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+        B = A.copy()
+        light = value * np.median(A.diagonal())
+        if j is None:
+            B[i] = light
+        else:
+            B[i, j] = light
+        return B
+
+    return damage
 
 
 # Name, damage of T (N, N) on a grid, words of the text, what it is good for (compensation,
@@ -151,10 +165,15 @@ def good(judged: Verdict) -> str:
 @pytest.mark.parametrize(("name", "damage", "words", "expected", "cause"), DAMAGES)
 def test_the_damage_is_named_and_nothing_else(name, damage, words, expected, cause, scene):
     T = truth(scene)
-    changed = damage(measure(T, noise_of(T, LEVEL), 0).to_numpy().astype(np.float64), T.grid)
-    A, noise = changed if isinstance(changed, tuple) else (changed, None)
-    h, w = T.grid[::-1] if cause == "other_grid" else T.grid
-    judged = verdict(ltcl.Transport(A, (h, w), noise=noise))
+    undamaged = measure(T, noise_of(T, LEVEL), 0).to_numpy().astype(np.float64)
+    changed = damage(undamaged, T.grid)
+    noise = None
+    if isinstance(changed, tuple):
+        changed, noise = changed
+    height, width = T.grid
+    if cause == "other_grid":
+        height, width = width, height
+    judged = verdict(ltcl.Transport(changed, (height, width), noise=noise))
     assert re.fullmatch(expected, good(judged)), judged.text
     assert re.search(words, judged.text, re.IGNORECASE), judged.text
     assert judged.causes[:1] == (cause,) * bool(cause), judged.text
@@ -165,15 +184,22 @@ def test_the_damage_is_named_and_nothing_else(name, damage, words, expected, cau
 
 def colours(order: tuple[int, ...], **settings: Any) -> ltcl.Transport:
     """Three channels of a corner; their first bounces in another order."""
-    T, scales = truth("corner").to_numpy(), (1.0, 0.7, 0.4)
-    return ltcl.Transport(
-        [s * T for s in scales], (12, 24), [scales[c] * T.diagonal() for c in order], **settings
-    )
+    T = truth("corner").to_numpy()
+    scales = (1.0, 0.7, 0.4)
+    matrices = [scale * T for scale in scales]
+    first_bounce = [scales[c] * T.diagonal() for c in order]
+    return ltcl.Transport(matrices, (12, 24), first_bounce, **settings)
 
 
 def blocks(order: tuple[int, ...]) -> ltcl.Transport:
+    """Blocks of a corner whose brightest ones are in this order."""
     T = truth("corner").to_numpy()
-    return ltcl.Transport([[T if d == c else 0.1 * T for d in range(3)] for c in order], (12, 24))
+    rows = []
+    for c in order:
+        row = [0.1 * T, 0.1 * T, 0.1 * T]
+        row[c] = T
+        rows.append(row)
+    return ltcl.Transport(rows, (12, 24))
 
 
 @pytest.mark.parametrize(
@@ -233,27 +259,40 @@ def test_colours_shapes_and_surfaces(T, words, expected):
     ],
 )
 def test_errors_by_noise_are_those_of_the_truth(scene, photons, least):
-    """By dense inverses, whose pictures under white are those of the true T."""
+    """Errors are taken by dense inverses; both pictures under white are those of the true T."""
     T = truth(scene)
-    A, noise, errors = T.to_numpy(), noise_of(T, 5e-4, photons), []
-    B = measure(T, noise, 0).to_numpy().astype(np.float64)
-    light, left = np.linalg.solve(B, np.ones(len(B))), [A.sum(axis=1)] * 2
-    pairs = [[M @ np.clip(light / np.quantile(light, 0.9), 0.0, 1.0) for M in (B, A)]]
+    A = T.to_numpy()
+    measured_T = measure(T, noise_of(T, 5e-4, photons), 0)
+    B = measured_T.to_numpy().astype(np.float64)
+    light = np.linalg.solve(B, np.ones(len(B)))
+    p = np.clip(light / np.quantile(light, 0.9), 0.0, 1.0)
+    errors = {"pictures": relative_error(B @ p, A @ p)}
+    white = A.sum(axis=1)
+    true_bounces = dense_bounces(A, white)
+    for k, bounce in enumerate(dense_bounces(B, white)):
+        errors[f"bounce_{k}"] = relative_error(bounce, true_bounces[k])
+    numbers = verdict(measured_T).numbers
+    for name in ("pictures", "bounce_1", "bounce_2", "bounce_3"):
+        assert least < numbers[name] / errors[name] < 1.0 / least, name
+    b = ltcl.separate(measured_T, measured_T @ np.ones(T.grid), 3)
+    deviations = np.linalg.norm(b.std.bounces, axis=(1, 2))
+    expected = deviations / np.linalg.norm(b.bounces, axis=(1, 2))
+    stated = [numbers[name] for name in ("bounce_1", "bounce_2", "bounce_3")]
+    np.testing.assert_allclose(stated, expected, rtol=0.3)
+
+
+def relative_error(x: np.ndarray, exact: np.ndarray) -> float:
+    return float(np.linalg.norm(x - exact) / np.linalg.norm(exact))
+
+
+def dense_bounces(A: np.ndarray, light: np.ndarray) -> list[np.ndarray]:
+    """Bounces 0 to 3 of a picture: b_k = S^-1 l, l without b_k."""
+    bounces = []
     for _ in range(4):
-        b = [np.linalg.solve(M / M.diagonal(), l) for M, l in zip((B, A), left, strict=True)]
-        left = [l - b_k for l, b_k in zip(left, b, strict=True)]
-        pairs.append(b)
-    errors = [np.linalg.norm(x - y) / np.linalg.norm(y) for x, y in pairs]
-    numbers = verdict(M := measure(T, noise, 0)).numbers
-    names = ("pictures", "bounce_1", "bounce_2", "bounce_3")
-    ratios = [
-        numbers[name] / error for name, error in zip(names, [errors[0], *errors[2:]], strict=True)
-    ]
-    assert least < min(ratios), ratios
-    assert max(ratios) < 1.0 / least, ratios
-    b = ltcl.separate(M, M @ np.ones(T.grid), 3)
-    of_std = np.linalg.norm(b.std.bounces, axis=(1, 2)) / np.linalg.norm(b.bounces, axis=(1, 2))
-    np.testing.assert_allclose([numbers[name] for name in names[1:]], of_std, rtol=0.3)
+        b = np.linalg.solve(A / A.diagonal(), light)
+        light = light - b
+        bounces.append(b)
+    return bounces
 
 
 @pytest.mark.parametrize(("ambient", "causes"), [(0.0, set()), (0.01, {"ambient"})])
@@ -279,7 +318,8 @@ def test_reports_end_in_it(capsys, tmp_path):
     assert judged.numbers["negative_bounce"] < 1e-3
     for command in ("info", "analyze"):
         assert main([command, str(tmp_path / "T.npz"), "--json"]) == 0
-        json_schema.check([command], document := json.loads(capsys.readouterr().out))
+        document = json.loads(capsys.readouterr().out)
+        json_schema.check([command], document)
         (entry,) = document
         assert entry["verdict"]["text"] == judged.text
         assert entry["verdict"]["numbers"]["bounce_3"] == pytest.approx(

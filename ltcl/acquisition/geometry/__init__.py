@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which projector pixel each camera pixel sees, and photographs on the projector's grid.
+"""Map from camera pixels to projector pixels, and photographs on the projector's grid.
 
 graycode         patterns, and the coordinates that their photographs give
 correspondence   the map; `decode` makes it from photographs
-resample         photographs on the projector's grid: its pixels separated by smaller camera pixels
-sharpness        how much of a pixel's light comes out at its neighbours
+subpixel         fractions of a pixel, by planes through the edges of stripes
+resample         photographs on the projector's grid
+footprints       areas of projector pixels that camera pixels see
+blocks           projector pixels in square blocks
+sharpness        how much of a pixel's light appears at its neighbours
 """
 
 from __future__ import annotations

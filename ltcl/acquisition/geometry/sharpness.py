@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How sharp a camera sees the projector's pixels, from the stripes that give their places.
+"""How well a camera separates the projector's pixels, from photographs of Gray code stripes.
 
 With b = 1 and -1 where a pattern of stripes is on and off, and D the photograph of it less that of
-its inverse, on the projector's grid, light from elsewhere is in both and cancels. What is left of
-pixel n is
+its inverse, on the projector's grid, light from elsewhere is in both and cancels. The rest of pixel
+n is
 
     D_n = l_n ((1 - q) b_n + q (b_n-1 + b_n+1) / 2)
 
-along an axis: l its direct light, and q the part of what comes out at it that is its neighbours',
-for camera pixels are too large for the grid, or out of focus. Least squares over the finest
+along an axis: l its direct light, and q the part of the light seen at it that is its neighbours',
+because camera pixels are too large for the grid, or out of focus. Least squares over the finest
 patterns of the axis give q; the median of the pixels counts. Blocks of k x k pixels share a k-th of
 it. The relative error of a picture of noise, even in [0, 1], is
 
@@ -28,28 +28,40 @@ from dataclasses import dataclass
 import numpy as np
 
 from ltcl.acquisition.geometry.correspondence import Correspondence
-from ltcl.acquisition.geometry.graycode import FINE, GrayCode
-from ltcl.acquisition.geometry.resample import SEPARABLE, Footprints, Resampling
+from ltcl.acquisition.geometry.footprints import Footprints
+from ltcl.acquisition.geometry.graycode import FINE_BITS, GrayCode
+from ltcl.acquisition.geometry.resample import SEPARABLE_WIDTH, Resampling
 from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
-BAD, HOPELESS = (
-    0.035,
-    0.3,
-)  # blur from which there is a warning (a sharp camera has 1 to 2 %), and a refusal
-OF_MAP = (
-    0.07  # q of errors of the map, of camera pixels as wide as the projector's: measured, above
-)
-OF_MEANS = (
-    13 / 32
-)  # q of means by a tent: E |a + b + c|, even in [-1/2, 1/2] (footprint: a, tent: b + c)
-_LEAST = 3  # patterns that determine l and q
+
+# Blur from which there is a warning (a sharp camera has 1 to 2 %), and a refusal.
+WARNING_BLUR = 0.035
+MAX_BLUR = 0.3
+
+# q of errors of the map, for camera pixels as wide as the projector's: measured, above.
+MAP_ERROR_LEAK = 0.07
+
+# q of means by a tent: E |a + b + c|, even in [-1/2, 1/2] (footprint: a, tent: b + c).
+TENT_LEAK = 13 / 32
+
+# Patterns that determine l and q.
+MIN_PATTERNS = 3
 
 
 @dataclass(frozen=True)
 class Sharpness:
-    """How well a camera separates pixels: `leak`, q along y and x; `width` of its own in the projector's.
+    """How well a camera separates the projector's pixels.
 
+    Parameters
+    ----------
+    leak : (float, float)
+        q along y and x: part of the light seen at a pixel that is its neighbours'.
+    width : float
+        Width of a camera pixel, in projector pixels.
+
+    Examples
+    --------
     >>> sharpness = Sharpness((0.2, 0.5), 0.25)
     >>> sharpness.own, sharpness.of_blocks(2).own
     (0.4, 0.675)
@@ -64,20 +76,40 @@ class Sharpness:
     def of(
         cls, mapping: Correspondence, R: Resampling, light: Sequence[np.ndarray] = ()
     ) -> Sharpness:
-        """By photographs (H, W[, c]) of Gray code, linear in light; without and of small grids by the map."""
-        width = Footprints.of(mapping).width
-        by_map = min(OF_MEANS * width, 1.0) if width >= SEPARABLE else 0.0
-        y, x = (_leak(R, light, axis) for axis in (0, 1))
-        return cls((by_map, by_map) if y is None or x is None else (y, x), width)
+        """Sharpness of a camera.
+
+        Parameters
+        ----------
+        mapping : Correspondence
+            Map from the camera to the projector.
+        R : Resampling
+            Resampling of photographs by this map.
+        light : sequence of (H, W) or (H, W, c) arrays
+            Photographs of Gray code, linear in light. Without them, and on small grids, the size of
+            camera pixels decides.
+
+        Returns
+        -------
+        Sharpness
+        """
+        width = Footprints.from_map(mapping).width
+        leak_y = _measure_leak(R, light, 0)
+        leak_x = _measure_leak(R, light, 1)
+        if leak_y is not None and leak_x is not None:
+            return cls((leak_y, leak_x), width)
+        leak = 0.0
+        if width >= SEPARABLE_WIDTH:
+            leak = min(TENT_LEAK * width, 1.0)
+        return cls((leak, leak), width)
 
     def of_blocks(self, side: int) -> Sharpness:
-        """Of blocks of `side` x `side` pixels: less of their light crosses a border."""
+        """Sharpness for blocks of `side` x `side` pixels: less of their light crosses a border."""
         y, x = self.leak
         return Sharpness((y / side, x / side), self.width / side)
 
     @property
     def own(self) -> float:
-        """The part of what comes out at a pixel that is its own light."""
+        """Part of the light seen at a pixel that is its own."""
         y, x = self.leak
         return round((1 - y) * (1 - x), 12)
 
@@ -90,51 +122,77 @@ class Sharpness:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """q along y and x, or what is as bad as errors of the map, where that is more."""
-        least = OF_MAP * min(self.width, 1.0) ** 2
-        return max(self.leak[0], least), max(self.leak[1], least)
+        """q along y and x, or the q that is as bad as errors of the map if that is larger."""
+        y, x = self.leak
+        least = MAP_ERROR_LEAK * min(self.width, 1.0) ** 2
+        return max(y, least), max(x, least)
 
     def check(self, side: int = 1) -> None:
-        """Warn of a camera that hardly separates blocks of `side` x `side` pixels; refuse one that does not.
+        """Warn if a camera hardly separates blocks of `side` x `side` pixels, or refuse it.
 
         >>> Sharpness((0.4, 0.4), 0.9).check()  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ltcl.errors.AcquisitionError: the camera does not separate the projector's pixels: ...
         """
-        here = self.of_blocks(side)
-        if not here.blur > BAD:
+        sharpness = self.of_blocks(side)
+        if not sharpness.blur > WARNING_BLUR:
             return
         text = (
-            f"camera pixels are {self.width:.2g} projector pixels wide, and {here.own:.0%} of what comes out "
-            f"at a pixel is its own light: pictures of fine detail have an error of {here.blur:.1%}; "
-            "move the camera closer, focus it and the projector, use a longer lens or a projector_grid of "
-            f"fewer pixels, or scan with strategy='block' and block={2 * side}"
+            f"camera pixels are {self.width:.2g} projector pixels wide, and {sharpness.own:.0%} of "
+            "the light seen at a pixel is its own: pictures of fine detail have an error of "
+            f"{sharpness.blur:.1%}; move the camera closer, focus it and the projector, use a "
+            "longer lens or a projector_grid of fewer pixels, or scan with strategy='block' and "
+            f"block={2 * side}"
         )
-        if here.blur > HOPELESS:
+        if sharpness.blur > MAX_BLUR:
             text += "; or photographs of the finest stripes are exchanged"
             raise AcquisitionError(f"the camera does not separate the projector's pixels: {text}")
         logger.warning("%s", text)
 
 
-def _leak(R: Resampling, light: Sequence[np.ndarray], axis: int) -> float | None:
-    """q along y (axis 0) or x, in [0, 1], of pixels with two neighbours; None where patterns are too few."""
+def _measure_leak(R: Resampling, light: Sequence[np.ndarray], axis: int) -> float | None:
+    """q along y (axis 0) or x, in [0, 1], at pixels with two neighbours.
+
+    None for too few patterns or no light.
+    """
     if R.grid[axis] == 1:
         return 0.0
-    code, seen = GrayCode(R.grid), np.moveaxis(R.seen, axis, -1)[:, 1:-1]
-    first, last = (2 * code.bits[0] * (1 - axis), 2 * sum(code.bits[: 2 - axis]))
-    fine = range(max(first, last - 2 * FINE), last, 2)
-    if len(fine) < _LEAST or len(light) < last or not seen.any():
+    code = GrayCode(R.grid)
+    numbers = _finest_patterns(code, axis)
+    has_photographs = len(light) > numbers[-1] + 1
+    is_seen = np.moveaxis(R.seen, axis, -1)[:, 1:-1]
+    if len(numbers) < MIN_PATTERNS or not has_photographs or not is_seen.any():
         return None
+
+    # A (n - 2, patterns, 2) has the columns b_n and (b_n-1 + b_n+1) / 2.
     patterns = code.patterns()
-    b = np.stack(
-        [2.0 * patterns[k].take(0, 1 - axis) - 1.0 for k in fine], axis=-1
-    )  # (n, patterns)
+    stripes = [2.0 * patterns[k].take(0, 1 - axis) - 1.0 for k in numbers]
+    b = np.stack(stripes, axis=-1)
     A = np.stack([b[1:-1], (b[:-2] + b[2:]) / 2], axis=-1)
-    D = np.stack(
-        [R.apply(light[k] - light[k + 1]).reshape(*R.grid, -1).mean(axis=-1) for k in fine]
-    )
-    D = np.moveaxis(D, 1 + axis, -1)[..., 1:-1]  # (patterns, lines, n - 2)
-    z = np.einsum("nik,kjn->ijn", np.linalg.pinv(A), D)[:, seen]  # l (1 - q), l q
-    l = z.sum(axis=0)
-    lit = l > 0
-    return float(np.clip(np.median(z[1, lit] / l[lit]), 0.0, 1.0)) if lit.any() else None
+
+    # D (patterns, lines, n - 2)
+    differences = []
+    for k in numbers:
+        difference = R.apply(light[k] - light[k + 1])
+        differences.append(difference.reshape(*R.grid, -1).mean(axis=-1))
+    D = np.moveaxis(np.stack(differences), 1 + axis, -1)[..., 1:-1]
+
+    own, neighbours = np.einsum("nik,kjn->ijn", np.linalg.pinv(A), D)[:, is_seen]
+    direct = own + neighbours  # l (1 - q) + l q
+    is_lit = direct > 0
+    if not is_lit.any():
+        return None
+    q = np.median(neighbours[is_lit] / direct[is_lit])
+    return float(np.clip(q, 0.0, 1.0))
+
+
+def _finest_patterns(code: GrayCode, axis: int) -> range:
+    """Numbers of the finest patterns of an axis; each is followed by its inverse."""
+    column_bits, row_bits = code.bits
+    if axis == 1:
+        first = 0
+        last = 2 * column_bits
+    else:
+        first = 2 * column_bits
+        last = 2 * (column_bits + row_bits)
+    return range(max(first, last - 2 * FINE_BITS), last, 2)

@@ -33,7 +33,7 @@ from ltcl.acquisition.radiometry.exposures import NO_LIGHT
 from ltcl.acquisition.radiometry.merge import Radiance
 from ltcl.acquisition.radiometry.response import Response
 from ltcl.errors import InputError
-from ltcl.transport import frames as layout
+from ltcl.transport.matrices import check_mixing
 
 # Codes of the result: four values for each code of 8 bits.
 TABLE_SIZE = 1025
@@ -183,4 +183,4 @@ def mixing(lit: Sequence[Radiance], black: Radiance) -> np.ndarray:
                 f"lit[{c}] has no light in its own channel {c}; is the order red, green, blue?"
             )
         M[c, d] = np.sum(w * L[:, c, d] * L[:, c, c]) / squares
-    return layout.mixing(M, 3, None)
+    return check_mixing(M, 3, has_blocks=False)

@@ -33,8 +33,8 @@ from ltcl import checks
 from ltcl.acquisition.rig import as_codes, as_exposures, shot_key
 from ltcl.errors import InputError
 from ltcl.images import from_srgb, to_srgb
-from ltcl.transport import frames as layout
 from ltcl.transport.fingerprint import fingerprint
+from ltcl.transport.matrices import check_matrices, check_mixing
 
 Curve = Callable[[np.ndarray], np.ndarray]
 Place = Callable[[np.ndarray, np.ndarray], tuple[Any, Any]]
@@ -214,11 +214,11 @@ class VirtualRig(SimulatedRig):
             raise InputError(
                 "T has blocks between colours; it must have one matrix a channel, and a mixing"
             )
-        matrices = layout.matrices(getattr(T, "matrices", T), "T")
+        matrices = check_matrices(getattr(T, "matrices", T), "T")
         self._T = [A.astype(np.float32) if A.dtype.kind in "iub" else A for A in matrices]
         rows, columns = self._T[0].shape
         super().__init__(checks.grid("grid", grid, columns), len(self._T), sensor)
-        maps = [] if camera_map is None else layout.matrices(camera_map, "camera_map")
+        maps = [] if camera_map is None else check_matrices(camera_map, "camera_map")
         (pixels, width), self._map = (maps[0].shape, maps[0]) if maps else ((rows, rows), None)
         if len(maps) > 1 or width != rows:
             shape = f"{len(maps)} x {(pixels, width)}"
@@ -229,7 +229,9 @@ class VirtualRig(SimulatedRig):
             "camera_grid", grid if camera_grid is None else camera_grid, pixels
         )
         mixing = getattr(T, "mixing", None) if mixing is None else mixing
-        self._mixing = None if mixing is None else layout.mixing(mixing, self.channels, None)
+        self._mixing = (
+            None if mixing is None else check_mixing(mixing, self.channels, has_blocks=False)
+        )
         a = checks.finite("ambient", checks.real("ambient", ambient)).astype(np.float64)
         checks.shape("ambient", a, (), (self.channels,), (rows,), (rows, self.channels))
         if a.min() < 0:

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.scanning.columns import all_but_one
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Log, Seen
 from ltcl.transport import first_bounce
@@ -224,7 +224,7 @@ def arrays(
     )
     result: dict[str, Any] = {
         "grid": cells.grid,
-        "first_bounce": first_bounce.certain(own, noise, sigmas),
+        "first_bounce": first_bounce.drop_uncertain(own, noise, sigmas),
     }
     result |= {"basis_0.name": "pyramid", "basis_0.grid": cells.grid}
     result |= {} if mixing is None else {"mixing": mixing}

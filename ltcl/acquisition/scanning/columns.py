@@ -16,7 +16,7 @@ import scipy.linalg
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Pictures
 from ltcl.errors import InputError
 from ltcl.store import BlockStore

@@ -30,7 +30,7 @@ from ltcl.acquisition.agreement import (
     spread,
 )
 from ltcl.acquisition.calibration import Calibration, Setup
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.session import acquisition_error

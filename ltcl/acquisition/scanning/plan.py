@@ -27,7 +27,7 @@ import numpy as np
 
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
-from ltcl.acquisition.geometry.resample import Blocks
+from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import adaptive, columns
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings

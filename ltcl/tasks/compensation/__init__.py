@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Radiometric compensation: the projector pattern that makes the scene look as desired (section 8.2)."""
+"""Radiometric compensation: the pattern that makes the scene look as desired (section 8.2)."""
 
 from __future__ import annotations
 
-from ltcl.tasks.compensation.compensate import RTOL, Compensation, compensate
+from ltcl.tasks.compensation.compensate import compensate
+from ltcl.tasks.compensation.inputs import RTOL
+from ltcl.tasks.compensation.result import Compensation
 
 __all__ = ["RTOL", "Compensation", "compensate"]

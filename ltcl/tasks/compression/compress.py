@@ -49,7 +49,7 @@ from ltcl.tasks.compression.sources import (
     window_of,
 )
 from ltcl.theory import TwoNorm, two_norm
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 Note = Callable[[str, float], object]
 _GATHER = 0.7  # of what is allowed: Frobenius norm of what need not even be looked at
@@ -240,7 +240,7 @@ def compress(
     if client is not None:
         cluster.require(client)
     with memory_errors("compress", T):
-        noise = require(T).noise if rtol == "noise" else None
+        noise = check_transport(T).noise if rtol == "noise" else None
         inputs = validate_inputs(T, grid, first_bounce, device, noise, memory=memory, client=client)
         C, channels = compress_inputs(inputs, names, goal, fresh_starts("compress"), note)
     needed = sum(channel.nbytes for channel in channels)
@@ -296,7 +296,7 @@ def compress_inputs(
         matrices.append(ScaledColumns(fit.system(problem), problem.F))
         reports.append(fit.report(trials))
         note("done", 1.0)
-    return Transport(matrices, dark=0.0, **inputs.settings), tuple(reports)
+    return Transport(matrices, dark_threshold=0.0, **inputs.settings), tuple(reports)
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ from ltcl.tasks.compression.losses import (
 )
 from ltcl.tasks.compression.sources import memory_errors, of_transport
 from ltcl.theory import two_norm
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 _FOR_R = 0.4  # of the tolerance
 _ITERATION = 0.9  # of the rest, for A; the last tenth is for rounding its core
@@ -133,7 +133,7 @@ def invert(
     >>> c.solution.products, c.error <= 2e-2
     (1, True)
     """
-    require(T)
+    check_transport(T)
     rtol = validate_rtol(rtol, _BOUNCES * UNIT * math.sqrt(T.shape[0]))
     if T.is_compressed and rtol <= T.error:
         raise InputError(

@@ -21,7 +21,7 @@ from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import Dense, Host, Operator
 from ltcl.transport import first_bounce as _first_bounce
 from ltcl.transport.noise import Noise
-from ltcl.transport.transport import Transport, require
+from ltcl.transport.transport import Transport, check_transport
 
 COLUMNS = 16  # blocks are of a multiple of this, so that kernels run alike whatever the block
 _WINDOW = 64  # pixels a side of the part of a picture on which bases are compared
@@ -228,7 +228,7 @@ def validate_inputs(
                 raise InputError(
                     f"{name} is given, but T is a Transport, which has its own; leave it out"
                 )
-        require(T)
+        check_transport(T)
         if T.error > 0.0:
             raise InputError(
                 f"T is compressed already, with an error of {T.error:.2g}; compress its origin"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The noise of a measured transport as a quantity: its model, and what it is where nobody measured it."""
+"""The noise of a measured transport: its model, fit to measurements, and estimate from T."""
 
 from ltcl.transport.noise.estimate import estimate
 from ltcl.transport.noise.model import Noise

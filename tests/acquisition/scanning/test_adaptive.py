@@ -14,7 +14,6 @@ import ltcl
 from ltcl.acquisition.scanning import adaptive
 from ltcl.acquisition.scanning.adaptive import Cells
 from ltcl.acquisition.scanning.pictures import Picture
-from ltcl.transport.transport import from_arrays
 
 random = np.random.default_rng(0)
 GRIDS = [(1, 1), (1, 6), (7, 1), (4, 4), (5, 7), (8, 8)]
@@ -110,7 +109,9 @@ def test_the_core_as_a_transport(device: Any, grid: tuple[int, int], channels: i
         Known(flat(grid, channels) + 0.02 * random.random((channels, n, n)), grid), threshold=0.03
     )
     C, mixing = dense(core), np.eye(3) + 0.1 if channels == 3 else np.eye(1)
-    T = from_arrays(adaptive.arrays(core, mixing if channels == 3 else None), device=device)
+    T = ltcl.Transport.from_arrays(
+        adaptive.arrays(core, mixing if channels == 3 else None), device=device
+    )
     np.testing.assert_allclose(
         np.atleast_2d(T.first_bounce), np.diagonal(C, axis1=1, axis2=2), rtol=1e-6
     )

@@ -19,7 +19,6 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Wavelet
 from ltcl.tasks.compression.coefficients import Analysis, coefficients
 from ltcl.tasks.compression.sources import source
-from ltcl.transport.transport import to_arrays
 
 from_array: Any = dask.array.from_array  # whose chunks are no str
 GRID, N = (8, 16), 128
@@ -94,7 +93,7 @@ def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     options: dict[str, Any] = {"grid": GRID, "basis": "db2", "memory": SMALLEST}
     serial = ltcl.compress(matrix, 0.02, **options)
     C = ltcl.compress(HOLDERS["dask"](matrix, None), 0.02, client=client, **options)
-    arrays, others = to_arrays(C), to_arrays(serial)
+    arrays, others = C.to_arrays(), serial.to_arrays()
     for name in others.keys() - {
         "system_0.solution_error",
         "system_0.error_bound",

@@ -26,7 +26,6 @@ from ltcl.errors import (
 )
 from ltcl.operators import Compressed, Dense, IdentityPlus, SubsetBasis
 from ltcl.tasks.compression import inverse_norm
-from ltcl.transport.transport import to_arrays
 from tests import gallery
 from tests.operators.helpers import FORMATS
 
@@ -131,7 +130,7 @@ def test_the_bound_holds_for_random_matrices(basis, h, w, rtol, noise, strength,
 def test_the_same_transport_gives_the_same_bits(basis, tuned, monkeypatch):
     monkeypatch.setenv("LTCL_TUNE", tuned)
     T = SCENES["open box"]()
-    one, two = (to_arrays(ltcl.compress(T, 0.02, basis=basis)) for _ in range(2))
+    one, two = (ltcl.compress(T, 0.02, basis=basis).to_arrays() for _ in range(2))
     assert {name: (array.dtype, array.shape, array.tobytes()) for name, array in one.items()} == {
         name: (array.dtype, array.shape, array.tobytes()) for name, array in two.items()
     }

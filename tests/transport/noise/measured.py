@@ -19,22 +19,23 @@ N = 12
 def truth(name: str, n: int = N) -> ltcl.Transport:
     """T of a scene without noise: two walls, three painted ones, three, with a block, glossy."""
     block = scenes.Block((0.3, 0.3, 0.2), (0.3, 0.3, 0.3))
-    if name == "glossy":
-        T = scenes.glossy(
-            scenes.dihedral(n), n, albedo=0.6, gloss=0.4, projector=(0.5, 0.8, 1.5)
-        ).transport()
+    if name == "corner":
+        scene = scenes.dihedral(n, albedo=0.6)
+    elif name == "painted":
+        scene = scenes.trihedral(n, albedo=[[0.9], [0.3], [0.6]])
+    elif name == "box":
+        scene = scenes.box(n, 3, albedo=0.7)
+    elif name == "occluded":
+        scene = scenes.box(n, 3, albedo=0.7, occluder=block)
     else:
-        T = {
-            "corner": lambda: scenes.dihedral(n, albedo=0.6),
-            "painted": lambda: scenes.trihedral(n, albedo=[[0.9], [0.3], [0.6]]),
-            "box": lambda: scenes.box(n, 3, albedo=0.7),
-            "occluded": lambda: scenes.box(n, 3, albedo=0.7, occluder=block),
-        }[name]().transport()
+        corner = scenes.dihedral(n)
+        scene = scenes.glossy(corner, n, albedo=0.6, gloss=0.4, projector=(0.5, 0.8, 1.5))
+    T = scene.transport()
     return ltcl.Transport(T.to_numpy().astype(np.float64), T.grid)
 
 
 def noise_of(T: ltcl.Transport, level: float, photons: float = 0.0) -> Noise:
-    """A floor of `level` times the median first bounce; a share of photon noise of as much at that light."""
+    """A floor of `level` times the median first bounce, and `photons` times its variance."""
     median = float(np.median(T.first_bounce))
     return Noise.uniform(T.shape, level * median, photons * level**2 * median)
 
@@ -42,9 +43,6 @@ def noise_of(T: ltcl.Transport, level: float, photons: float = 0.0) -> Noise:
 def measure(T: ltcl.Transport, noise: Noise, seed: int, known: bool = True) -> ltcl.Transport:
     """T with errors of this noise; `known`: the transport is told its noise."""
     entries = T.to_numpy()
-    error = np.random.default_rng(seed).standard_normal(entries.shape) * np.sqrt(
-        noise.variance(entries)
-    )
-    return ltcl.Transport(
-        (entries + error).astype(np.float32), T.grid, noise=noise if known else None
-    )
+    normal = np.random.default_rng(seed).standard_normal(entries.shape)
+    measured = entries + normal * np.sqrt(noise.variance(entries))
+    return ltcl.Transport(measured.astype(np.float32), T.grid, noise=noise if known else None)

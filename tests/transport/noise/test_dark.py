@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pixels whose first bounce is noise or nothing: masked or refused, reported, shown; the others are right."""
+"""Pixels whose first bounce is noise or 0: masked or refused, reported, shown."""
 
 from __future__ import annotations
 
@@ -32,9 +32,8 @@ DESIRED = {
 
 @pytest.fixture(autouse=True)
 def _seed(request: pytest.FixtureRequest) -> None:
-    random.bit_generator.state = np.random.default_rng(
-        [*request.node.name.encode()]
-    ).bit_generator.state
+    seeded = np.random.default_rng([*request.node.name.encode()])
+    random.bit_generator.state = seeded.bit_generator.state
 
 
 class Corner(NamedTuple):
@@ -48,8 +47,9 @@ class Corner(NamedTuple):
 
 @cache
 def corner() -> Corner:
-    """Albedo 0.85, direct light of 81.8 %; 12 pixels with 1e-6 of their light, a projector pixel without."""
-    rng, N = np.random.default_rng(1), n * n
+    """Albedo 0.85, direct light of 81.8 %; 12 pixels with 1e-6 of their light, one without light."""
+    rng = np.random.default_rng(1)
+    N = n * n
     G = np.asarray(ltcl.scenes.dihedral(n).form_factors)
     pairs = G.reshape(n, n, 2, n, n, 2).sum(axis=5).mean(axis=2).reshape(N, N)
     true = 0.85 * np.linalg.inv(np.eye(N) - 0.85 * pairs)
@@ -67,7 +67,7 @@ def test_they_are_masked_with_one_warning_or_refused(caplog, form, first_bounce)
     case = corner()
     F: Any = np.full(n * n, 0.85) if first_bounce == "given" else first_bounce
     T = ltcl.Transport(form(case.measured), GRID, F)
-    assert [record.message for record in caplog.records] == [f"{T.dark}; they stay unlit"]
+    assert [record.message for record in caplog.records] == [f"{T.dark_note}; they stay unlit"]
     np.testing.assert_array_equal(np.flatnonzero(T.masked), case.dark)
     np.testing.assert_allclose(T.first_bounce[~T.masked], 0.85, rtol=0.04)
     with pytest.raises(InputError, match=r"13 of 1024 pixels.*on_dark='mask'"):
@@ -85,22 +85,26 @@ def test_direct_light_is_right() -> None:
 
 @pytest.mark.parametrize("picture", DESIRED)
 def test_gain_is_that_without_these_pixels(picture) -> None:
-    case, desired = corner(), DESIRED[picture]
+    case = corner()
+    desired = DESIRED[picture]
     best = ltcl.compensate(ltcl.Transport(case.true, GRID), desired, gain="auto").gain
     c: Any = ltcl.compensate(ltcl.Transport(case.measured, GRID), desired, gain="auto")
     assert c.gain == pytest.approx(best, rel=0.02)
     assert c.solution.products + sum(each.products for each in c.limited) < 60
     around = scipy.ndimage.median_filter(c.pattern, 3)
-    assert np.all(
-        c.pattern[c.pattern > 0.99] < 1.1 * around[c.pattern > 0.99]
-    )  # none is saturated alone
+    is_saturated = c.pattern > 0.99
+    # No pixel is saturated alone.
+    assert np.all(c.pattern[is_saturated] < 1.1 * around[is_saturated])
     missing = np.delete(case.scene @ c.pattern.ravel() - c.target.ravel(), case.dark)
     assert np.linalg.norm(missing) < 0.015 * np.linalg.norm(c.target)
 
 
 def test_the_command_line_does_the_same_and_shows_them(program, tmp_path: Path) -> None:  # noqa: F811
-    case, grey, white = corner(), tmp_path / "grey.exr", tmp_path / "white.exr"
-    np.savez(path := tmp_path / "T.npz", T=case.measured, grid=GRID)
+    case = corner()
+    grey = tmp_path / "grey.exr"
+    white = tmp_path / "white.exr"
+    path = tmp_path / "T.npz"
+    np.savez(path, T=case.measured, grid=GRID)
     write(grey, DESIRED["grey"].astype(np.float32))
     write(white, case.scene.sum(axis=1).reshape(GRID).astype(np.float32))
     separated = program("separate", path, white, "--out", tmp_path / "b", "--json")
@@ -116,19 +120,19 @@ def test_the_command_line_does_the_same_and_shows_them(program, tmp_path: Path) 
     for command in ("info", "analyze"):
         (facts,) = program(command, path, "--show-dark", tmp_path / "dark.png", "--json").json
         assert facts["dark_pixels" if command == "info" else "masked"] == 13
-        shown = read(tmp_path / "dark.png")[
-            -8 - 512 : -8 : 16, 8 : 8 + 512 : 16
-        ]  # a pixel of each square
+        # A pixel of each square.
+        shown = read(tmp_path / "dark.png")[-8 - 512 : -8 : 16, 8 : 8 + 512 : 16]
         orange = (shown[..., 0] > 2 * shown[..., 2]).ravel()
         np.testing.assert_array_equal(np.flatnonzero(orange), case.dark)
 
 
-# What is dark.
+# Dark pixels.
 
 SMALL = ltcl.scenes.dihedral(4, albedo=[[0.6], [0.3]])
 T32 = SMALL.matrices()[0]
 SOME = np.arange(32) % 7 == 3
-DIM, SIGMA = np.where(SOME, 0.01, 1.0), Noise.uniform((32, 32), 0.02)
+DIM = np.where(SOME, 0.01, 1.0)
+SIGMA = Noise.uniform((32, 32), 0.02)
 QUIET = Noise.uniform((32, 32), 0.0)
 
 
@@ -138,9 +142,9 @@ QUIET = Noise.uniform((32, 32), 0.0)
         (T32 * DIM, {}, False),  # dim, without noise
         (T32 * DIM**2, {"noise": QUIET}, False),
         (T32 * DIM**4, {"noise": QUIET}, True),  # of which no camera and no float32 sees anything
-        (T32 * DIM**4, {"noise": QUIET, "dark": 0.0}, False),
+        (T32 * DIM**4, {"noise": QUIET, "dark_threshold": 0.0}, False),
         (np.linalg.inv(np.diag(1 / (0.6 * DIM)) - SMALL.form_factors), {}, False),  # dark paint
-        (T32 * DIM, {"dark": 0.05}, True),
+        (T32 * DIM, {"dark_threshold": 0.05}, True),
         (T32 * DIM, {"noise": SIGMA}, True),
         (T32 * DIM**0.5, {"noise": SIGMA}, True),
         (T32 * ~SOME, {}, True),
@@ -152,10 +156,11 @@ def test_what_is_dark(matrix, options, dark) -> None:
     np.testing.assert_array_equal(ltcl.Transport(matrix, (4, 8), **options).masked, SOME & dark)
 
 
-@pytest.mark.parametrize(("options", "gain"), [({}, 1.0), ({"dark": 0.0}, 1e-12)])
+@pytest.mark.parametrize(("options", "gain"), [({}, 1.0), ({"dark_threshold": 0.0}, 1e-12)])
 def test_pixels_without_light_do_not_decide_the_gain(options, gain) -> None:
     """Projector pixels with 1e-12 of the others' light, and noise as small."""
-    desired, without = np.full((4, 8), 0.5), ltcl.Transport(T32 * ~SOME, (4, 8))
+    desired = np.full((4, 8), 0.5)
+    without = ltcl.Transport(T32 * ~SOME, (4, 8))
     best = ltcl.compensate(without, desired, gain="auto").gain
     T = ltcl.Transport(T32 * np.where(SOME, 1e-12, 1.0), (4, 8), noise=QUIET, **options)
     assert ltcl.compensate(T, desired, gain="auto").gain == pytest.approx(gain * best, rel=0.1)
@@ -171,17 +176,19 @@ def test_noise_is_not_estimated_without_need(monkeypatch) -> None:
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.98])
 def test_most_pixels_may_be_dark_with_noise(share) -> None:
     scene = ltcl.scenes.dihedral(8)
-    lit, noise = random.permutation(128) >= share * 128, 7e-4 * random.standard_normal((128, 128))
+    lit = random.permutation(128) >= share * 128
+    noise = 7e-4 * random.standard_normal((128, 128))
     T = ltcl.Transport(scene.matrices()[0] * lit + noise, scene.grid)
     np.testing.assert_array_equal(T.masked, ~lit)
     with pytest.raises(InputError, match=r"noise.*every pixel|every pixel.*noise"):
         ltcl.Transport(noise, scene.grid)
 
 
-# What a separation cannot be.
+# Impossible separations.
 
 
-BRIGHTER = [[1, 0], [2, 1]]  # what pixel 0 lights, pixel 1 shows twice
+# Pixel 1 shows twice the light of pixel 0.
+BRIGHTER = [[1, 0], [2, 1]]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +214,7 @@ def test_an_impossible_separation_is_refused(T, image, says) -> None:
 
 @pytest.mark.parametrize("level", [1e-3, 1e-2])
 def test_noise_alone_is_not_refused(level) -> None:
-    """Of a wall without interreflection, all of whose light is direct: a little more or less by noise."""
+    """A wall without interreflection has direct light alone, a little more or less by noise."""
     T = ltcl.Transport(np.eye(64) + level * random.standard_normal((64, 64)), (8, 8))
     images = random.uniform(0.5, 1.0, (20, 8, 8)) + level * random.standard_normal((20, 8, 8))
     shares = ltcl.separate(T, images).direct.sum(axis=(1, 2)) / images.sum(axis=(1, 2))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Noise of T against noise that is known: estimated, from a second measurement, acquired; in files."""
+"""Noise of T against known noise: estimated, from a second measurement, acquired, in files."""
 
 from __future__ import annotations
 
@@ -45,30 +45,28 @@ def within(ratio: np.ndarray) -> float:
 
 
 def with_factors(noise: Noise, spread: float) -> Noise:
-    rows, columns = (
-        np.exp(spread * random.standard_normal(x.shape)) for x in (noise.rows, noise.columns)
-    )
+    rows = np.exp(spread * random.standard_normal(noise.rows.shape))
+    columns = np.exp(spread * random.standard_normal(noise.columns.shape))
     return replace(noise, rows=rows / rows.mean(), columns=columns / columns.mean())
 
 
 def same(a: Noise | None, b: Noise) -> bool:
-    return (
-        a is not None
-        and a.source == b.source
-        and all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ATTRIBUTES)
-    )
+    if a is None or a.source != b.source:
+        return False
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ATTRIBUTES)
 
 
 @pytest.mark.parametrize("photons", [0.0, 1.0, 300.0])
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_estimate_is_within_a_factor_of_1_3(scene: str, level: float, photons: float) -> None:
-    """Of 95 % of the entries, and of the first bounce; that of the glossy scene has structure of 1e-5."""
+    """95 % of the entries, and the first bounce; that of the glossy scene has structure of 1e-5."""
     T = truth(scene)
     exact = noise_of(T, level, photons)
     ratio = ratios(T, measure(T, exact, seed(), known=False).noise, exact)
     assert within(ratio) > 0.95
-    limit = 2.5 if (scene, level) == ("glossy", 1e-5) else 1.45  # few samples: 1.3 of most seeds
+    # Most seeds have 1.3, by few samples.
+    limit = 2.5 if (scene, level) == ("glossy", 1e-5) else 1.45
     assert 1.0 / limit < np.median(np.diag(ratio)) < limit
 
 
@@ -142,11 +140,10 @@ def test_estimate_is_not_confused_by_texture() -> None:
 
 @pytest.mark.parametrize("grid", [(1, 1), (1, 2), (6, 12), (8, 16)])
 def test_estimate_of_a_transport_without_noise_is_next_to_nothing(grid: tuple[int, int]) -> None:
-    exact = (
-        scenes.dihedral(grid[0]).transport()
-        if grid[1] > 2
-        else ltcl.Transport(np.eye(grid[1]), grid)
-    )
+    if grid[1] > 2:
+        exact = scenes.dihedral(grid[0]).transport()
+    else:
+        exact = ltcl.Transport(np.eye(grid[1]), grid)
     assert np.max(exact.noise.diagonal(exact.first_bounce)) < 1e-4 * np.median(exact.first_bounce)
 
 
@@ -161,7 +158,7 @@ def test_estimate_refuses_what_shows_no_entries() -> None:
 @pytest.mark.parametrize("photons", [0.0, 300.0])
 @pytest.mark.parametrize("layout", [np.asarray, scipy.sparse.csr_array])
 def test_second_measurement_shows_the_noise(layout: Any, photons: float) -> None:
-    """Also where an object has moved, of 1 % of a row and one more entry."""
+    """Moved objects, 1 % of a row and one more entry, do not matter."""
     T = truth("painted")
     exact = with_factors(noise_of(T, 1e-3, photons), 0.6)
     first, second = (measure(T, exact, seed(), known=False).to_numpy() for _ in range(2))
@@ -241,21 +238,20 @@ def test_noise_of_no_shape_is_refused(shape: Any) -> None:
 def test_files_of_damaged_noise_are_refused(
     name: str, value: Any, extension: str, tmp_path: Path
 ) -> None:
-    """Those of before `neighbours` are not damaged."""
     arrays: dict[str, Any] = {
         "T": np.eye(4),
         "grid": [2, 2],
         **Noise.uniform((4, 4), 0.01).to_arrays(),
     }
-    del arrays["noise_neighbours"]
     path = tmp_path / f"T.{extension}"
 
     def write() -> None:
+        present = {name: array for name, array in arrays.items() if array is not None}
         if extension == "npz":
-            np.savez(path, allow_pickle=False, **{n: a for n, a in arrays.items() if a is not None})
+            np.savez(path, allow_pickle=False, **present)
             return
         with h5py.File(path, "w") as file:
-            file.update({n: a for n, a in arrays.items() if a is not None})
+            file.update(present)
 
     write()
     assert same(ltcl.load(path).measured_noise, Noise.uniform((4, 4), 0.01))
@@ -335,15 +331,17 @@ def test_acquired_transports_have_the_noise_of_their_scan(
     Entries of an S-matrix batch share their noise, the first bounce's; the model has its mean over
     the row, of all entries only where none is dropped.
     """
-    T, z, diagonal, pictures = truth("corner", 4), [], [], []
+    T = truth("corner", 4)
+    z = []
+    diagonal = []
+    pictures = []
     seed()
-    exact, p = T.to_numpy(), random.random(T.shape[1])
+    exact = T.to_numpy()
+    p = random.random(T.shape[1])
     for number in range(2):
         camera = {"bits": 12, "ambient": 0.01, "read": 0.003, "gain": 2000.0, "response": "linear"}
-        rig, path = (
-            VirtualRig(exact, T.grid, seed=seed() % 1000, **camera),
-            tmp_path / f"{number}.zarr",
-        )
+        rig = VirtualRig(exact, T.grid, seed=seed() % 1000, **camera)
+        path = tmp_path / f"{number}.zarr"
         options = {"order": 7, "response": LINE, "sigmas": 0.0 if strategy == "hadamard" else 3.0}
         scan = acquire(rig, geometry="aligned", strategy=strategy, store=path, **options)
         again = ltcl.load(path, on_dark="mask")
@@ -351,7 +349,8 @@ def test_acquired_transports_have_the_noise_of_their_scan(
         assert scan.noise.source == "acquired"
         measured = scan @ np.eye(32).reshape(32, *T.grid)
         measured = measured.reshape(32, 32).T * (exact.sum() / measured.sum())
-        v, white = scan.noise.variance(exact), scan.noise.white[0]
+        v = scan.noise.variance(exact)
+        white = scan.noise.white[0]
         total = v.sum(axis=1)
         error = measured - exact
         own = v + (white / total - 1.0)[:, None] * v**2 / total[:, None]
@@ -364,10 +363,11 @@ def test_acquired_transports_have_the_noise_of_their_scan(
 
 
 def test_the_first_bounce_may_have_a_noise_of_its_own() -> None:
-    """As of a path tracer, which has no chance where light comes straight from the projector."""
+    """A path tracer has no randomness in light that comes straight from the projector."""
     T = truth("box")
     noise = replace(noise_of(T, 1e-3, photons=100.0), direct=0.01)
-    first, second = (measure(T, noise, seed, known=False) for seed in (1, 2))
+    first = measure(T, noise, 1, known=False)
+    second = measure(T, noise, 2, known=False)
     twice = ltcl.Transport(first.to_numpy(), T.grid, noise=second).noise
     assert twice.direct == pytest.approx(0.01, rel=0.4)
     for each in (twice, first.noise):
@@ -383,15 +383,15 @@ def test_the_first_bounce_may_have_a_noise_of_its_own() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.5])
 @pytest.mark.parametrize("twice", [False, True])
 def test_errors_of_neighbouring_columns_may_cancel(share: float, twice: bool) -> None:
-    """As of a path tracer: by row sums, in deviations of what smooth, single and random pictures show."""
+    """Errors of a path tracer: row sums, and deviations of smooth, single, random pictures."""
     T = truth("corner", 16)
     independent = noise_of(T, 1e-3)
     noise = replace(independent, neighbours=share)
-    first, second = (
-        T.to_numpy()
-        + noise.filtered((measure(T, independent, k).to_numpy() - T.to_numpy()).T, T.grid).T
-        for k in (1, 2)
-    )
+    measurements = []
+    for seed in (1, 2):
+        errors = measure(T, independent, seed).to_numpy() - T.to_numpy()
+        measurements.append(T.to_numpy() + noise.filtered(errors.T, T.grid).T)
+    first, second = measurements
     other = ltcl.Transport(second, T.grid) if twice else None
     measured = ltcl.Transport(first, T.grid, noise=other)
     assert measured.noise.neighbours == pytest.approx(share, abs=0.15)

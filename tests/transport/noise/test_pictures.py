@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compression to what pictures need, and to what stands out of the noise, against unseen pictures."""
+"""Compression for pictures, and down to the noise, against unseen pictures."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def text(grid: tuple[int, int]) -> np.ndarray:
 def photograph(grid: tuple[int, int]) -> np.ndarray:
     """A part of the landscape, at random."""
     whole = np.asarray(landscape(96, 192), np.float64).mean(axis=2)
-    (y, x), side = random.integers(0, (40, 90)), int(random.integers(24, 56))
+    y, x = random.integers(0, (40, 90))
+    side = int(random.integers(24, 56))
     return cv2.resize(whole[y : y + side, x : x + side], grid[::-1], interpolation=cv2.INTER_AREA)
 
 
@@ -67,9 +68,10 @@ def dense(T: ltcl.Transport) -> tuple[np.ndarray, np.ndarray]:
 
 
 def losses(T: ltcl.Transport, C: ltcl.Transport, picture: np.ndarray) -> list[float]:
-    """Of appearance and direct light of a picture, and of the pattern that shows it, and what that shows."""
+    """Errors of a picture, its direct light, the pattern that shows it, and the picture of that."""
     (S, inverse), (approximate, other) = map(dense, (T, C))
-    direct, b = T.first_bounce * picture.ravel(), picture.ravel()
+    direct = T.first_bounce * picture.ravel()
+    b = picture.ravel()
     pattern = other @ b
     pairs = [
         (approximate @ direct, S @ direct),

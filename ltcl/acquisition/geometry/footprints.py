@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Areas on the projector's grid that camera pixels see: parallelograms from a measured map.
+
+The parallelogram of a camera pixel is spanned by the differences of the map to its neighbours. Its
+share in each projector pixel is counted with points spread evenly over it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.acquisition.geometry.correspondence import Correspondence
+
+# A difference that is so many times the opposite one crosses the border of an object (perspective:
+# below 1.1).
+MAX_DIFFERENCE_RATIO = 2.5
+
+# Times the median: no camera pixel spans more on a surface that it sees at less than 80 degrees.
+MAX_SPAN_RATIO = 6.0
+
+# Points of a footprint along each side (error of pictures of noise with 2 camera pixels to a side
+# and an exact map, measured: 4: 1.2 %, 8: 0.9 %, 16: 0.6 % in four times the time).
+POINTS_PER_SIDE = 8
+
+# Camera pixels whose points are placed at once.
+PIXELS_AT_ONCE = 1 << 12
+
+
+@dataclass(frozen=True)
+class PaddedGrid:
+    """A projector's `grid` (h, w) with `rim` pixels more on each side."""
+
+    grid: tuple[int, int]
+    rim: int
+
+    @property
+    def width(self) -> int:
+        """Pixels of a row, with the rim."""
+        return self.grid[1] + 2 * self.rim
+
+    @property
+    def size(self) -> int:
+        """Pixels of the grid and its rim."""
+        return (self.grid[0] + 2 * self.rim) * self.width
+
+    @property
+    def inner(self) -> np.ndarray:
+        """Numbers of the projector's pixels on the padded grid, (h w,)."""
+        h, w = self.grid
+        rows = (np.arange(h) + self.rim) * self.width
+        columns = np.arange(w) + self.rim
+        return np.add.outer(rows, columns).ravel()
+
+    def numbers(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Numbers of the pixels at (x, y); places outside count as pixels just outside the grid."""
+        h, w = self.grid
+        column = np.clip(np.rint(x), -1, w).astype(np.int32) + self.rim
+        row = np.clip(np.rint(y), -1, h).astype(np.int32) + self.rim
+        return row * self.width + column
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footprints:
+    """Parallelograms on the projector's grid that camera pixels see.
+
+    Attributes
+    ----------
+    mapping : Correspondence
+        Places of their middles.
+    J : (H, W, 2, 2) float64
+        d(x, y) / d(u, v), whose columns span the parallelogram.
+    known : (H, W) bool
+        Whether J is known.
+    straddling : (H, W) bool
+        Whether the pixel is next to one that is not known, or not next to it on the surface: it may
+        see two surfaces.
+    """
+
+    mapping: Correspondence
+    J: np.ndarray
+    known: np.ndarray
+    straddling: np.ndarray
+
+    @classmethod
+    def from_map(cls, mapping: Correspondence) -> Footprints:
+        """Footprints from differences to both valid neighbours, averaged.
+
+        Only one counts if the other is across a border.
+
+        If a row or a column of pixels stands alone, and on a side of 1 of the projector's grid,
+        camera pixels count as squares. Those that would span six times the median have no
+        footprint.
+        """
+        places = np.stack([mapping.x, mapping.y], axis=-1).astype(np.float64)  # NaN if not valid
+        du, has_both_u = _differences(places, 1)
+        dv, has_both_v = _differences(places, 0)
+        J = np.stack([du, dv], axis=-1)
+        h, w = mapping.grid
+        if w == 1:
+            J[:, :, 0] = np.nan
+        if h == 1:
+            J[:, :, 1] = np.nan
+        # Missing derivatives of a square, by Cauchy and Riemann's equations.
+        of_square = J[..., ::-1, ::-1] * [[1, -1], [-1, 1]]
+        J = np.nan_to_num(np.where(np.isnan(J), of_square, J))
+
+        is_known = np.linalg.det(J) != 0
+        span = np.abs(J).max(axis=(2, 3))
+        if is_known.any():
+            is_known &= span <= MAX_SPAN_RATIO * np.median(span[is_known])
+        is_straddling = is_known & ~(has_both_u & has_both_v)
+        return cls(mapping=mapping, J=J, known=is_known, straddling=is_straddling)
+
+    @property
+    def width(self) -> float:
+        """Length of the median footprint, in projector pixels."""
+        return float(np.median(np.linalg.norm(self.J[self.known], 2, axis=(1, 2))))
+
+    def areas(self) -> np.ndarray:
+        """Area of each footprint in projector pixels, (M,)."""
+        return np.abs(np.linalg.det(self.J)).ravel()
+
+    def shares(self, padded: PaddedGrid, *, tent: bool = False) -> scipy.sparse.csr_array:
+        """Part of each footprint in each pixel of the padded grid, (M, pixels).
+
+        With `tent`, parts of twice the footprint, with less weight towards its border, as bilinear
+        interpolation weighs.
+        """
+        du, dv = _footprint_points(tent)
+        known = self.known.ravel()
+        x = np.where(self.known, self.mapping.x, 0.0).ravel()
+        y = np.where(self.known, self.mapping.y, 0.0).ravel()
+        J = self.J.reshape(-1, 4)
+        chunks = []
+        for start in range(0, known.size, PIXELS_AT_ONCE):
+            part = slice(start, start + PIXELS_AT_ONCE)
+            xu, xv, yu, yv = J[part].T[..., None]
+            points_x = x[part, None] + xu * du + xv * dv
+            points_y = y[part, None] + yu * du + yv * dv
+            numbers = padded.numbers(points_x, points_y)
+            chunks.append(_count_points(numbers, known[part], padded.size))
+        return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
+
+
+def _footprint_points(tent: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Points (u, v) of a camera pixel, in pixels from its middle.
+
+    They are sheared: no two points lie on one line along a side, which a border may be, too.
+    """
+    points = 2 * POINTS_PER_SIDE if tent else POINTS_PER_SIDE
+    number = np.arange(points)
+    row = np.repeat(number, points)
+    column = np.tile(number, points)
+    u = (row + (column + 0.5) / points) / points - 0.5
+    v = (column + (row + 0.5) / points) / points - 0.5
+    if tent:
+        return _spread_as_tent(u), _spread_as_tent(v)
+    return u, v
+
+
+def _spread_as_tent(even: np.ndarray) -> np.ndarray:
+    """Points of a tent over [-1, 1] from points that are even over [-1/2, 1/2]."""
+    return np.copysign(1.0 - np.sqrt(1.0 - 2.0 * np.abs(even)), even)
+
+
+def _count_points(numbers: np.ndarray, known: np.ndarray, pixels: int) -> scipy.sparse.csr_array:
+    """Part of the points (camera pixels, points) of known camera pixels in each projector pixel."""
+    points = numbers.shape[1]
+    columns = numbers[known].ravel()
+    indptr = np.append(0, np.cumsum(known, dtype=np.int32) * points)
+    values = np.full(columns.size, 1.0 / points)
+    shares = scipy.sparse.csr_array((values, columns, indptr), (len(numbers), pixels))
+    shares.sum_duplicates()
+    return shares
+
+
+def _differences(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean difference to the next and the previous pixel along `axis`, and whether both count.
+
+    It is NaN if neither is valid; of two that differ much the smaller one counts.
+    """
+    step = np.diff(x, axis=axis)
+    missing = np.full_like(np.take(x, [0], axis=axis), np.nan)
+    to_next = np.concatenate([step, missing], axis)
+    to_previous = np.concatenate([missing, step], axis)
+    steps = np.stack([to_next, to_previous])
+    size = np.linalg.norm(steps, axis=-1, keepdims=True)
+    is_used = np.isfinite(size) & ~(size > MAX_DIFFERENCE_RATIO * size[::-1])
+    total = np.where(is_used, steps, 0.0).sum(axis=0)
+    count = is_used.sum(axis=0)
+    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    return mean, count[..., 0] == 2

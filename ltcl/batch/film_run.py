@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`FilmRun`: the loop over the batches of a film, and `BatchSolver`, which its workers get once.
+
+A batch is read ahead, solved here or on workers, written, and then recorded, in this order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import chain, islice, repeat, tee
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ltcl import images
+from ltcl.batch import manifest
+from ltcl.batch.manifest import FrameRecord, OtherRun, identity
+from ltcl.errors import FileError, InputError, LtclError
+from ltcl.files import read_ahead
+from ltcl.images.frames import Frame, Source
+from ltcl.solvers import Inverse
+from ltcl.solvers.auto import SMALL, survey
+from ltcl.tasks.compensation import compensate
+from ltcl.transport.transport import Transport
+
+# Broken frames that an error names.
+MAX_NAMED = 5
+# Threads that compress and flush files, side by side.
+WRITERS = 4
+
+
+class ReadFrame(NamedTuple):
+    """A frame, the SHA-256 of what was read, and its picture on the camera's grid."""
+
+    frame: Frame
+    digest: str
+    picture: np.ndarray
+
+
+class SolvedBatch(NamedTuple):
+    """Patterns and appearances of the frames of a batch, with their errors and clipped shares."""
+
+    pattern: np.ndarray
+    appearance: np.ndarray | None
+    errors: list[float]
+    clipped: list[float]
+
+
+@dataclass(eq=False, kw_only=True)
+class BatchSolver:
+    """Solve a batch of pictures; it is sent to each worker once.
+
+    On workers `reload` reads T from its file, instead of a T that was sent.
+    """
+
+    T: Transport
+    options: dict[str, Any]
+    needs_appearance: bool
+    identity: dict[str, Any]
+    reload: Callable[[], Transport] | None = None
+    gain: Any = None  # of all frames, when it is known
+
+    def __call__(self, batch: tuple[list[int], np.ndarray]) -> SolvedBatch:
+        """Solve the pictures (k, h, w[, 3]) of frames with these numbers."""
+        numbers, pictures = batch
+        try:
+            self._survey()
+            solved = compensate(self.T, pictures, gain=self.gain, **self.options)
+        except LtclError as error:
+            error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
+            raise
+        return SolvedBatch(
+            pattern=solved.pattern,
+            appearance=solved.appearance if self.needs_appearance else None,
+            errors=solved.frame_errors.tolist(),
+            clipped=solved.frame_clipped.tolist(),
+        )
+
+    def _survey(self) -> None:
+        """Let "auto" see the same survey of S in every batch, so that all choose the same method."""
+        is_auto = self.options.get("method", "auto") == "auto"
+        if is_auto and self.T.is_square and self.T.shape[0] > SMALL:
+            for S in self.T.systems:
+                survey(S)
+
+    def __getstate__(self) -> dict[str, Any]:
+        options = {name: value for name, value in self.options.items() if name != "callback"}
+        T = None if self.reload else self.T
+        return dict(vars(self), T=T, options=options)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.reload is not None:
+            self.T = self.reload()
+            if identity(self.T) != self.identity:
+                raise InputError("the file of T holds another T there; give all workers the same")
+        for value in (self.T, *self.options.values()):
+            use_own_device(value)
+
+
+def use_own_device(value: Any) -> None:
+    """Let a transport or an inverse that was sent to a worker open the device of that worker."""
+    if isinstance(value, Transport):
+        value._requested_device = None
+    elif isinstance(value, Inverse):
+        value._index = None
+
+
+@dataclass(eq=False, kw_only=True)
+class FilmRun:
+    """A run over the frames of a film, into a folder."""
+
+    solver: BatchSolver
+    stream: Callable[..., Iterator[Any]]  # results of the solver, here or by workers
+    source: Source
+    limit: int | None
+    folder: Path
+    head: dict[str, Any]  # of the manifest
+    white: float  # light that is white in .png
+    codes: Callable[[np.ndarray], np.ndarray] | None
+    records: dict[int, FrameRecord] = field(default_factory=dict)  # by number, of all runs
+    done: set[int] = field(default_factory=set)  # numbers of frames, of earlier runs, too
+    broken: dict[int, str] = field(default_factory=dict)  # frames left out, and why
+    read_count: int = 0  # frames of the right size
+    solved_count: int = 0
+
+    def __post_init__(self) -> None:
+        settings = self.head["settings"]
+        self.batch_size: int = settings["batch"]
+        self.format: str = settings["format"]
+        self.needs_resize: bool = settings["resize"]
+
+    @property
+    def count(self) -> int | None:
+        """Number of frames, as far as the source tells."""
+        if not self.source.count or self.limit is None:
+            return self.source.count
+        return min(self.source.count, self.limit)
+
+    def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
+        """Solve all batches; yields how many frames are done, at the beginning and after each batch."""
+        # The next batch is read while one is solved.
+        ahead = read_ahead(lambda batches: next(batches, None), repeat(self._batches()), 1)
+        batches = iter(lambda: next(ahead), None)
+        first = list(islice(batches, 1))
+        yield len(self.done)
+        if first and self.head["gain"] is None:
+            self.head["gain"] = self._find_gain(gain, loss, first[0])
+        self.solver.gain = self.head["gain"]
+
+        to_solve, to_write = tee(chain(first, batches))
+        tasks = (([read.frame.number for read in batch], stack(batch)) for batch in to_solve)
+        with ThreadPoolExecutor(WRITERS) as writers:
+            results = self.stream(self.solver, tasks)
+            for solved, batch in zip(results, to_write, strict=True):
+                self._keep(batch, solved, writers)
+                yield len(self.done)
+        self._name_broken()
+
+    def _keep(
+        self, batch: Sequence[ReadFrame], solved: SolvedBatch, writers: ThreadPoolExecutor
+    ) -> None:
+        """Write the files of a batch, and record it."""
+        numbers = [read.frame.number for read in batch]
+        light = [solved.pattern]
+        if solved.appearance is not None:
+            light.append(solved.appearance)
+        list(writers.map(self._write, numbers, *light))
+        for read, error, clipped in zip(batch, solved.errors, solved.clipped, strict=True):
+            number = read.frame.number
+            self.records[number] = FrameRecord(number, read.frame.name, read.digest, error, clipped)
+            self.done.add(number)
+        manifest.write(self.folder, self.head, self.records)
+        self.solved_count += len(batch)
+
+    def _name_broken(self) -> None:
+        """FileError that names frames which were left out."""
+        if not self.broken:
+            return
+        reasons = [f"{number} ({self.broken[number]})" for number in sorted(self.broken)]
+        named = ", ".join(reasons[:MAX_NAMED])
+        if len(reasons) > MAX_NAMED:
+            named += f" and {len(reasons) - MAX_NAMED} more"
+        raise FileError(f"{self.source.path}: frames were left out: {named}")
+
+    def _find_gain(self, gain: float | str, loss: float | None, first: list[ReadFrame]) -> float:
+        """The gain of all frames; by "auto" of a sample, the first frames where their number is unknown."""
+        if not isinstance(gain, str):
+            return float(gain)
+        count = self.count or self.batch_size
+        places = np.linspace(1, count, min(self.batch_size, count))
+        numbers = set(np.rint(places).astype(int).tolist())
+        sample = []
+        for frame in islice(self.source, max(numbers)):
+            if frame.number in numbers:
+                sample += self._read(frame)
+        pictures = stack(sample or first)
+        options = self.solver.options
+        return compensate(self.solver.T, pictures, gain=gain, loss=loss, **options).gain
+
+    def _batches(self) -> Iterator[list[ReadFrame]]:
+        """The frames that no earlier run has done, without broken ones."""
+        frames = islice(self.source, self.limit)
+        while True:
+            group = list(islice(frames, self.batch_size))
+            if not group:
+                return
+            batch = []
+            for frame in group:
+                batch += self._read(frame)
+            if batch:
+                yield batch
+
+    def _read(self, frame: Frame) -> list[ReadFrame]:
+        """One frame, on the camera's grid; none where it is done, or broken, which is noted."""
+        place = f"{self.source.path}: frame {frame.number} ({frame.name})"
+        try:
+            digest = frame.digest()
+            if self._is_done(frame, digest, place):
+                self.done.add(frame.number)
+                return []
+            picture = frame.picture()
+            self._check_size(picture, place)
+        except InputError as error:
+            is_first_size = self.read_count == 0 and not isinstance(error, FileError)
+            if isinstance(error, OtherRun) or is_first_size:
+                raise  # perhaps all frames are of another size
+            self.broken[frame.number] = str(error)
+            return []
+        self.read_count += 1
+        grid = self.solver.T.camera_grid
+        if picture.shape[:2] != grid:
+            picture = images.resize(picture, grid)
+        return [ReadFrame(frame, digest, picture)]
+
+    def _is_done(self, frame: Frame, digest: str, place: str) -> bool:
+        """True if a frame has its files; OtherRun if it has changed since they were made."""
+        record = self.records.get(frame.number)
+        if record is None:
+            return False
+        if record.digest != digest:
+            advice = f"give the same frames to go on, or another folder than {self.folder}"
+            raise OtherRun(f"{place} has changed since its pattern was made; {advice}")
+        return all(file.is_file() for file in self._files(frame.number))
+
+    def _check_size(self, picture: np.ndarray, place: str) -> None:
+        h, w = self.solver.T.camera_grid
+        if self.needs_resize or picture.shape[:2] == (h, w):
+            return
+        size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
+        advice = "give resize=True (--resize) to scale all frames"
+        raise InputError(f"{place} is {size}; {advice}")
+
+    def patterns(self) -> Iterator[np.ndarray]:
+        """Patterns as they were written, white at 1; codes as the light of which sRGB makes them."""
+        for number in sorted(self.done):
+            pattern = images.read(self._files(number)[0])
+            if self.format == "exr":
+                if self.codes is None:
+                    pattern = pattern / np.float32(self.white)
+                else:
+                    pattern = images.from_srgb(self.codes(pattern))
+            yield pattern
+
+    def _files(self, number: int) -> list[Path]:
+        """Files of a frame: its pattern and, where asked for, its appearance."""
+        files = [self.folder / f"pattern_{number:06}.{self.format}"]
+        if self.solver.needs_appearance:
+            files.append(self.folder / f"appearance/appearance_{number:06}.{self.format}")
+        return files
+
+    def _write(
+        self, number: int, pattern: np.ndarray, appearance: np.ndarray | None = None
+    ) -> None:
+        """Write the files of a frame."""
+        pattern_file, *appearance_file = self._files(number)
+        if self.codes is not None and self.format == "png":
+            images.write(pattern_file, self.codes(pattern), bits=16, encoding="linear")
+        else:
+            self._write_light(pattern_file, pattern, self.white)
+        if appearance is not None:
+            # Divided by the gain it is as bright as the picture that was asked for.
+            self._write_light(appearance_file[0], appearance, self.head["gain"])
+
+    def _write_light(self, file: Path, light: np.ndarray, white: float) -> None:
+        """Write light as it is in .exr, in .png with white at `white`."""
+        if self.format == "exr":
+            images.write(file, light)
+        else:
+            images.write(file, light / np.float32(white), bits=16)
+
+
+def stack(batch: Sequence[ReadFrame]) -> np.ndarray:
+    """The pictures of a batch: (k, h, w), or (k, h, w, 3) where one of them is in colour."""
+    pictures = [np.atleast_3d(read.picture) for read in batch]
+    stacked = np.stack(np.broadcast_arrays(*pictures))
+    return stacked if stacked.shape[-1] == 3 else stacked[..., 0]

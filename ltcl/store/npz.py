@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""NumPy's files: .npz, whose declared sizes are checked, and .npy. Nothing is compressed or pickled.
+
+An .npz holds SciPy's `save_npz` layouts; or named arrays, `T` (M, N) or (3, M, N) or the only matrix;
+or, by its `format`, a compressed transport, an inverse, or three sparse channels ("ltcl-rgb-csr-1":
+`shape`, `indptr_0`, `indices_0`, `data_0` to `data_2`); and perhaps `EXTRAS`.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ltcl import checks
+from ltcl.errors import FileError, InputError
+from ltcl.store.guards import EXPANSION, check_declared, sparse_floats
+from ltcl.store.record import (
+    CHANNELS,
+    COMPRESSED_FORMAT,
+    CSR,
+    INVERSE_FORMAT,
+    CompressedRecord,
+    StoreRecord,
+    assemble,
+)
+
+RGB_FORMAT = "ltcl-rgb-csr-1"
+# Arrays of SciPy's layouts that hold indices begin with these.
+INDEX_ARRAYS = ("indices", "indptr", "row", "col", "coords", "offsets")
+# About the bytes of a stored entry: enough to bound the rows of a sparse matrix by the file's size.
+ENTRY_BYTES = 8
+
+Headers = dict[str, tuple[tuple[int, ...], np.dtype]]
+
+
+def read_npz(path: Path, variable: str | None = None) -> StoreRecord | CompressedRecord:
+    """Read an .npz; MemoryLimitError or FileError before an array that does not fit is allocated."""
+    headers = _headers(path)
+    with np.load(path, allow_pickle=False) as archive:
+
+        def load(name: str) -> np.ndarray:
+            array = archive[name]
+            if array.dtype.kind in "SU" and array.size == 1:
+                return array.astype(str).reshape(())
+            native = array.dtype.newbyteorder("=")
+            return np.asarray(checks.real(f"array {name!r}", array), native)
+
+        layout = str(load("format")) if "format" in headers else None
+        if layout in (COMPRESSED_FORMAT, INVERSE_FORMAT):
+            arrays = {name: load(name) for name in headers if name != "format"}
+            return CompressedRecord(arrays, layout)
+
+        shapes = {}
+        for name, (shape, dtype) in headers.items():
+            if dtype.kind in "fiubc" or name.startswith("noise_"):
+                shapes[name] = shape
+        matrices: dict[str, Any] = {}
+        if layout is not None and variable is None:
+            matrices = _sparse_matrices(path, layout, headers, load)
+        shapes |= dict.fromkeys(matrices, (1, 1))
+
+        def load_member(name: str) -> Any:
+            if name in matrices:
+                return matrices[name]
+            return load(name)
+
+        return assemble(shapes, load_member, variable)
+
+
+def _sparse_matrices(
+    path: Path, layout: str, headers: Headers, load: Callable[[str], np.ndarray]
+) -> dict[str, scipy.sparse.csr_array]:
+    """One sparse matrix in a layout of SciPy, or three channels."""
+    if "shape" not in headers:
+        raise FileError(f"array 'format' is {layout!r:.60}, which is unknown")
+    shape = checks.grid("array 'shape'", load("shape").tolist())
+    for name, (_, dtype) in headers.items():
+        # SciPy would truncate other numbers.
+        if name.startswith(INDEX_ARRAYS) and dtype.kind not in "iu":
+            raise FileError(f"array {name!r} holds {dtype}; it must hold integers")
+    entries = path.stat().st_size // ENTRY_BYTES
+    if layout != RGB_FORMAT:
+        return {"T": sparse_floats(lambda: scipy.sparse.load_npz(path), shape, entries)}
+
+    matrices = {}
+    for number, channel in enumerate(CHANNELS):
+        csr = tuple(load(f"{name}_{number}") for name in CSR)
+
+        def make(csr: Any = csr) -> scipy.sparse.csr_array:
+            return scipy.sparse.csr_array(csr, shape=shape)
+
+        matrices[channel] = sparse_floats(make, shape, entries)
+    return matrices
+
+
+def _headers(path: Path) -> Headers:
+    """Shape and type of each array by name, after they were compared with the sizes that are stored."""
+    headers: Headers = {}
+    file_size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            name = info.filename.removesuffix(".npy")
+            with archive.open(info) as stream:
+                is_version_1 = np.lib.format.read_magic(stream) == (1, 0)
+                if is_version_1:
+                    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+                else:
+                    shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+                stored = info.file_size - stream.tell()
+            most = EXPANSION * min(info.compress_size, file_size)
+            check_declared(f"array {name!r}", dtype, shape, min(stored, most), stored)
+            headers[name] = (shape, dtype)
+    return headers
+
+
+def write_npz(path: Path, record: StoreRecord | CompressedRecord) -> None:
+    """Write everything in `record`."""
+    arrays: Mapping[str, Any]
+    if isinstance(record, CompressedRecord):
+        arrays = {"format": record.format, **record.arrays}
+    elif record.dense:
+        arrays = record.arrays()
+    else:
+        arrays = record.arrays() | _sparse_arrays(record)
+    np.savez(path, **arrays)
+
+
+def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:
+    """Arrays of one sparse matrix as SciPy writes them, or of three channels."""
+    is_grey = len(record.matrices) == 1
+    arrays: dict[str, Any] = {
+        "format": np.array(b"csr") if is_grey else RGB_FORMAT,
+        "_is_array": True,  # SciPy makes a csr_array of it
+        "shape": record.shape,
+    }
+    for number, matrix in enumerate(record.matrices):
+        ending = "" if is_grey else f"_{number}"
+        for name in CSR:
+            arrays[name + ending] = getattr(matrix, name)
+    return arrays
+
+
+def read_npy(path: Path) -> StoreRecord:
+    """Read a dense matrix, or map it where memory has no room for two of it."""
+    mapped = np.lib.format.open_memmap(path, "r")  # reads the header and allocates nothing
+    has_room = 2 * mapped.nbytes <= checks.host_memory()
+
+    def load(name: str) -> np.ndarray:
+        return np.array(mapped) if has_room else mapped
+
+    return assemble({"T": mapped.shape}, load)
+
+
+def write_npy(path: Path, record: StoreRecord) -> None:
+    """Write the dense matrices of `record`, (M, N) or (3, M, N)."""
+    if not record.dense:
+        raise InputError("T is sparse, and .npy holds dense arrays only; save it as .npz")
+    np.save(path, record.arrays()["T"], allow_pickle=False)

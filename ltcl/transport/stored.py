@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Plain arrays of a compressed transport T = S diag(d), for files and pickles.
+
+grid             (2,)                  height and width
+first_bounce     (channels, N)         F
+columns_c        (N,)                  d of channel c, where it differs from F
+mixing           (3, 3)                optional
+noise_...                              as `Noise.to_arrays` has them, optional
+all others                             S of each channel, see `ltcl.operators.stored`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ltcl.device import Device
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import ScaledColumns
+from ltcl.operators import stored as stored_operators
+from ltcl.operators.interreflection import underlying_system
+
+if TYPE_CHECKING:
+    from ltcl.transport.transport import Transport
+
+
+def to_arrays(T: Transport) -> dict[str, np.ndarray]:
+    """The arrays of a compressed T, S diag(d) in each channel."""
+    systems = []
+    for matrix in T.matrices:
+        S = underlying_system(matrix)
+        if S is not None:
+            systems.append(S)
+    if not T.is_square or len(systems) < T.channels:
+        kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
+        raise InputTypeError(
+            f"T is made of {kinds}; only arrays, sparse matrices and S diag(F) are stored"
+        )
+    F = np.atleast_2d(T.first_bounce)
+    arrays = {"grid": np.array(T.grid), "first_bounce": F}
+    if T.mixing is not None:
+        arrays["mixing"] = T.mixing
+    if T.measured_noise is not None:
+        arrays |= T.measured_noise.to_arrays()
+    for channel, (matrix, f) in enumerate(zip(T.matrices, F, strict=True)):
+        if not np.array_equal(matrix.d, f):
+            arrays[f"columns_{channel}"] = np.asarray(matrix.d, np.float64)
+    return arrays | stored_operators.to_arrays(systems)
+
+
+def matrices_from_arrays(
+    arrays: Mapping[str, np.ndarray], device: Device
+) -> tuple[ScaledColumns, ...]:
+    """S diag(d) of each channel, uploaded."""
+    F = arrays["first_bounce"]
+    systems = stored_operators.from_arrays(device, arrays)
+    if len(systems) != len(F):
+        raise InputError(
+            f"first_bounce has {len(F)} channels, but there are {len(systems)} operators"
+        )
+    matrices = []
+    for channel, S in enumerate(systems):
+        d = arrays.get(f"columns_{channel}", F[channel])
+        matrices.append(ScaledColumns(S, d))
+    return tuple(matrices)

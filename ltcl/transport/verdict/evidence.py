@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Numbers that a measured T gives about its noise and its damages, computed on the host.
+
+Errors by noise are those of `ltcl.transport.uncertainty`, for the picture under white, a plain
+picture under its pattern, and bounces 1 to 3 under white,
+
+    b_k = A b_(k-1) = b_(k-1) - S^-1 b_(k-1),    b_0 = F
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ltcl.transport import diagnostics
+from ltcl.transport.covariance import channel_matrices
+from ltcl.transport.first_bounce import ENTRIES
+from ltcl.transport.transport import Transport
+from ltcl.transport.uncertainty import bounce_variances
+from ltcl.transport.verdict.colours import exchanged_colours
+from ltcl.transport.verdict.host_system import HostErrors, HostSystem
+from ltcl.transport.verdict.row_sample import RowSample
+
+# Fewer pixels tell neither parts of the picture nor noise.
+MIN_PIXELS = 64
+# Median of |x| to the standard deviation of normal x.
+MEDIAN_PER_STD = 0.6745
+# Factor of a standard deviation that was estimated.
+NOISE_MARGIN = 1.5
+# Share of pixels that a plain picture reaches.
+REACHED_SHARE = 0.9
+# Noise of indirect light, relative to it, from which on a drift is not seen.
+MAX_DRIFT_NOISE = 0.3
+MIN_LIGHT = 1e-300
+
+
+class Measure(NamedTuple):
+    """A number about T, and a place in the picture in words, perhaps empty."""
+
+    name: str
+    value: float
+    place: str = ""
+
+
+class Evidence:
+    """T with its matrices and S on the host, and the numbers they give."""
+
+    def __init__(self, T: Transport) -> None:
+        self.T = T
+        self.noise = T.noise
+        self.matrices = []
+        for matrix in T.matrices:
+            # Rows of a store become a matrix in memory.
+            is_stored = hasattr(matrix, "row_blocks")
+            self.matrices.append(matrix.tocsr() if is_stored else matrix)
+        self.systems: list[HostSystem] = []
+        if T.is_square:
+            F = np.atleast_2d(T.first_bounce)
+            for channel, matrix in enumerate(self.matrices):
+                self.systems.append(HostSystem(matrix, F[channel]))
+        self.errors = HostErrors(T, self.matrices, self.systems)
+
+    def measures(self) -> Iterator[Measure]:
+        """Numbers of the whole T, and of each channel."""
+        T = self.T
+        yield Measure("no_bounces", not T.is_square)
+        yield from self._measure_order()
+        for channel in range(T.channels):
+            yield from self._measure_pictures(channel)
+            if self._shows_damages(channel):
+                yield from self._measure_damages(channel)
+        if T.is_square:
+            yield from self._measure_bounces()
+            place = describe_place(T.grid, np.flatnonzero(T.masked))
+            yield Measure("dark", T.masked.mean(), place)
+
+    def _shows_damages(self, channel: int) -> bool:
+        """Whether the entries of a channel are read, and are enough."""
+        has_entries = isinstance(self.matrices[channel], ENTRIES)
+        return self.T.is_square and has_entries and len(self.T.masked) >= MIN_PIXELS
+
+    def _measure_order(self) -> Iterator[Measure]:
+        """Another grid, and exchanged colours."""
+        T = self.T
+        if T.is_square:
+            grid = diagnostics.other_grid(self.matrices[0], T.grid)
+            if grid is not None:
+                yield Measure("other_grid", 1.0, f"{grid[0]}x{grid[1]}")
+        exchanged = exchanged_colours(T)
+        yield Measure("exchanged", len(exchanged), ", ".join(exchanged))
+
+    # Errors by noise.
+
+    def _measure_pictures(self, channel: int) -> Iterator[Measure]:
+        """Error of the picture under white, and of a plain picture."""
+        matrices: list[Any] = [self.matrices[channel]]
+        if self.T.blocks is not None:
+            matrices = list(channel_matrices(self.T, channel))
+        N = self.T.shape[1]
+        pattern = np.ones(N, np.float32)
+        white = np.sum([matrix @ pattern for matrix in matrices], axis=0)
+        deviation = self.errors.deviation(channel, np.ones(N * len(matrices)))
+        yield self._relative_error("pictures", channel, white, deviation)
+        if self.T.is_square:
+            yield from self._measure_plain_picture(channel, white)
+
+    def _measure_plain_picture(self, channel: int, white: np.ndarray) -> Iterator[Measure]:
+        """Error and gain of a plain picture, as bright as nine tenths of the pixels can be."""
+        S = self.systems[channel]
+        is_lit = S.F > 0
+        plain = np.sign(S.F)
+        light = S.inverse_F * S.solve(plain[:, None])[:, 0]
+        needed = float(np.quantile(light[is_lit], REACHED_SHARE))
+        gain = 1.0 / max(needed, 1e-6 * float(np.abs(light).max()), 1e-30)
+        median_white = float(np.median(white[is_lit]))
+        yield Measure("gain", gain / max(median_white, MIN_LIGHT))
+        pattern = np.clip(gain * light, 0.0, 1.0)
+        deviation = self.errors.deviation(channel, pattern)
+        yield self._relative_error("pictures", channel, gain * plain, deviation)
+
+    def _measure_bounces(self) -> Iterator[Measure]:
+        """Errors of bounces 1 to 3 under white."""
+        random = np.random.default_rng(0)
+        for channel, S in enumerate(self.systems):
+            bounces = [S.F]
+            for _ in range(3):
+                b = bounces[-1]
+                bounces.append(b - S.solve(b[:, None])[:, 0])
+            columns = np.stack(bounces, axis=-1)[:, None, :]
+            variances = bounce_variances(self.errors, channel, columns, random)
+            deviations = np.sqrt(np.maximum(variances[:, 0], 0.0))
+            for k in (1, 2, 3):
+                error = self._relative_error(f"bounce_{k}", channel, bounces[k], deviations[:, k])
+                yield error
+                yield error._replace(name="bounces")
+
+    def _relative_error(
+        self, name: str, channel: int, light: np.ndarray, deviation: np.ndarray
+    ) -> Measure:
+        """Relative error of a picture (M,) and the place where it is largest; NaN if not finite."""
+        F = np.ones(len(light))
+        if self.T.is_square:
+            F = self.systems[channel].F
+        light = np.where(F > 0, light, 0.0)
+        deviation = np.where(F > 0, deviation, 0.0)
+        doubt = deviation / np.maximum(np.abs(light), MIN_LIGHT)
+        doubtful = np.flatnonzero(doubt > 2.0 * np.median(doubt))
+        place = describe_place(self.T.camera_grid, doubtful, F)
+        if not np.isfinite(light).all():
+            return Measure(name, math.nan, place)
+        norm = float(np.linalg.norm(light))
+        if norm == 0.0:
+            norm = 1.0
+        return Measure(name, float(np.linalg.norm(deviation)) / norm, place)
+
+    # Damages.
+
+    def _measure_damages(self, channel: int) -> Iterator[Measure]:
+        grid = self.T.grid
+        S = self.systems[channel]
+        yield Measure("ambient", diagnostics.ambient(S.solve, grid))
+        yield Measure("flicker", self._drift(channel))
+        sample = RowSample(self.T, S, channel)
+        share, move = sample.shifted()
+        yield Measure("shifted", share, move)
+        hot = sample.hot_pixels()
+        yield Measure("hot_rows", len(hot), describe_place(grid, hot))
+        entries, saturated = sample.saturated_entries()
+        yield Measure("saturated", entries, describe_place(grid, saturated))
+        yield Measure("offset", sample.negative_offset())
+        share, outliers = sample.outliers()
+        yield Measure("outliers", share, describe_place(grid, outliers))
+        yield Measure("irreciprocal", self._irreciprocity(channel, sample))
+
+    def _drift(self, channel: int) -> float:
+        """Relative change of smooth light from column to column, beyond noise."""
+        S = self.systems[channel]
+        ones = np.ones(self.T.shape[1])
+        deviation = self.errors.deviation(channel, ones)
+        direct_deviation = self.noise.diagonal(self.T.first_bounce)[channel]
+        is_lit = S.F > 0
+        # Bounced light under white, in units of F.
+        indirect = np.maximum((S.T @ ones - S.T.diagonal()) * S.inverse_F, 1e-30)
+        logs = np.log(np.where(is_lit, indirect, np.nan)).reshape(self.T.grid)
+        detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0
+        doubt = np.hypot(deviation / indirect, direct_deviation + direct_deviation / indirect)
+        noise = NOISE_MARGIN * np.median(doubt[is_lit] * S.inverse_F[is_lit])
+        if not noise < MAX_DRIFT_NOISE:
+            return 0.0
+        # One 0, so that the median exists.
+        known = np.append(detail[np.isfinite(detail)], 0.0)
+        change = float(np.median(np.abs(known))) / MEDIAN_PER_STD
+        return math.sqrt(max(change**2 - noise**2, 0.0))
+
+    def _irreciprocity(self, channel: int, sample: RowSample) -> float:
+        """The defect of reciprocity beyond that of noise, both of F^-1/2 R F^1/2."""
+        S = self.systems[channel]
+        direct_deviation = self.noise.diagonal(self.T.first_bounce)[channel]
+        variances = self.errors.variance(channel, S.inverse_F[:, None])[:, 0]
+        direct = np.sum((direct_deviation * S.inverse_F) ** 2)
+        share = len(sample.pixels) / len(S.F)
+        noise_power = float(S.inverse_F @ variances - direct) * share
+        power = sample.scaled_power(S.inverse_F)
+        expected = min(NOISE_MARGIN**2 * noise_power / max(power, MIN_LIGHT), 1.0)
+        defect = diagnostics.reciprocity_defect(S.T, S.F, entries=diagnostics.QUICK_ENTRIES)
+        return math.sqrt(max(defect**2 - expected, 0.0))
+
+
+def describe_place(grid: tuple[int, int], pixels: np.ndarray, F: np.ndarray | None = None) -> str:
+    """The part of the picture where `pixels` lie, in words; dark if F (N,) is less there."""
+    height, width = grid
+    if not 0 < len(pixels) < 0.6 * height * width:
+        return ""
+    y = np.mean(pixels // width + 0.5) / height
+    x = np.mean(pixels % width + 0.5) / width
+    words = []
+    if F is not None and np.median(F[pixels]) < 0.7 * np.median(F[F > 0]):
+        words.append("dark")
+    if y < 0.4:
+        words.append("upper")
+    if y > 0.6:
+        words.append("lower")
+    if x < 0.4:
+        words.append("left")
+    if x > 0.6:
+        words.append("right")
+    if not words:
+        return ""
+    return f" in the {' '.join(words)} part"
