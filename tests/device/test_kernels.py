@@ -14,22 +14,22 @@ import pyopencl as cl
 import pytest
 from pyopencl import _cl
 
-from ltcl.device import kernels, vectors
+from ltcl.device import sources, vectors
 from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
 
 TWINS = (Path(__file__).parents[1] / "reference.py").read_text(encoding="utf-8")
-FILES = sorted(path.stem for path in kernels.folder().glob("*.cl"))
+FILES = sorted(path.stem for path in sources.folder().glob("*.cl"))
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_every_kernel_has_a_twin_and_every_line_its_mark(name):
-    file, number, seen, text = "", 0, [], kernels.load(name)
+    file, number, seen, text = "", 0, [], sources.load(name)
     for line in text.splitlines():
         mark = re.fullmatch(r'#line (\d+) "(.+)"', line)
         if mark:
             number, file = int(mark[1]), mark[2]
             continue
-        assert (kernels.folder() / file).read_text().splitlines()[number - 1] == line
+        assert (sources.folder() / file).read_text().splitlines()[number - 1] == line
         seen.append((file, number))
         number += 1
     assert len(set(seen)) == len(seen)  # each include comes once
@@ -40,13 +40,28 @@ def test_every_kernel_has_a_twin_and_every_line_its_mark(name):
         )
 
 
+DEFINES = {"K": 2, "STRIP": 2, "WIDTH": 8, "PLACE": "int", "VALUES": 2, "TAPS": 4, "PAIRS": 1}
+HEADER = "common/lanes.h"
+DEFINES |= {"LANES": 8, "BLOCKS": 1, "CHUNK": 2, "WALKS": 2, "CHANNELS": 2, "LINKED": 1}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_compiler_reads_the_files_as_they_are(device, name):
+    """Editors and offline compilers, too: headers have guards, and name each other by place."""
+    path = sources.folder() / f"{name}.cl"
+    text = "\n".join(f'#include "{header.as_posix()}"' for header in (path.parent / HEADER, path))
+    options = [f"-D{define}={value}" for define, value in DEFINES.items()]
+    program = cl.Program(device.context, text).build([*sources.OPTIONS, *options])
+    assert f"{name}_" in program.kernel_names
+
+
 @pytest.fixture
 def own_kernels(tmp_path, monkeypatch):
     """A folder of kernels in which a test writes its own."""
-    monkeypatch.setattr(kernels, "folder", lambda: tmp_path)
-    kernels.load.cache_clear()
+    monkeypatch.setattr(sources, "folder", lambda: tmp_path)
+    sources.load.cache_clear()
     yield tmp_path
-    kernels.load.cache_clear()
+    sources.load.cache_clear()
 
 
 def test_messages_name_file_line_and_defines(device, own_kernels):
@@ -76,7 +91,7 @@ def test_missing_and_wrong_defines_and_names_are_refused(device, file):
 
 def test_a_program_is_built_once(small_device, monkeypatch):
     small_device.kernel("vector", "vector_fill")
-    monkeypatch.setattr(kernels, "build", lambda *_: pytest.fail("built again"))
+    monkeypatch.setattr(sources, "build", lambda *_: pytest.fail("built again"))
     small_device.kernel("vector", "vector_axpby")
 
 
