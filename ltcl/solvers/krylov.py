@@ -8,6 +8,7 @@ BiCGStab, 6.11 for restarted GMRES. Coefficients of CG and BiCGStab stay on the 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -123,7 +124,9 @@ class _CGIteration:
             x=x,
             r=r,
         )
-        self.launches = [system.S.bind(r, w), dots, self.update, self._keep_direction]
+        # Not a method of this object: device memory is freed by reference counting alone.
+        keep_direction = functools.partial(self.update.set, restart=0)
+        self.launches = [system.S.bind(r, w), dots, self.update, keep_direction]
 
     def _upload_weights(self, weights: Any) -> Array:
         """Upload the weights in units of the largest one, repeated for all columns."""
@@ -133,9 +136,6 @@ class _CGIteration:
         shape = (-1, *[1] * (len(r.shape) - 1))
         relative = (weights / weights.max()).reshape(shape)
         return r.device.upload(np.broadcast_to(relative, r.shape))
-
-    def _keep_direction(self) -> None:
-        self.update.set(restart=0)
 
     def run(self) -> None:
         """Take steps until the monitor ends the solve, or no column has a next step."""
