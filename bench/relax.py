@@ -19,7 +19,7 @@ from _harness import Options, Row, options, product, report, seconds
 from csr import matrix
 from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.operators.relaxation import Sweeps, relaxation
-from ltcl.solvers.stationary import BlockGaussSeidel
+from ltcl.solvers.relaxation import BlockGaussSeidel
 
 PRODUCT_TARGET = 1 / 1.1  # a sweep takes at most 1.1 times one product
 PYAMG_TARGETS = {"runs of 16": 2.4, "random": 1.4}  # times faster; PyAMG's own limit is the product

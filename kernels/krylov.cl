@@ -11,48 +11,38 @@
 // Layout: vectors are (rows, k). `state` holds k columns by rows, which have names below: two
 // copies of COPY_ROWS numbers, of which a step reads one, by parity, and writes the other, as
 // groups that start late still read; then what BiCGStab keeps; from STATE_ROWS on partial sums of
-// squared residuals of RESIDUAL_SLOTS steps. ltcl/solvers/krylov.py reads the same state.
+// squared residuals of RESIDUAL_SLOTS steps. ltcl/solvers/krylov_state.py has the rows.
 
 #include "common/columns.h"
 
-#ifndef STATE_ROWS
-#define STATE_ROWS 16
+// The rows and phases below come from ltcl/solvers/krylov_state.py, which reads the same state.
+#if !defined(STATE_ROWS) || !defined(RESIDUAL_SLOTS) || !defined(COPY_ROWS)
+#error "krylov.cl needs -DSTATE_ROWS, -DRESIDUAL_SLOTS, -DCOPY_ROWS: the layout of the state"
 #endif
-#ifndef RESIDUAL_SLOTS
-#define RESIDUAL_SLOTS 8
+// Rows of a copy: <r, r>, alpha, and 1 where there was no positive curvature.
+#if !defined(CG_SQUARE) || !defined(CG_ALPHA) || !defined(CG_INDEFINITE)
+#error "krylov.cl needs -DCG_SQUARE, -DCG_ALPHA, -DCG_INDEFINITE: rows of a copy"
 #endif
-#define COPY_ROWS 4
-
-// Rows of a copy: CG.
-#define CG_SQUARE 0  // <r, r>
-#define CG_ALPHA 1
-#define CG_INDEFINITE 2  // 1 where there was no positive curvature
-// Rows of a copy: BiCGStab.
-#define BICGSTAB_RHO 0
-#define BICGSTAB_PHASE 1
-// Rows of the state: BiCGStab.
-#define BICGSTAB_ALPHA 8
-#define BICGSTAB_SHADOW 9  // |r*|^2
-#define BICGSTAB_AGAINST \
-    10  // the square that <r*, v> is compared with: |S^T r*|^2 with |p|^2, or
-        // |r*|^2 with |v|^2
-
-// Phases of a column of BiCGStab.
-#ifndef PHASE_MOVES
-#define PHASE_MOVES 0.0f
-#define PHASE_FRESH 1.0f   // started anew with r* = p = r, and made no step since
-#define PHASE_WAITS 2.0f   // to be started anew by the host
-#define PHASE_BROKEN 3.0f  // even a fresh start has no step
+// Rows of a copy: rho and the phase. Rows of the state: alpha; |r*|^2; and the square that <r*, v>
+// is compared with: |S^T r*|^2 with |p|^2, or |r*|^2 with |v|^2.
+#if !defined(BICGSTAB_RHO) || !defined(BICGSTAB_PHASE) || !defined(BICGSTAB_ALPHA) || \
+    !defined(BICGSTAB_SHADOW) || !defined(BICGSTAB_AGAINST)
+#error "krylov.cl needs -DBICGSTAB_RHO, _PHASE, _ALPHA, _SHADOW, _AGAINST: rows of the state"
+#endif
+// Phases of a column, real numbers: it moves; restarted with r* = p = r and made no step since;
+// waits for a restart by the host; has no step even after a restart.
+#if !defined(PHASE_MOVES) || !defined(PHASE_FRESH) || !defined(PHASE_WAITS) || !defined(PHASE_BROKEN)
+#error "krylov.cl needs -DPHASE_MOVES, -DPHASE_FRESH, -DPHASE_WAITS, -DPHASE_BROKEN"
 #endif
 
 // 2^-20, a cosine: below it a float32 inner product is rounding.
 #define ORTHOGONAL 9.5367431640625e-7f
 
-// Of column j, in the copy that `step` reads.
-#define IN_COPY(step, row) state[(((step) & 1) * COPY_ROWS + (row)) * k + s.origin + j]
+// Of column j, in the copy that `iteration` reads.
+#define IN_COPY(iteration, row) state[(((iteration) & 1) * COPY_ROWS + (row)) * k + s.origin + j]
 #define IN_STATE(row) state[((row) * k) + s.origin + j]
 #define SQUARES_ROW \
-    (STATE_ROWS + step % RESIDUAL_SLOTS * (int)get_num_groups(0) + (int)get_group_id(0))
+    (STATE_ROWS + iteration % RESIDUAL_SLOTS * (int)get_num_groups(0) + (int)get_group_id(0))
 
 // A denominator beyond float32 gives NaN, which the residual tells, not a step of 0.
 static inline real divided(real a, real b)
@@ -119,7 +109,7 @@ kernel void krylov_cg(
     int rows,                     // rows of the vectors
     int k,                        // right-hand sides
     int slices,                   // of the partial sums
-    int step,                     // number of the step
+    int iteration,                // number of the step
     int restart,                  // 1: forgets p and q
     global const int *resting,    // [k], 1 where a column rests
     global const real *partials,  // <r, r> and <w, r>, (slices, 2, k)
@@ -136,8 +126,8 @@ kernel void krylov_cg(
     local real *betas = alphas + s.width;
     EACH_COLUMN(j) {
         const real square = alphas[j], product = betas[j];
-        const real previous = IN_COPY(step, CG_SQUARE), last = IN_COPY(step, CG_ALPHA);
-        real broken = IN_COPY(step, CG_INDEFINITE);
+        const real previous = IN_COPY(iteration, CG_SQUARE), last = IN_COPY(iteration, CG_ALPHA);
+        real broken = IN_COPY(iteration, CG_INDEFINITE);
         bool moves = !resting[s.origin + j] && !(broken > 0);
         real beta = !restart && previous > 0 ? square / previous : 0;
         real curvature = beta == 0 ? product : product - beta * square / last;
@@ -151,9 +141,9 @@ kernel void krylov_cg(
         moves = moves && square != 0 && !(broken > 0);
         const real alpha = divided(square, curvature);
         if (get_group_id(0) == 0) {
-            IN_COPY(step + 1, CG_SQUARE) = moves ? square : previous;
-            IN_COPY(step + 1, CG_ALPHA) = moves ? alpha : last;
-            IN_COPY(step + 1, CG_INDEFINITE) = broken;
+            IN_COPY(iteration + 1, CG_SQUARE) = moves ? square : previous;
+            IN_COPY(iteration + 1, CG_ALPHA) = moves ? alpha : last;
+            IN_COPY(iteration + 1, CG_INDEFINITE) = broken;
         }
         alphas[j] = moves ? alpha : 0;
         betas[j] = beta;
@@ -182,7 +172,7 @@ kernel void krylov_half(
     int rows,                     // rows of the vectors
     int k,                        // right-hand sides
     int slices,                   // of the partial sums
-    int step,                     // number of the step
+    int iteration,                // number of the step
     global const real *partials,  // <r*, v> and the square that it is compared with, (slices, 2, k)
     global real *state,           // see above
     global const real *r,         // residual, (rows, k)
@@ -196,9 +186,9 @@ kernel void krylov_half(
         const real sigma = totals[j], square = totals[s.width + j];
         const bool lost =
             fabs(sigma) <= ORTHOGONAL * sqrt(square) * sqrt(IN_STATE(BICGSTAB_AGAINST));
-        const bool moves = IN_COPY(step, BICGSTAB_PHASE) <= PHASE_FRESH
+        const bool moves = IN_COPY(iteration, BICGSTAB_PHASE) <= PHASE_FRESH
                            && !(lost && isfinite(square) && isfinite(sigma));
-        totals[j] = moves ? divided(IN_COPY(step, BICGSTAB_RHO), sigma) : 0;
+        totals[j] = moves ? divided(IN_COPY(iteration, BICGSTAB_RHO), sigma) : 0;
         if (get_group_id(0) == 0)
             IN_STATE(BICGSTAB_ALPHA) = totals[j];
     }
@@ -213,7 +203,7 @@ kernel void krylov_bicgstab(
     int rows,                     // rows of the vectors
     int k,                        // right-hand sides
     int slices,                   // of the partial sums
-    int step,                     // number of the step
+    int iteration,                // number of the step
     global const real *partials,  // <t, s>, <t, t>, <r*, s>, <r*, t> and <s, s>, (slices, 5, k)
     global real *state,           // see above
     global real *next_partials,   // gets <g, p> and <p, p> of the next step, (slices, 2, k)
@@ -231,7 +221,7 @@ kernel void krylov_bicgstab(
     local real *alphas = totals, *omegas = totals + s.width, *betas = totals + 2 * s.width;
     EACH_COLUMN(j) {
         const real ts = totals[j], tt = totals[s.width + j], ss = totals[4 * s.width + j];
-        const real alpha = IN_STATE(BICGSTAB_ALPHA), phase = IN_COPY(step, BICGSTAB_PHASE);
+        const real alpha = IN_STATE(BICGSTAB_ALPHA), phase = IN_COPY(iteration, BICGSTAB_PHASE);
         const real omega = alpha == 0 || tt == 0 ? 0 : divided(ts, tt);
         const real rho = totals[2 * s.width + j] - omega * totals[3 * s.width + j];
         const real square = ss - omega * (2 * ts - omega * tt);  // |r|^2, or about that
@@ -243,13 +233,13 @@ kernel void krylov_bicgstab(
         if (!(phase <= PHASE_FRESH))
             next_phase = phase;
         if (get_group_id(0) == 0) {
-            IN_COPY(step + 1, BICGSTAB_RHO) = rho;
-            IN_COPY(step + 1, BICGSTAB_PHASE) = next_phase;
+            IN_COPY(iteration + 1, BICGSTAB_RHO) = rho;
+            IN_COPY(iteration + 1, BICGSTAB_PHASE) = next_phase;
         }
         alphas[j] = alpha;
         omegas[j] = omega;
         const bool moves = next_phase == PHASE_MOVES;
-        betas[j] = moves ? rho / IN_COPY(step, BICGSTAB_RHO) * (alpha / omega) : 0;
+        betas[j] = moves ? rho / IN_COPY(iteration, BICGSTAB_RHO) * (alpha / omega) : 0;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     const real alpha = alphas[s.column], omega = omegas[s.column], beta = betas[s.column];

@@ -7,13 +7,12 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.device import Array, Device
-from ltcl.operators import CSR, Compressed, Dense
-from ltcl.operators.base import Epilogue
+from ltcl.operators import CSR, Compressed, Dense, Epilogue
 from ltcl.operators.bases import Basis
 
 
 class Given(Basis):
-    """W of any matrix (M, N)."""
+    """A basis W from any matrix (M, N)."""
 
     def __init__(self, device: Device, matrix: np.ndarray) -> None:
         self._on_device = Dense(device, matrix)
@@ -22,8 +21,10 @@ class Given(Basis):
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
         self.isometric = bool(np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5))
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        self._on_device._product(x, out, epilogue, transpose)
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
+        self._on_device._queue_product(x, out, Epilogue(a, b, y), transpose)
 
 
 def rotation(n: int, seed: int = 0) -> np.ndarray:
@@ -40,7 +41,10 @@ def two_sided(device: Device, R: np.ndarray, keep: float = 1.0, seed: int = 0) -
 
 
 def stands_for(R: Compressed) -> np.ndarray:
-    """The float64 matrix of it, (M, N), and so the truth that its products are rounded from."""
-    C = R.core.to_dense()
-    C = C if R.out is None else R.out.matrix.T @ C  # pyright: ignore[reportAttributeAccessIssue]
-    return C if R.into is None else C @ R.into.matrix  # pyright: ignore[reportAttributeAccessIssue]
+    """The float64 matrix (M, N) of it, from which its products are rounded."""
+    matrix = R.core.to_dense()
+    if isinstance(R.out, Given):
+        matrix = R.out.matrix.T @ matrix
+    if isinstance(R.into, Given):
+        matrix = matrix @ R.into.matrix
+    return matrix

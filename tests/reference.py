@@ -370,20 +370,24 @@ def vector_dots(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray)
 def krylov_subtract(V, w, h, square: np.ndarray | None = None) -> np.ndarray:
     """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
     left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
-    return (
-        left
-        if square is None
-        else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
-    )
+    if square is None:
+        return left
+    squares_of_h = np.sum(h.astype(np.float64) ** 2, axis=0)
+    return left / np.sqrt(square - squares_of_h)
 
 
 def krylov_cg(sums, previous, last, moves, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """alpha (k,), then p, q, x and r after a step, of w, p, q, x and r before; sums <r, r> and <w, r>."""
-    (square, product), (w, p, q, x, r) = sums, (v.astype(np.float64) for v in vectors)
+    """alpha (k,), then p, q, x and r after a step.
+
+    `sums` are <r, r> and <w, r>, `vectors` w, p, q, x and r before the step.
+    """
+    square, product = sums
+    w, p, q, x, r = _float64(*vectors)
     beta = square / previous
     alpha = square / (product - beta * square / last)
-    p, q = np.where(moves, r + beta * p, p), np.where(moves, w + beta * q, q)
     alpha = np.where(moves, alpha, 0.0)
+    p = np.where(moves, r + beta * p, p)
+    q = np.where(moves, w + beta * q, q)
     return alpha, p, q, x + alpha * p, r - alpha * q
 
 
@@ -393,13 +397,19 @@ def krylov_half(rho: np.ndarray, sigma: np.ndarray, r: np.ndarray, v: np.ndarray
 
 
 def krylov_bicgstab(sums, rho, alpha, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The next rho (k,), then x, r and p of s, t, v, p and x; sums <t, s>, <t, t>, <r*, s> and <r*, t>."""
-    (ts, tt, shadow_s, shadow_t), (s, t, v, p, x) = sums, (u.astype(np.float64) for u in vectors)
+    """The next rho (k,), then x, r and p.
+
+    `sums` are <t, s>, <t, t>, <r*, s> and <r*, t>, `vectors` s, t, v, p and x.
+    """
+    ts, tt, shadow_s, shadow_t = sums
+    s, t, v, p, x = _float64(*vectors)
     omega = ts / tt
-    following = shadow_s - omega * shadow_t
+    next_rho = shadow_s - omega * shadow_t
     r = s - omega * t
-    beta = following / rho * alpha / omega
-    return following, x + alpha * p + omega * s, r, r + beta * (p - omega * v)
+    beta = next_rho / rho * alpha / omega
+    x = x + alpha * p + omega * s
+    p = r + beta * (p - omega * v)
+    return next_rho, x, r, p
 
 
 def bounded_look(lower, upper, x, g, h) -> np.ndarray:

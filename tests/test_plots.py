@@ -18,7 +18,14 @@ from ltcl.solvers import Solution, Status
 
 def solution(method: str, residuals: tuple[float, ...], products: int) -> Solution:
     status = Status.CONVERGED if residuals[-1] < 1e-2 else Status.DIVERGED
-    return Solution(np.zeros(1), status, len(residuals) - 1, products, residuals, 0.0, method)
+    return Solution(
+        x=np.zeros(1),
+        status=status,
+        iterations=len(residuals) - 1,
+        products=products,
+        residuals=residuals,
+        method=method,
+    )
 
 
 SOLUTIONS = {

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From photographs to a transport: what drives projectors and cameras, and what their pictures say.
+"""Measure a transport by photographs: rigs, calibration, scans.
 
-task         acquire and finalize, by a `rig`: virtual, rendered, photographed by a person, on a
-cable (rigs/) calibrate    what is measured once (`session`, radiometry/, geometry/); its record,
-`calibration` scanning/    which pixels are lit when, and T from the pictures; plan before, report
-after agreement    photographs that deviate from what others show are refused by number; `anchor`:
-did it move? project      an acquisition as a folder with an acquisition.toml
+    task          acquire and finalize, with the `settings` of a scan, by a `rig`: virtual,
+                  rendered, photographed by a person, on a cable (rigs/)
+    calibrate     facts that are measured once (`exposure`, `session`, radiometry/, geometry/), and
+                  their checks (`consistency`); its record, `calibration`
+    scanning/     patterns in order, and T from the pictures; a plan before, a report after
+    agreement     photographs that deviate from the others are refused by number; `anchor`: did
+                  anything move?
+    project       an acquisition as a folder with an acquisition.toml
 
-Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
+Codes in [0, 1] are fed to a projector and come from a camera; they are not linear in light.
 """
 
 from __future__ import annotations
@@ -33,20 +36,20 @@ from ltcl.acquisition.task import acquire, finalize
 __all__ = [
     "Calibration",
     "Correspondence",
-    "Project",
-    "Report",
-    "Rig",
-    "ScanSettings",
-    "Setup",
-    "Shots",
-]
-__all__ += [
     "Display",
     "FolderRig",
     "GPhoto2Camera",
     "LiveRig",
     "MitsubaRig",
     "OpenCVCamera",
+    "Project",
+    "Report",
+    "Rig",
+    "ScanSettings",
+    "Setup",
+    "Shots",
     "VirtualRig",
+    "acquire",
+    "camera_map",
+    "finalize",
 ]
-__all__ += ["acquire", "camera_map", "finalize"]

@@ -1,287 +1,472 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Whether photographs show the light that is already known, in units of the noise of the camera.
+"""Test whether photographs show the light that is already known, in units of the camera's noise.
 
-Of linear values x_k above black after t_k seconds under one pattern, of variance v_k, each
+Linear values x_k above black after t_k seconds under one pattern have variances v_k. Each
 photograph is compared with the radiance L of the others, at pixels where neither is saturated:
 
     z_k = (x_k - t_k L) / sqrt(v_k + t_k^2 v_L),    L = sum_j x_j t_j / v_j / sum_j t_j^2 / v_j
 
-v is noise, (2 % of x)^2 for inexact exposures and response curves, and for the level of black (0.1
-% of full scale)^2 and (3 electrons)^2: cameras without an offset clip the noise there, which bends
-their curves. A photograph deviates where the mean of min(z^2, 100) is above 2.5, two pixels left
-out that may be defects; of fewer than 8 pixels, where it is above 27.5. Or where the sum of t_k L
-(x_k - t_k L) over pixels exceeds 5 of its standard deviations: an exposure is wrong, and each pixel
-alone is dim. In the same way a photograph is compared with an earlier one (`known`), and sums of
-patterns and their inverses with each other.
+v is the sum of noise, (2 % of x)^2 for inexact exposures and response curves, and for the level
+of black (0.1 % of full scale)^2 and (3 electrons)^2: cameras without an offset clip the noise
+there, which bends their curves.
+
+A photograph deviates if the mean of min(z^2, 100) is above 2.5, two pixels left out that may be
+defects; for fewer than 8 pixels, if it is above 27.5. It also deviates if the sum of
+t_k L (x_k - t_k L) over pixels exceeds 5 of its standard deviations: an exposure is wrong, and
+each pixel alone is dim. A photograph is compared in the same way with an earlier one (`known`),
+and sums of patterns and their inverses with each other.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.errors import AcquisitionError
 
-_SCALE, _FLOOR = 0.02, 0.001  # systematic errors: of light, of full scale
-_ELECTRONS = (
-    3.0  # of light: error of the level of black, of a camera of at least `_LEAST` at full scale
-)
-_LEAST = 300.0  # fewer are measured only where photographs of one pattern differ
-_DIM = 3.0  # times that light: what pixels below have of this error, they have in common
-_BIAS = 0.2  # of the noise without light: common error of all pixels there
-_CLIP, _DEFECTS, _MEAN = 100.0, 2, 2.5
-_SINGLE = 25.0  # z^2 of each of a few pixels, which a single one has by noise once in a million
-_RANGE = 0.95  # of saturation; above, pixels may be clipped
-_SIGMAS = 5.0  # below saturation, of pixels that must not be saturated
-_SUSPECTS = 4  # photographs with the largest scores
-_PIXELS = 1 << 13  # of a photograph, at most
+# Systematic errors, relative to light and to full scale.
+SCALE_ERROR = 0.02
+BLACK_ERROR = 0.001
+# Error of the level of black in electrons, of a camera with at least so many at full scale;
+# fewer are measured only where photographs of one pattern differ.
+BLACK_ELECTRONS = 3.0
+MIN_ELECTRONS = 300.0
+# Pixels below this multiple of the error of black have that error in common.
+DIM_FACTOR = 3.0
+# Common error of all pixels, relative to the noise without light.
+COMMON_ERROR = 0.2
+# Largest z^2 that counts, number of defects that may have it, largest mean z^2 of the others.
+MAX_Z2 = 100.0
+MAX_DEFECTS = 2
+MAX_MEAN_Z2 = 2.5
+# z^2 that noise exceeds once in a million; allowed for each of a few pixels.
+SINGLE_Z2 = 25.0
+# Share of saturation above which pixels may be clipped.
+CLIPPING_SHARE = 0.95
+# Standard deviations by which pixels that must not be saturated are below saturation.
+SATURATION_SIGMAS = 5.0
+# Number of photographs with the largest scores that are considered as a cause.
+MAX_SUSPECTS = 4
+# Largest number of pixels of a photograph that are compared.
+MAX_PIXELS = 1 << 13
+# Share of the brightest light above which pixels tell the ratio of two photographs.
+BRIGHT_SHARE = 0.3
+
 ROUGH_NOISE = NoiseModel(electrons=500.0, read=0.01)
 """Noise of a camera that is not measured yet: more than most have."""
-ADVICE = "photographs must be in the order of the list, exposed as listed, and the set-up must not change"
+ADVICE = (
+    "photographs must be in the order of the list, exposed as listed, "
+    "and the set-up must not change"
+)
 
-Name = Callable[[int], str]
-name_number: Name = "photograph {}".format
+PhotographName = Callable[[int], str]
 
 
-class CameraModel(NamedTuple):
-    """What is known of a camera: response, noise, linear value without light (a float, or one a channel)."""
+def name_by_number(number: int) -> str:
+    """Name of a photograph in messages: its number."""
+    return f"photograph {number}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraModel:
+    """Response and noise of a camera, and its linear value without light.
+
+    `offset` is a float, or one for each channel.
+    """
 
     response: Response
     noise: NoiseModel = ROUGH_NOISE
     offset: Any = 0.0
 
 
-class Deviation(NamedTuple):
-    """Photographs (indices) of which one deviates, or two that are exchanged; and the likely cause."""
+@dataclass(frozen=True, kw_only=True)
+class Deviation:
+    """Photographs (indices) one of which deviates, or two exchanged ones; and the likely cause."""
 
     suspects: tuple[int, ...]
     cause: str
-    exchanged: bool = False
+    is_exchange: bool = False
 
-    def describe(self, numbers: Sequence[int], name: Name = name_number) -> str:
-        """In one line, of photographs with these numbers."""
+    def describe(self, numbers: Sequence[int], name: PhotographName = name_by_number) -> str:
+        """Describe the deviation of photographs with these numbers in one line."""
         names = [name(numbers[k]) for k in self.suspects]
-        return f"{(' and ' if self.exchanged else ' or ').join(names)} {self.cause}"
+        conjunction = " and " if self.is_exchange else " or "
+        return f"{conjunction.join(names)} {self.cause}"
 
 
 def spread(pixels: int | np.ndarray) -> np.ndarray:
-    """At most `_PIXELS` of so many pixels, or of an array of their numbers, evenly."""
+    """Choose at most `MAX_PIXELS` of so many pixels, or of an array of numbers, spread evenly."""
     numbers = np.arange(pixels) if isinstance(pixels, int) else pixels
-    return numbers[:: -(-max(len(numbers), 1) // _PIXELS)]
+    step = -(-max(len(numbers), 1) // MAX_PIXELS)
+    return numbers[::step]
 
 
 def sample(image: np.ndarray, pixels: np.ndarray | None = None) -> np.ndarray:
     """A photograph (H, W[, c]) at some pixels, (n, c); by default spread over all."""
-    pixels = spread(image.shape[0] * image.shape[1]) if pixels is None else pixels
-    return image.reshape(-1, image.shape[2] if image.ndim == 3 else 1)[pixels]
+    if pixels is None:
+        pixels = spread(image.shape[0] * image.shape[1])
+    channels = image.shape[2] if image.ndim == 3 else 1
+    return image.reshape(-1, channels)[pixels]
 
 
 def find_deviation(
     samples: Sequence[np.ndarray],
     seconds: Sequence[float],
-    sensor: CameraModel,
+    camera: CameraModel,
     known: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Deviation | None:
-    """Which photographs of one pattern deviate, if any; each is its codes at the same pixels (`sample`).
+    """Find which photographs of one pattern deviate, if any.
 
-    `known`: radiance (n, c) there, ambient light included, and its variance.
+    Parameters
+    ----------
+    samples : sequence of (n, c) arrays
+        Codes of each photograph at the same pixels (`sample`).
+    seconds : sequence of float
+        Their exposures.
+    camera : CameraModel
+        What is known of the camera.
+    known : pair of (n, c) arrays, optional
+        Radiance at these pixels, ambient light included, and its variance.
     """
     if known is None:
-        return _deviation(_Light.of(samples, seconds, sensor), len(samples))
-    return _deviation(
-        _Light.of(samples, seconds, sensor, known[0]).with_known(*known), len(samples)
-    )
+        light = LinearLight.from_samples(samples, seconds, camera)
+    else:
+        value, variance = known
+        measured = LinearLight.from_samples(samples, seconds, camera, value)
+        light = measured.with_known(value, variance)
+    return _deviation(light, len(samples))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RecordedPhotograph:
+    """Codes, seconds and number of a photograph, and its image at some pixels."""
+
+    codes: np.ndarray
+    seconds: float
+    sample: np.ndarray
+    number: int
 
 
 class AgreementRecord:
     """Photographs of a calibration, at some pixels, to be compared when its noise is known."""
 
     def __init__(self) -> None:
-        # Codes, seconds, samples and number of the photographs of one pattern (bytes) and of one
-        # exposure.
-        self._groups: dict[bytes | float, list[tuple[Any, ...]]] = defaultdict(list)
+        self._by_pattern: dict[bytes, list[_RecordedPhotograph]] = defaultdict(list)
+        self._by_exposure: dict[float, list[_RecordedPhotograph]] = defaultdict(list)
 
     def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
-        """One photograph, (H, W) or (H, W, c) in [0, 1]."""
-        for key in (codes.tobytes(), seconds):
-            self._groups[key].append((codes, seconds, sample(image), number))
+        """Record one photograph, (H, W) or (H, W, c) in [0, 1]."""
+        photograph = _RecordedPhotograph(
+            codes=codes, seconds=seconds, sample=sample(image), number=number
+        )
+        self._by_pattern[codes.tobytes()].append(photograph)
+        self._by_exposure[seconds].append(photograph)
 
-    def check(self, sensor: CameraModel, name: Name = name_number) -> None:
-        """Raise AcquisitionError where photographs of a pattern, or of it and its inverse, deviate.
+    def check(self, camera: CameraModel, name: PhotographName = name_by_number) -> None:
+        """Raise AcquisitionError if photographs of a pattern, or of it and its inverse, deviate.
 
         It names the photograph, or the few of which one must be wrong; of several, the first.
         """
         findings: list[tuple[int, str]] = []
-        for key, group in self._groups.items():
-            codes, seconds, samples, numbers = zip(*group, strict=True)
-            one_pattern = isinstance(key, bytes)
-            deviation = (
-                find_deviation(samples, seconds, sensor)
-                if one_pattern
-                else _in_inverses(codes, samples, sensor)
-            )
+
+        def note(group: list[_RecordedPhotograph], deviation: Deviation | None) -> None:
             if deviation is not None:
-                findings.append(
-                    (numbers[max(deviation.suspects)], deviation.describe(numbers, name))
-                )
+                numbers = [photograph.number for photograph in group]
+                last = numbers[max(deviation.suspects)]
+                findings.append((last, deviation.describe(numbers, name)))
+
+        for group in self._by_pattern.values():
+            samples = [photograph.sample for photograph in group]
+            seconds = [photograph.seconds for photograph in group]
+            note(group, find_deviation(samples, seconds, camera))
+        for group in self._by_exposure.values():
+            note(group, _deviation_of_inverses(group, camera))
         if findings:
-            raise AcquisitionError(f"{min(findings)[1]}; {ADVICE}")
+            _, text = min(findings)
+            raise AcquisitionError(f"{text}; {ADVICE}")
 
 
-def _in_inverses(
-    codes: Sequence[np.ndarray], samples: Sequence[np.ndarray], sensor: CameraModel
+def _deviation_of_inverses(
+    group: Sequence[_RecordedPhotograph], camera: CameraModel
 ) -> Deviation | None:
-    """Which photographs of a pattern of 0 and 1 and its inverse, at one exposure, do not add up as others."""
-    first = [
-        k
-        for k, (a, b) in enumerate(pairwise(codes))
-        if a.shape == b.shape and np.all(a + b == 1.0) and np.all(a * b == 0.0)
-    ]
+    """Patterns and inverses, at one exposure, that do not add up to the same as the others."""
+    first = []
+    for k, (photograph, following) in enumerate(pairwise(group)):
+        if _are_inverse(photograph.codes, following.codes):
+            first.append(k)
     if len(first) < 3:
         return None
-    light = _Light.of(samples, np.ones(len(samples)), sensor)
-    deviation = _deviation(light.at(first) + light.at([k + 1 for k in first]), len(first))
+    samples = [photograph.sample for photograph in group]
+    light = LinearLight.from_samples(samples, np.ones(len(samples)), camera)
+    second = [k + 1 for k in first]
+    sums = light.select(first).plus(light.select(second))
+    deviation = _deviation(sums, len(first))
     if deviation is None:
         return None
-    pairs = deviation.suspects if len(deviation.suspects) < 3 else deviation.suspects[-1:]
-    cause = "deviates: a pattern and its inverse must add up to white, as the other ones do"
-    return Deviation(tuple(first[k] + i for k in pairs for i in (0, 1)), cause)
+    pairs = deviation.suspects
+    if len(pairs) >= 3:
+        pairs = pairs[-1:]
+    suspects = []
+    for pair in pairs:
+        suspects += [first[pair], second[pair]]
+    return Deviation(
+        suspects=tuple(suspects),
+        cause="deviates: a pattern and its inverse must add up to white, as the other ones do",
+    )
 
 
-class _Light(NamedTuple):
-    """Seconds (k, 1, 1) of photographs, linear values x above black (k, n, c) and their variance.
+def _are_inverse(a: np.ndarray, b: np.ndarray) -> bool:
+    """True for codes of 0 and 1 of a pattern and its inverse."""
+    if a.shape != b.shape:
+        return False
+    return bool(np.all(a + b == 1.0) and np.all(a * b == 0.0))
 
-    x is inf from `limit` (k, 1, c) on, where it is saturated; `bias`: common error of all pixels;
-    `few`: more of it, of pixels that have hardly more light.
+
+@dataclass(frozen=True, kw_only=True)
+class _MeanLight:
+    """Radiance (n, c) by several photographs, its variance, common error, and where it is known."""
+
+    value: np.ndarray
+    variance: np.ndarray
+    bias: np.ndarray
+    known: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearLight:
+    """Linear values above black of k photographs at n pixels, with their variance.
+
+    Attributes
+    ----------
+    seconds : (k, 1, 1)
+    value, variance : (k, n, c)
+        The value is inf where it is saturated.
+    limit : (k, 1, c)
+        Value from which on a pixel is saturated.
+    bias, dim_bias : (k, 1, c)
+        Common error of all pixels, and what dim pixels have of it in addition.
     """
 
     seconds: np.ndarray
-    x: np.ndarray
+    value: np.ndarray
     variance: np.ndarray
     limit: np.ndarray
     bias: np.ndarray
-    few: np.ndarray
+    dim_bias: np.ndarray
 
     @classmethod
-    def of(
-        cls, samples: Sequence[np.ndarray], seconds: Any, sensor: CameraModel, L: Any = None
-    ) -> _Light:
-        """`L`: radiance (n, c), where it is known; that of all photographs determines their noise if not.
+    def from_samples(
+        cls,
+        samples: Sequence[np.ndarray],
+        seconds: Any,
+        camera: CameraModel,
+        radiance: np.ndarray | None = None,
+    ) -> LinearLight:
+        """Linear values of codes, whose noise follows from the radiance (n, c).
 
-        By its own value each pixel would have the less noise the darker it is by chance.
+        By default it is the mean over all photographs: by its own value each pixel would have the
+        less noise the darker it is by chance.
         """
-        response, noise, offset = sensor
+        noise = camera.noise
         codes = np.stack(samples)
         curve = codes if codes.shape[2] > 1 else codes[..., 0]
-        x = response.linear(curve).reshape(codes.shape) - offset
-        limit = np.broadcast_to(
-            _RANGE * (noise.saturation - np.asarray(offset)), (len(x), 1, x.shape[2])
-        )
+        value = camera.response.linear(curve).reshape(codes.shape) - camera.offset
+        saturation = noise.saturation - np.asarray(camera.offset)
+        limit = np.broadcast_to(CLIPPING_SHARE * saturation, (len(value), 1, value.shape[2]))
         t = np.asarray(seconds, np.float64)[:, None, None]
-        if L is None:
-            usable = x < limit
-            L = np.sum(x * usable, axis=0) / np.maximum(np.sum(t * usable, axis=0), 1e-30)
-        variance = noise.variance(t * L, response.derivative(curve).reshape(codes.shape))
-        few = _ELECTRONS / max(noise.electrons, _LEAST)
-        variance = variance + (_SCALE * t * L) ** 2 + _FLOOR**2 + few**2
-        bias, few = (np.full(limit.shape, b) for b in (_BIAS * np.sqrt(noise.variance(0.0)), few))
-        return cls(t, np.where(x < limit, x, np.inf), variance, limit, bias, few)
-
-    def with_known(self, value: np.ndarray, variance: np.ndarray) -> _Light:
-        """One more, as the shortest photograph would show what is known."""
-        t = self.seconds.min(axis=0, keepdims=True)
-        x = t * value
-        v = t**2 * variance + (_SCALE * x) ** 2 + _FLOOR**2
-        known = t, x, v, np.full((1, 1, x.shape[2]), np.inf), *np.zeros((2, 1, 1, x.shape[2]))
-        return _Light(*(np.concatenate(pair) for pair in zip(self, known, strict=True)))
-
-    def at(self, numbers: Sequence[int]) -> _Light:
-        return _Light(*(values[list(numbers)] for values in self))
-
-    def without(self, k: int) -> _Light:
-        return self.at([other for other in range(len(self.x)) if other != k])
-
-    def __add__(self, other: _Light) -> _Light:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Light(self.seconds, *(a + b for a, b in zip(self[1:], other[1:], strict=True)))
-
-    def mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Radiance (n, c) by all photographs, its variance and bias, and where any shows it."""
-        t, x, variance, _, bias, _ = self
-        usable = np.isfinite(x)
-        weight = np.where(usable, t / variance, 0.0)
-        total = np.sum(weight * t, axis=0)
-        known = total > 0
-        total = np.where(known, total, 1.0)
-        L, bias = (
-            np.sum(weight * values, axis=0) / total for values in (np.where(usable, x, 0.0), bias)
+        if radiance is None:
+            radiance = _mean_radiance(value, t, value < limit)
+        slope = camera.response.derivative(curve).reshape(codes.shape)
+        dim_bias = BLACK_ELECTRONS / max(noise.electrons, MIN_ELECTRONS)
+        variance = noise.variance(t * radiance, slope)
+        variance = variance + (SCALE_ERROR * t * radiance) ** 2 + BLACK_ERROR**2 + dim_bias**2
+        bias = COMMON_ERROR * np.sqrt(noise.variance(0.0))
+        return cls(
+            seconds=t,
+            value=np.where(value < limit, value, np.inf),
+            variance=variance,
+            limit=limit,
+            bias=np.full(limit.shape, bias),
+            dim_bias=np.full(limit.shape, dim_bias),
         )
-        return L, 1.0 / total, bias, known
+
+    def with_known(self, radiance: np.ndarray, variance: np.ndarray) -> LinearLight:
+        """Add a photograph of known light at the shortest exposure."""
+        t = self.seconds.min(axis=0, keepdims=True)
+        value = t * radiance
+        shape = (1, 1, value.shape[2])
+        known = LinearLight(
+            seconds=t,
+            value=value,
+            variance=t**2 * variance + (SCALE_ERROR * value) ** 2 + BLACK_ERROR**2,
+            limit=np.full(shape, np.inf),
+            bias=np.zeros(shape),
+            dim_bias=np.zeros(shape),
+        )
+        return LinearLight(
+            seconds=np.concatenate([self.seconds, known.seconds]),
+            value=np.concatenate([self.value, known.value]),
+            variance=np.concatenate([self.variance, known.variance]),
+            limit=np.concatenate([self.limit, known.limit]),
+            bias=np.concatenate([self.bias, known.bias]),
+            dim_bias=np.concatenate([self.dim_bias, known.dim_bias]),
+        )
+
+    def select(self, numbers: Sequence[int]) -> LinearLight:
+        """Select photographs by their places."""
+        chosen = list(numbers)
+        return LinearLight(
+            seconds=self.seconds[chosen],
+            value=self.value[chosen],
+            variance=self.variance[chosen],
+            limit=self.limit[chosen],
+            bias=self.bias[chosen],
+            dim_bias=self.dim_bias[chosen],
+        )
+
+    def without(self, k: int) -> LinearLight:
+        """Leave one photograph out."""
+        return self.select([number for number in range(len(self.value)) if number != k])
+
+    def plus(self, other: LinearLight) -> LinearLight:
+        """Sums of the values of photographs, for the seconds of the first ones."""
+        return LinearLight(
+            seconds=self.seconds,
+            value=self.value + other.value,
+            variance=self.variance + other.variance,
+            limit=self.limit + other.limit,
+            bias=self.bias + other.bias,
+            dim_bias=self.dim_bias + other.dim_bias,
+        )
+
+    def mean(self) -> _MeanLight:
+        """Radiance by all photographs, with weights 1 / variance."""
+        usable = np.isfinite(self.value)
+        weight = np.where(usable, self.seconds / self.variance, 0.0)
+        precision = np.sum(weight * self.seconds, axis=0)
+        known = precision > 0
+        precision = np.where(known, precision, 1.0)
+        light = np.where(usable, self.value, 0.0)
+        return _MeanLight(
+            value=np.sum(weight * light, axis=0) / precision,
+            variance=1.0 / precision,
+            bias=np.sum(weight * self.bias, axis=0) / precision,
+            known=known,
+        )
 
     def scores(self) -> np.ndarray:
-        """How far each photograph is from the others: it deviates above 1."""
-        result = np.zeros(len(self.x))
-        whole = np.maximum(self.mean()[0], 0.0)
-        for k, (t, x, v, limit, bias, few) in enumerate(zip(*self, strict=True)):
-            L, v_L, bias_L, known = self.without(k).mean()
-            variance = v + t**2 * v_L
-            z2 = np.minimum((x - t * L) ** 2 / variance, _CLIP)
-            least = np.where(np.isfinite(x), t * whole, t * L + _SIGMAS * np.sqrt(variance))
-            use = known & (least < limit)
-            count = np.count_nonzero(use)
-            allowed = _MEAN * count + min(_DEFECTS * _CLIP, _SINGLE * count)
-            near = use & (z2 < _CLIP)
-            s = bias + t * bias_L + few * (t * whole < _DIM * few)
-            w, d, s = ((t * whole)[near], (x - t * L)[near], s[near])
-            together = (w @ d) ** 2 / max(
-                w**2 @ variance[near] + (_SCALE * w @ w) ** 2 + (w @ s) ** 2, 1e-30
-            )
-            result[k] = max(z2[use].sum() / max(allowed, 1.0), together / _SINGLE)
-        return result
+        """Distance of each photograph from the others, (k,): it deviates above 1."""
+        mean = np.maximum(self.mean().value, 0.0)
+        return np.array([self._score(k, mean) for k in range(len(self.value))])
+
+    def _score(self, k: int, mean: np.ndarray) -> float:
+        """Distance of one photograph from the others; `mean` is the radiance (n, c) by all."""
+        others = self.without(k).mean()
+        t = self.seconds[k]
+        value = self.value[k]
+        expected = t * others.value
+        variance = self.variance[k] + t**2 * others.variance
+        z2 = np.minimum((value - expected) ** 2 / variance, MAX_Z2)
+
+        # 1. Each pixel by itself, where the photograph must not be saturated.
+        is_saturated = ~np.isfinite(value)
+        margin = SATURATION_SIGMAS * np.sqrt(variance)
+        lowest = np.where(is_saturated, expected + margin, t * mean)
+        compared = others.known & (lowest < self.limit[k])
+        count = np.count_nonzero(compared)
+        allowed = MAX_MEAN_Z2 * count + min(MAX_DEFECTS * MAX_Z2, SINGLE_Z2 * count)
+        by_pixel = z2[compared].sum() / max(allowed, 1.0)
+
+        # 2. All pixels together, weighted with their light; s is the error they have in common.
+        near = compared & (z2 < MAX_Z2)
+        is_dim = t * mean < DIM_FACTOR * self.dim_bias[k]
+        common = self.bias[k] + t * others.bias + self.dim_bias[k] * is_dim
+        w = (t * mean)[near]
+        d = (value - expected)[near]
+        s = common[near]
+        spread_of_sum = w**2 @ variance[near] + (SCALE_ERROR * w @ w) ** 2 + (w @ s) ** 2
+        together = (w @ d) ** 2 / max(spread_of_sum, 1e-30)
+        return max(by_pixel, together / SINGLE_Z2)
 
     def agrees(self) -> bool:
+        """True if no photograph deviates."""
         return bool(self.scores().max(initial=0.0) <= 1.0)
 
-    def cause(self, k: int) -> str:
-        """Why photograph k may deviate from the others: their ratio at bright pixels tells."""
-        L, _, _, known = self.without(k).mean()
-        both = known & np.isfinite(self.x[k])
+    def likely_cause(self, k: int) -> str:
+        """Why photograph k may deviate: its ratio to the others at bright pixels tells."""
+        others = self.without(k).mean()
+        both = others.known & np.isfinite(self.value[k])
         if both.any():
-            x, expected = self.x[k][both], (self.seconds[k] * L)[both]
-            bright = expected >= 0.3 * np.quantile(expected, 0.99)
-            gain = float(np.median(x[bright] / np.maximum(expected[bright], 1e-9)))
-            if gain > 1.0 and np.mean(x > expected) > 0.9:
-                return "is too bright nearly everywhere: another light was on, or the exposure was too long"
-            if abs(gain - 1.0) > 3 * _SCALE:
+            value = self.value[k][both]
+            expected = (self.seconds[k] * others.value)[both]
+            bright = expected >= BRIGHT_SHARE * np.quantile(expected, 0.99)
+            gain = float(np.median(value[bright] / np.maximum(expected[bright], 1e-9)))
+            if gain > 1.0 and np.mean(value > expected) > 0.9:
+                return (
+                    "is too bright nearly everywhere: another light was on, "
+                    "or the exposure was too long"
+                )
+            if abs(gain - 1.0) > 3 * SCALE_ERROR:
                 return f"is {gain:.2g} times as bright as the others of its pattern"
         return (
             "deviates from the others of its pattern: another pattern, or the camera or scene moved"
         )
 
 
-def _deviation(light: _Light, count: int) -> Deviation | None:
-    """Which of the first `count` photographs deviate; what is known stands behind them."""
-    scores, every = light.scores(), range(len(light.x))
+def _mean_radiance(value: np.ndarray, seconds: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Mean radiance (n, c) by the usable ones of linear values (k, n, c)."""
+    light = np.sum(value * usable, axis=0)
+    total_seconds = np.sum(seconds * usable, axis=0)
+    return light / np.maximum(total_seconds, 1e-30)
+
+
+def _deviation(light: LinearLight, count: int) -> Deviation | None:
+    """Find which of the first `count` photographs deviate; known light follows them."""
+    scores = light.scores()
     if scores.max(initial=0.0) <= 1.0:
         return None
-    worst = sorted(np.argsort(-scores[:count])[:_SUSPECTS].tolist())
-    for a, b in combinations(worst, 2):
-        order = [{a: b, b: a}.get(k, k) for k in every]
-        if (
-            light.seconds[a] != light.seconds[b]
-            and light._replace(seconds=light.seconds[order]).agrees()
-        ):
-            return Deviation((a, b), "are exchanged", exchanged=True)
-    alone = [k for k in worst if light.without(k).agrees()]
-    if count < len(every) or count < 3:
-        return Deviation(tuple(alone or [0]), light.cause((alone or [0])[0]))
-    since = next((k for k in every[1:] if not light.at(every[: k + 1]).agrees()), count - 1)
-    if alone:
-        return Deviation(tuple(sorted({*alone, since})), light.cause(alone[0]))
-    return Deviation(
-        (since,), "and those after it deviate: the camera or scene moved, or the light changed"
-    )
+    worst = np.argsort(-scores[:count])[:MAX_SUSPECTS]
+    suspects = sorted(worst.tolist())
+    exchange = _exchanged_pair(light, suspects)
+    if exchange is not None:
+        return Deviation(suspects=exchange, cause="are exchanged", is_exchange=True)
+
+    # Photographs without which the others agree.
+    single = [k for k in suspects if light.without(k).agrees()]
+    total = len(light.value)
+    if count < total or count < 3:
+        chosen = single if single else [0]
+        return Deviation(suspects=tuple(chosen), cause=light.likely_cause(chosen[0]))
+    change = _first_change(light)
+    if single:
+        chosen = sorted({*single, change})
+        return Deviation(suspects=tuple(chosen), cause=light.likely_cause(single[0]))
+    cause = "and those after it deviate: the camera or scene moved, or the light changed"
+    return Deviation(suspects=(change,), cause=cause)
+
+
+def _exchanged_pair(light: LinearLight, suspects: Sequence[int]) -> tuple[int, int] | None:
+    """Two photographs whose exchange makes all agree."""
+    for a, b in combinations(suspects, 2):
+        if light.seconds[a] == light.seconds[b]:
+            continue
+        order = np.arange(len(light.value))
+        order[[a, b]] = b, a
+        if replace(light, seconds=light.seconds[order]).agrees():
+            return a, b
+    return None
+
+
+def _first_change(light: LinearLight) -> int:
+    """The first photograph that does not agree with those before it, or the last."""
+    last = len(light.value) - 1
+    for k in range(1, last):
+        if not light.select(range(k + 1)).agrees():
+            return k
+    return last

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Calibration`: what `calibrate` has measured, as arrays in a store; `Setup`: it on the pixels of T.
+"""`Calibration`: a measured set-up, as arrays in a store; `Setup`: the same on the pixels of T.
 
 With light p of a pattern in [0, 1], codes x that the projector is fed, its response g and ambient
 light a,
@@ -7,7 +7,7 @@ light a,
     x = g^-1(p)                 for each channel, on the projector's own pixels
     picture = T p + a           in linear sensor values a second
 
-T is for light relative to white less black: a includes what a black projector sends.
+T is for light relative to white less black: a includes the light of a black projector.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
+from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.geometry.blocks import Blocks
@@ -29,18 +30,37 @@ from ltcl.errors import FileError
 from ltcl.store import BlockStore
 from ltcl.transport.transport import Transport
 
-PREFIX = "calibration."  # of the names of the extra arrays that a calibration is kept in
-_VALID = 0.5  # of the camera pixels that see a projector pixel: with less its value is unknown
+PREFIX = "calibration."
+"""Beginning of the names of the extra arrays that a calibration is kept in."""
+# Share of the camera pixels of a projector pixel that must be valid; with less its value is
+# unknown.
+MIN_VALID_SHARE = 0.5
+# Random patterns by which a transport is compared with a known scene.
+COMPARED_PATTERNS = 4
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Calibration:
-    """What is known of a set-up.
+    """Measured facts about a set-up.
 
-    `exposures` in seconds, ascending; `offset`, the camera's linear value without light; `ambient`,
-    `white`, (H, W[, 3]), what a black projector shows and a white one adds; `mixing`, (3, 3), None
-    of one channel; `resampling` to the projector's pixels; `sharpness`, None of an aligned camera;
-    `anchor`, None of older stores.
+    Attributes
+    ----------
+    exposures : tuple of float
+        Seconds of the photographs of each pattern, ascending.
+    response, noise, offset : Response, NoiseModel, ndarray
+        Of the camera; `offset` is its linear value without light, (channels,).
+    ambient, white : Radiance
+        Light (H, W[, 3]) of a black projector, and what a white one adds.
+    projector : Response
+        From codes to light of the projector.
+    mixing : ndarray, optional
+        How its colours mix, (3, 3); None with one channel.
+    resampling : Resampling
+        From the camera's pixels to the projector's.
+    sharpness : Sharpness, optional
+        None with an aligned camera.
+    anchor : Anchor, optional
+        The pattern of blocks, which is photographed again during the scan.
     """
 
     exposures: tuple[float, ...]
@@ -57,76 +77,124 @@ class Calibration:
 
     @property
     def light(self) -> np.ndarray:
-        """What each channel of T answers to when all of the projector's are at full code, (channels,)."""
+        """Light that each channel of T answers to when all of the projector's are at full code.
+
+        (channels,)
+        """
         return np.ones(1) if self.mixing is None else self.mixing.sum(axis=1)
+
+    @property
+    def camera(self) -> CameraModel:
+        """Response, noise and offset of the camera."""
+        return CameraModel(response=self.response, noise=self.noise, offset=self.offset)
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Calibration:
-        """That of a store made by `ltcl.acquire`; FileError where it has none, or is damaged."""
+        """Read the calibration in a store of `ltcl.acquire`.
+
+        FileError if it has none, or is damaged.
+        """
         scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
-        names = [name.removeprefix(PREFIX) for name in scan.extras if name.startswith(PREFIX)]
-        if not names:
+        arrays = _stored_arrays(scan)
+        if not arrays:
             raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
-        if "resampling.doubtful" not in names:
-            raise FileError(
-                f"{scan.path}: its calibration is of an earlier ltcl; it must be acquired again"
-            )
-        arrays = {name: np.array(scan.extra(PREFIX + name)) for name in names}
-
-        def group(prefix: str) -> dict[str, Any]:
-            return {
-                k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)
-            }
-
-        R, ambient, white, anchor = map(group, ("resampling.", "ambient.", "white.", "anchor."))
-        anchor.pop("shift", None)  # of earlier versions
-        for light in (ambient, white):  # of earlier versions: 0 where it is not valid
-            light["variance"] = np.where(light["valid"], light["variance"], np.float32(np.inf))
-        (h, w), (H, W) = R["coverage"].shape, R["camera_grid"].tolist()
-        weights = scipy.sparse.csr_array(
-            (R["data"], R["indices"], R["indptr"]), shape=(h * w, H * W)
-        )
-        *sensor, levels = arrays["noise"].tolist()
-        y, x, width = arrays.get("sharpness", np.zeros(3)).tolist()
+        sharpness = None
+        if "sharpness" in arrays:
+            y, x, width = arrays["sharpness"].tolist()
+            sharpness = Sharpness((y, x), width)
+        anchor = _group(arrays, "anchor.")
+        *noise, levels = arrays["noise"].tolist()
         return cls(
-            tuple(arrays["exposures"].tolist()),
-            Response(arrays["response"]),
-            NoiseModel(*sensor, levels=int(levels)),
-            arrays["offset"],
-            Radiance(**ambient),
-            Radiance(**white),
-            Response(arrays["projector"]),
-            arrays.get("mixing"),
-            Resampling(weights, R["coverage"], (h, w), (H, W), R["doubtful"]),
-            Sharpness((y, x), width) if "sharpness" in arrays else None,
-            Anchor(**anchor) if anchor else None,
+            exposures=tuple(arrays["exposures"].tolist()),
+            response=Response(arrays["response"]),
+            noise=NoiseModel(*noise, levels=int(levels)),
+            offset=arrays["offset"],
+            ambient=Radiance(**_group(arrays, "ambient.")),
+            white=Radiance(**_group(arrays, "white.")),
+            projector=Response(arrays["projector"]),
+            mixing=arrays.get("mixing"),
+            resampling=_resampling_from_arrays(_group(arrays, "resampling.")),
+            sharpness=sharpness,
+            anchor=Anchor(**anchor) if anchor else None,
         )
 
     def write(self, store: BlockStore) -> None:
         """Commit it to a store, as extra arrays."""
-        R = self.resampling
         arrays = {
             "exposures": np.array(self.exposures),
             "response": self.response.values,
             "noise": np.array(astuple(self.noise), np.float64),
             "offset": self.offset,
             "projector": self.projector.values,
-            "resampling.coverage": R.coverage,
-            "resampling.camera_grid": np.array(R.camera_grid),
-            "resampling.doubtful": np.zeros(R.grid, bool) if R.doubtful is None else R.doubtful,
-        }
-        arrays |= {
-            f"resampling.{name}": getattr(R.weights, name) for name in ("data", "indices", "indptr")
+            **_resampling_arrays(self.resampling),
         }
         if self.sharpness is not None:
             arrays["sharpness"] = np.hstack(astuple(self.sharpness))
         if self.mixing is not None:
             arrays["mixing"] = self.mixing
-        for group in ("ambient", "white", "anchor"):
-            if (record := getattr(self, group)) is not None:
-                arrays |= {f"{group}.{field}": array for field, array in vars(record).items()}
+        arrays |= _radiance_arrays("ambient.", self.ambient)
+        arrays |= _radiance_arrays("white.", self.white)
+        if self.anchor is not None:
+            arrays["anchor.pixels"] = self.anchor.pixels
+            arrays["anchor.value"] = self.anchor.value
+            arrays["anchor.variance"] = self.anchor.variance
         for name, array in arrays.items():
             store.extra(PREFIX + name, array)
+
+
+def _stored_arrays(store: BlockStore) -> dict[str, np.ndarray]:
+    """The arrays of a calibration, by their names without `PREFIX`."""
+    arrays = {}
+    for name in store.extras:
+        if name.startswith(PREFIX):
+            arrays[name.removeprefix(PREFIX)] = np.array(store.extra(name))
+    return arrays
+
+
+def _group(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, Any]:
+    """The arrays whose names begin with `prefix`, by the rest of their names."""
+    group = {}
+    for name, array in arrays.items():
+        if name.startswith(prefix):
+            group[name.removeprefix(prefix)] = array
+    return group
+
+
+def _radiance_arrays(prefix: str, light: Radiance) -> dict[str, np.ndarray]:
+    return {
+        f"{prefix}value": light.value,
+        f"{prefix}variance": light.variance,
+        f"{prefix}valid": light.valid,
+    }
+
+
+def _resampling_arrays(resampling: Resampling) -> dict[str, np.ndarray]:
+    weights = resampling.weights
+    doubtful = resampling.doubtful
+    if doubtful is None:
+        doubtful = np.zeros(resampling.grid, bool)
+    return {
+        "resampling.coverage": resampling.coverage,
+        "resampling.camera_grid": np.array(resampling.camera_grid),
+        "resampling.doubtful": doubtful,
+        "resampling.data": weights.data,
+        "resampling.indices": weights.indices,
+        "resampling.indptr": weights.indptr,
+    }
+
+
+def _resampling_from_arrays(arrays: dict[str, np.ndarray]) -> Resampling:
+    """The inverse of `_resampling_arrays`, without the prefix."""
+    h, w = arrays["coverage"].shape
+    H, W = arrays["camera_grid"].tolist()
+    entries = arrays["data"], arrays["indices"], arrays["indptr"]
+    return Resampling(
+        weights=scipy.sparse.csr_array(entries, shape=(h * w, H * W)),
+        coverage=arrays["coverage"],
+        grid=(h, w),
+        camera_grid=(H, W),
+        doubtful=arrays["doubtful"],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,12 +206,9 @@ class Setup:
     >>> import tempfile, ltcl
     >>> from ltcl.acquisition import VirtualRig
     >>> store = f"{tempfile.mkdtemp()}/T.zarr"
-    >>> T = ltcl.acquire(
-    ...     VirtualRig(np.eye(64) / 2, (8, 8), ambient=0.1), geometry="aligned", store=store
-    ... )
-    >>> Setup.of(store).codes(np.full(T.grid, 0.214)).mean().round(
-    ...     1
-    ... )  # sRGB, as this rig has by default
+    >>> rig = VirtualRig(np.eye(64) / 2, (8, 8), ambient=0.1)  # a projector of sRGB
+    >>> T = ltcl.acquire(rig, geometry="aligned", store=store)
+    >>> Setup.of(store).codes(np.full(T.grid, 0.214)).mean().round(1)
     np.float32(0.5)
     """
 
@@ -152,10 +217,12 @@ class Setup:
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Setup:
-        """That of a store made by `ltcl.acquire`; FileError as of `Calibration.of`."""
+        """Read the set-up in a store of `ltcl.acquire`; FileError as from `Calibration.of`."""
         scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
-        calibration, facts = Calibration.of(scan), scan.attributes
-        side = facts["settings"]["block"] if facts.get("strategy") == "block" else 1
+        calibration = Calibration.of(scan)
+        side = 1
+        if scan.attributes.get("strategy") == "block":
+            side = scan.attributes["settings"]["block"]
         return cls(calibration, Blocks(calibration.resampling.grid, side))
 
     @property
@@ -171,41 +238,59 @@ class Setup:
     @property
     def ambient(self) -> np.ndarray:
         """Light under a black projector, (h, w[, 3]) in the units of T; 0 where it is unknown."""
-        R, light = self.calibration.resampling, self.calibration.ambient
-        weight, value = R.apply(light.valid.astype(np.float32)), R.apply(light.value * light.valid)
-        return self._mean(np.where(weight >= _VALID, value / np.maximum(weight, _VALID), 0.0))
+        resampling = self.calibration.resampling
+        light = self.calibration.ambient
+        weight = resampling.apply(light.valid.astype(np.float32))
+        value = resampling.apply(light.value * light.valid)
+        mean = value / np.maximum(weight, MIN_VALID_SHARE)
+        return self._block_means(np.where(weight >= MIN_VALID_SHARE, mean, 0.0))
 
     def codes(self, pattern: Any) -> np.ndarray:
-        """Codes, float32 on the projector's pixels, for light (h, w[, 3]), clipped to [0, 1], 1 for white."""
-        light = np.clip(self._colours("pattern", pattern), 0.0, 1.0)
+        """Codes, float32 on the projector's pixels, for light (h, w[, 3]) relative to white.
+
+        The light is clipped to [0, 1].
+        """
+        light = np.clip(self._in_channels("pattern", pattern), 0.0, 1.0)
         return self.blocks.enlarged(self.calibration.projector.codes(light))
 
     def light(self, codes: Any) -> np.ndarray:
         """Light of codes (h, w[, 3]) in [0, 1], relative to white."""
-        return self.calibration.projector.linear(self._colours("codes", codes))
+        return self.calibration.projector.linear(self._in_channels("codes", codes))
 
     def relative_error(self, rig: Any, T: Transport) -> tuple[float, ...]:
-        """||s T p - c|| / ||c|| of each channel for random p of 0 and 1, s = <T p, c> / ||T p||^2.
+        """Relative error of T for each channel, by random patterns p of 0 and 1.
 
-        c is what `rig`, a `VirtualRig`, shows under p less black; the camera's unit of light is
-        unknown.
+        It is ||s T p - c|| / ||c|| with s = <T p, c> / ||T p||^2. c is what `rig`, a `VirtualRig`,
+        shows under p less black; the camera's unit of light is unknown.
         """
-        patterns = (np.random.default_rng(0).random((4, *T.grid)) < 0.5).astype(np.float32)
-        pictures = [rig.radiance(self.blocks.enlarged(p)) for p in (0 * patterns[0], *patterns)]
-        if rig.camera_grid != rig.projector_grid:
-            pictures = [self.calibration.resampling.apply(picture) for picture in pictures]
-        light = patterns if T.channels == 1 else np.repeat(patterns[..., None], 3, axis=-1)
-        sides = [T @ p for p in light], [self._mean(c - pictures[0]) for c in pictures[1:]]
-        x, y = (
-            np.reshape(side, (4, -1, T.channels))[:, ~T.masked].astype(np.float64) for side in sides
-        )
-        scale = (x * y).sum(axis=(0, 1)) / np.maximum(
-            (x * x).sum(axis=(0, 1)), np.finfo(float).tiny
-        )
-        error = np.sqrt(((scale * x - y) ** 2).sum(axis=(0, 1)) / (y * y).sum(axis=(0, 1)))
+        random = np.random.default_rng(0)
+        is_on = random.random((COMPARED_PATTERNS, *T.grid)) < 0.5
+        patterns = is_on.astype(np.float32)
+        black = self._picture(rig, np.zeros_like(patterns[0]))
+        estimated = []
+        expected = []
+        for pattern in patterns:
+            light = pattern
+            if T.channels == 3:
+                light = np.repeat(pattern[..., None], 3, axis=-1)
+            estimated.append(T @ light)
+            expected.append(self._block_means(self._picture(rig, pattern) - black))
+        x = _lit_pixels(estimated, T)
+        y = _lit_pixels(expected, T)
+        squares = (x * x).sum(axis=(0, 1))
+        scale = (x * y).sum(axis=(0, 1)) / np.maximum(squares, np.finfo(float).tiny)
+        difference = ((scale * x - y) ** 2).sum(axis=(0, 1))
+        error = np.sqrt(difference / (y * y).sum(axis=(0, 1)))
         return tuple(error.tolist())
 
-    def _colours(self, name: str, picture: Any) -> np.ndarray:
+    def _picture(self, rig: Any, pattern: np.ndarray) -> np.ndarray:
+        """The light of a virtual rig under a pattern, on the projector's pixels."""
+        picture = rig.radiance(self.blocks.enlarged(pattern))
+        if rig.camera_grid == rig.projector_grid:
+            return picture
+        return self.calibration.resampling.apply(picture)
+
+    def _in_channels(self, name: str, picture: Any) -> np.ndarray:
         """A checked picture of as many channels as the projector has."""
         values = checks.finite(name, checks.real(name, picture)).astype(np.float32)
         checks.shape(name, values, self.grid, (*self.grid, 3))
@@ -213,7 +298,13 @@ class Setup:
             return np.repeat(values[..., None], 3, axis=-1)
         return values
 
-    def _mean(self, picture: np.ndarray) -> np.ndarray:
-        return (self.blocks.sum(picture) / self.blocks.sum(np.ones_like(picture))).astype(
-            np.float32
-        )
+    def _block_means(self, picture: np.ndarray) -> np.ndarray:
+        """Means of a picture (h, w[, c]) on the projector's pixels over the pixels of T."""
+        pixels = self.blocks.sum(np.ones_like(picture))
+        return (self.blocks.sum(picture) / pixels).astype(np.float32)
+
+
+def _lit_pixels(pictures: Any, T: Transport) -> np.ndarray:
+    """Pictures without the masked pixels of T, (patterns, pixels, channels) float64."""
+    values = np.reshape(pictures, (COMPARED_PATTERNS, -1, T.channels))
+    return values[:, ~T.masked].astype(np.float64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Project`: an acquisition as a folder, whose acquisition.toml says what photographs, and how.
+"""`Project`: an acquisition as a folder, with an acquisition.toml that describes rig and scan.
 
     [rig]
     kind = "virtual"            # virtual, mitsuba, folder or live
@@ -8,7 +8,7 @@
     [acquire]
     strategy = "auto"
 
-Keys of [rig] are arguments of its class, those of [acquire] of `ltcl.acquire`; "none" stands for
+Keys of [rig] are arguments of its class, those of [acquire] of `ScanSettings`; "none" stands for
 None. A virtual rig has the files `transport` and `camera_map`, a live one the tables [rig.camera],
 of kind "opencv" or "gphoto2", and [rig.display].
 """
@@ -19,47 +19,68 @@ import contextlib
 import inspect
 import os
 import tomllib
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import rigs
-from ltcl.acquisition.calibrate import expected_exposures, expected_photographs
+from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.exposure import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
-from ltcl.acquisition.rigs.virtual import CURVES, Sensor
+from ltcl.acquisition.rigs.simulated import CURVES, Sensor
 from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.settings import ScanSettings
-from ltcl.errors import FileError, InputError, InputTypeError, LtclError
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
 from ltcl.store import BlockStore, CompressedRecord, formats, load
 
-FILE, STORE = "acquisition.toml", "transport.zarr"
-_NOISELESS = 1e9  # electrons
-_RIGS: dict[str, Any] = {"virtual": rigs.VirtualRig, "mitsuba": rigs.MitsubaRig}
-_RIGS |= {"folder": rigs.FolderRig, "live": rigs.LiveRig}
-_CAMERAS = {"opencv": rigs.OpenCVCamera, "gphoto2": rigs.GPhoto2Camera}
-_OBJECTS = (
-    "T",
-    "folder",
-    "rig",
-    "store",
-    "resume",
-    "progress",
-    "device",
-)  # arguments that no file has
+FILE = "acquisition.toml"
+STORE = "transport.zarr"
+RIGS: dict[str, Any] = {
+    "virtual": rigs.VirtualRig,
+    "mitsuba": rigs.MitsubaRig,
+    "folder": rigs.FolderRig,
+    "live": rigs.LiveRig,
+}
+CAMERAS: dict[str, Any] = {"opencv": rigs.OpenCVCamera, "gphoto2": rigs.GPhoto2Camera}
+# Arguments of rigs that are objects, which no file has.
+OBJECT_ARGUMENTS = frozenset({"T", "folder"})
+# Electrons at full scale of a camera without photon noise.
+NOISELESS_ELECTRONS = 1e9
+# Codes at which the curve of a known response is tabulated.
+RESPONSE_CODES = 1025
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedRig:
+    """Grid and channels of a live rig whose camera and display are not opened: for plans only."""
+
+    projector_grid: tuple[int, int]
+    channels: int
+
+    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+        """Raise AcquisitionError: the camera is not open."""
+        raise AcquisitionError("the camera of the rig is not open")
 
 
 @dataclass(frozen=True)
 class Project:
-    """A folder with an acquisition.toml: the `table` of its rig, and `settings`, arguments of `ltcl.acquire`.
+    """A folder with an acquisition.toml.
+
+    Attributes
+    ----------
+    folder : Path
+    table : dict
+        The table [rig].
+    settings : dict
+        The table [acquire], arguments of `ltcl.acquire` and fields of `ScanSettings`.
 
     Examples
     --------
@@ -86,162 +107,266 @@ class Project:
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str]) -> Project:
-        """Read and check the file of a folder: FileError where it is none, InputError for its keys."""
-        path = (folder := as_path(folder)) / FILE
-        if not path.exists():
-            raise FileError(
-                f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one"
-            )
-        try:
-            content = tomllib.loads(input_file(path).read_text(encoding="utf-8-sig"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise FileError(f"{path}: is no TOML: {error}") from None
+        """Read and check the file of a folder.
+
+        FileError if the folder has none, or it is not valid TOML; InputError for its keys.
+        """
+        folder = as_path(folder)
+        path = folder / FILE
+        content = _read_toml(path)
         for name, value in content.items():
             if name not in ("rig", "acquire") or not isinstance(value, dict):
                 raise InputError(
                     f"{path}: has {name!r}; it must have the tables [rig] and [acquire] only"
                 )
-        table = _check(path, "rig", content.get("rig"), _RIGS)
+        table = _check_kind(path, "rig", content.get("rig"), RIGS)
         if table["kind"] == "live":
-            table["camera"] = _check(path, "rig.camera", table["camera"], _CAMERAS)
-            table["display"] = _check(path, "rig.display", table["display"], rigs.Display)
-        settings = _check(path, "acquire", content.get("acquire", {}), ScanSettings)
+            table["camera"] = _check_kind(path, "rig.camera", table["camera"], CAMERAS)
+            table["display"] = _check_table(path, "rig.display", table["display"], rigs.Display)
+        settings = _check_table(path, "acquire", content.get("acquire", {}), ScanSettings)
         project = cls(folder, table, settings)
-        if (name := settings.get("response")) is not None:
+        curve = settings.get("response")
+        if curve is not None:
             with project.naming("acquire"):
-                decode = CURVES[checks.one_of("response", name, CURVES)][1]
-            settings["response"] = Response(decode(np.linspace(0.0, 1.0, 1025)))
+                settings["response"] = _known_response(curve)
         return project
 
     @property
     def store(self) -> Path:
-        """Where the transport comes to."""
+        """Folder of the transport."""
         return self.folder / STORE
 
     @property
     def kind(self) -> str:
-        """Of the rig."""
+        """Kind of the rig."""
         return self.table["kind"]
 
     @property
     def state(self) -> str:
-        """Of the store: "new" until a whole calibration is in it, then "begun", at last "final"."""
+        """State of the store.
+
+        "new" until a whole calibration is in it, then "begun", at last "final".
+        """
         if not self.store.exists():
             return "new"
         store = BlockStore.open(self.store)
-        return "final" if store.final else "begun" if "strategy" in store.attributes else "new"
+        if store.final:
+            return "final"
+        return "begun" if "strategy" in store.attributes else "new"
 
     @contextlib.contextmanager
     def rig(self, *, closed: bool = False, aligned: bool = False) -> Iterator[Any]:
-        """The rig, until the end of the block; a live one that is `closed` has its grid and channels only.
+        """The rig, which is closed at the end of the block.
 
-        What an `aligned` virtual rig photographs is seen on the pixels that its transport has.
+        Parameters
+        ----------
+        closed : bool
+            Open no camera and no display: a live rig then has its grid and channels only.
+        aligned : bool
+            Photograph a virtual rig on the pixels that its transport has.
         """
-        camera = ("camera_map", "camera_grid") if aligned else ()
+        table = dict(self.table)
+        if aligned:
+            table.pop("camera_map", None)
+            table.pop("camera_grid", None)
         with self.naming("rig"):
             try:
-                rig = _make(
-                    self.folder, {k: v for k, v in self.table.items() if k not in camera}, closed
-                )
+                rig = _make_rig(self.folder, table, closed)
             except LtclError:
                 raise
-            except (TypeError, ValueError) as error:  # a number where a class expects a list
+            except (TypeError, ValueError) as error:
+                # A number where a class expects a list.
                 raise InputTypeError(f"holds a value of an unusable type: {error}") from error
         with Shots(rig):
             yield rig
 
     @contextlib.contextmanager
     def naming(self, table: str) -> Iterator[None]:
-        """Refusals of values begin with the file and the table that they stand in."""
+        """Begin refusals of values with the file and the table that they stand in."""
         try:
             yield
-        except FileError:  # begins with a file
+        except FileError:
+            # It begins with a file.
             raise
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.folder / FILE}: [{table}] {error}") from None
 
     def outlook(self) -> tuple[ScanSettings, dict[str, Any]]:
-        """Settings as `acquire` checks them, and facts for `scanning.plan.plans`, measured or guessed."""
+        """Settings as `acquire` checks them, and arguments of `scanning.plans`.
+
+        Noise, light and exposures are guessed, or measured if the store has a calibration.
+        """
         with self.rig(closed=True) as rig:
-            shots, light = Shots(rig), Light()
+            shots = Shots(rig)
             with self.naming("acquire"):
                 settings = ScanSettings(**self.settings).for_rig(shots)
-            noise = NoiseModel(levels=1 << rig.bits if rig.bits else 0)
-            if (sensor := getattr(rig, "sensor", None)) is not None:
-                noise = replace(noise, electrons=sensor.gain or _NOISELESS, read=sensor.read)
-            light = replace(light, ambient=float(np.mean(getattr(rig, "ambient", light.ambient))))
-            times = expected_exposures(shots, light.direct + light.indirect, light.ambient)
-            facts: dict[str, Any] = {"exposures": tuple(sorted(settings.exposures or times))}
-            facts |= {
-                "grid": shots.grid,
-                "channels": shots.channels,
-                "noise": noise,
-                "light": light,
-            }
+            noise = _expected_noise(rig)
+            light = _expected_light(rig)
+            exposures = settings.exposures
+            if exposures is None:
+                exposures = expected_exposures(shots, light.direct + light.indirect, light.ambient)
         if self.state != "new":
-            known = Calibration.of(self.store)
-            facts |= {"exposures": known.exposures, "noise": known.noise, "light": measured(known)}
-        ways = {"aligned": settings.geometry == "aligned", "by_hand": self.kind == "folder"}
-        facts["calibration"] = expected_photographs(
-            facts["grid"], facts["channels"], settings.frames, **ways
+            calibration = Calibration.of(self.store)
+            noise = calibration.noise
+            light = measured(calibration)
+            exposures = calibration.exposures
+        photographs = expected_photographs(
+            shots.grid,
+            shots.channels,
+            settings.frames,
+            aligned=settings.geometry == "aligned",
+            by_hand=self.kind == "folder",
         )
-        return settings, facts | {
-            name: getattr(settings, name) for name in ("block", "order", "threshold")
+        facts = {
+            "grid": shots.grid,
+            "channels": shots.channels,
+            "exposures": tuple(sorted(exposures)),
+            "noise": noise,
+            "light": light,
+            "calibration": photographs,
+            "block": settings.block,
+            "order": settings.order,
+            "threshold": settings.threshold,
         }
+        return settings, facts
 
 
-def _check(path: Path, name: str, table: Any, make: Any) -> dict[str, Any]:
-    """The arguments of `make`, or of one of several by the key "kind", in a table; None for "none"."""
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: has no table [{name}]; it must have one")
-    needed: dict[str, bool] = {}
-    if isinstance(make, dict):
-        if (kind := table.get("kind")) not in [*make]:
-            raise InputError(
-                f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(make)}"
-            )
-        make, needed = make[kind], {"kind": True}
-    arguments = dict(inspect.signature(make).parameters)
-    if arguments.pop("sensor", None):
-        arguments |= inspect.signature(Sensor).parameters
-    needed |= {key: a.default is a.empty for key, a in arguments.items() if key not in _OBJECTS}
-    needed |= {"transport": True, "grid": False} if make is rigs.VirtualRig else {}
-    for key in {**table, **needed}:
-        if key not in needed:
-            raise InputError(f"{path}: [{name}] has {key!r}; it may have {', '.join(needed)}")
-        if needed[key] and key not in table:
+def _read_toml(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        raise FileError(
+            f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one"
+        )
+    try:
+        return tomllib.loads(input_file(path).read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise FileError(f"{path}: is not valid TOML: {error}") from None
+
+
+def _known_response(curve: Any) -> Response:
+    """The response of a named curve."""
+    checks.one_of("response", curve, CURVES)
+    _, decode = CURVES[curve]
+    return Response(decode(np.linspace(0.0, 1.0, RESPONSE_CODES)))
+
+
+def _expected_noise(rig: Any) -> NoiseModel:
+    """Noise of the camera of a rig, as far as it is known before the calibration."""
+    bits = getattr(rig, "bits", None)
+    levels = 1 << bits if bits else 0
+    sensor: Sensor | None = getattr(rig, "sensor", None)
+    if sensor is None:
+        return NoiseModel(levels=levels)
+    electrons = NOISELESS_ELECTRONS if sensor.gain is None else sensor.gain
+    return NoiseModel(levels=levels, electrons=electrons, read=sensor.read)
+
+
+def _expected_light(rig: Any) -> Light:
+    """Light of a scene, as far as it is known before the calibration."""
+    ambient = getattr(rig, "ambient", None)
+    if ambient is None:
+        return Light()
+    return Light(ambient=float(np.mean(ambient)))
+
+
+def _check_kind(path: Path, name: str, table: Any, classes: Mapping[str, Any]) -> dict[str, Any]:
+    """Check a table whose key "kind" says of which class its other keys are arguments."""
+    _check_is_table(path, name, table)
+    kind = table.get("kind")
+    if kind not in list(classes):
+        raise InputError(
+            f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(classes)}"
+        )
+    return _check_table(path, name, table, classes[kind], {"kind": True})
+
+
+def _check_table(
+    path: Path,
+    name: str,
+    table: Any,
+    make: Callable[..., Any],
+    more_keys: Mapping[str, bool] | None = None,
+) -> dict[str, Any]:
+    """Check that a table has the arguments of `make`, and more keys; "none" becomes None.
+
+    `more_keys` says of each whether it is required.
+    """
+    _check_is_table(path, name, table)
+    required = {} if more_keys is None else dict(more_keys)
+    for key, parameter in _parameters(make).items():
+        if key not in OBJECT_ARGUMENTS:
+            required[key] = parameter.default is parameter.empty
+    if make is rigs.VirtualRig:
+        # The transport is a file, which may have the grid.
+        required |= {"transport": True, "grid": False}
+    for key in table:
+        if key not in required:
+            raise InputError(f"{path}: [{name}] has {key!r}; it may have {', '.join(required)}")
+    for key, is_required in required.items():
+        if is_required and key not in table:
             raise InputError(f"{path}: [{name}] has no {key!r}; it must be there")
     return {key: None if value == "none" else value for key, value in table.items()}
 
 
-def _make(folder: Path, table: dict[str, Any], closed: bool) -> Any:
-    kind = table.pop("kind")
+def _check_is_table(path: Path, name: str, table: Any) -> None:
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: has no table [{name}]; it must have one")
+
+
+def _parameters(make: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Parameters of a class, with those of the sensor of a simulated rig."""
+    parameters = dict(inspect.signature(make).parameters)
+    if "sensor" in parameters:
+        del parameters["sensor"]
+        parameters |= inspect.signature(Sensor).parameters
+    return parameters
+
+
+def _make_rig(folder: Path, table: dict[str, Any], closed: bool) -> Any:
+    """Make the rig of a table; a live one that is `closed` opens nothing."""
+    options = dict(table)
+    kind = options.pop("kind")
     if kind == "virtual":
-        T = load(folder / str(table.pop("transport")), grid=table.pop("grid", None), on_dark="mask")
-        if (camera_map := table.get("camera_map")) is None:
-            table.setdefault("camera_grid", T.camera_grid)
-        else:
-            record = formats.read(folder / str(camera_map))
-            if isinstance(record, CompressedRecord):
-                raise InputError(
-                    f"camera_map is {camera_map}, a compressed transport; it must be a matrix"
-                )
-            table["camera_map"] = record.in_memory().matrices
-        return rigs.VirtualRig(T, T.grid, **table)
+        return _make_virtual_rig(folder, options)
     if kind == "mitsuba":
-        scene = table.pop("scene")
-        return rigs.MitsubaRig(scene if scene in SCENES else folder / str(scene), **table)
+        scene = options.pop("scene")
+        return rigs.MitsubaRig(scene if scene in SCENES else folder / str(scene), **options)
     if kind == "folder":
-        return rigs.FolderRig(folder, **table)
-    camera, display = dict(table.pop("camera")), table.pop("display")
+        return rigs.FolderRig(folder, **options)
     if closed:
-        grid, channels = checks.grid("display.grid", display["grid"]), camera.get("channels", 3)
-        return SimpleNamespace(projector_grid=grid, channels=channels, bits=None, photograph=None)
-    source = camera.get("source")
-    if isinstance(source, str) and (folder / source).exists():  # else a stream
-        camera["source"] = folder / source
+        grid = checks.grid("display.grid", options["display"]["grid"])
+        return ClosedRig(projector_grid=grid, channels=options["camera"].get("channels", 3))
+    return _make_live_rig(folder, options)
+
+
+def _make_virtual_rig(folder: Path, options: dict[str, Any]) -> rigs.VirtualRig:
+    """Make a rig of the files `transport` and `camera_map`."""
+    path = folder / str(options.pop("transport"))
+    T = load(path, grid=options.pop("grid", None), on_dark="mask")
+    camera_map = options.get("camera_map")
+    if camera_map is None:
+        options.setdefault("camera_grid", T.camera_grid)
+    else:
+        record = formats.read(folder / str(camera_map))
+        if isinstance(record, CompressedRecord):
+            raise InputError(
+                f"camera_map is {camera_map}, a compressed transport; it must be a matrix"
+            )
+        options["camera_map"] = record.in_memory().matrices
+    return rigs.VirtualRig(T, T.grid, **options)
+
+
+def _make_live_rig(folder: Path, options: dict[str, Any]) -> rigs.LiveRig:
+    """Open the camera and the display of a live rig; both are closed again if one fails."""
+    camera_options = dict(options.pop("camera"))
+    display_options = options.pop("display")
+    source = camera_options.get("source")
+    # A text that names no file is a stream.
+    if isinstance(source, str) and (folder / source).exists():
+        camera_options["source"] = folder / source
+    camera_class = CAMERAS[camera_options.pop("kind")]
     with contextlib.ExitStack() as opened:
-        eye = opened.enter_context(_CAMERAS[camera.pop("kind")](**camera))
-        rig = rigs.LiveRig(eye, opened.enter_context(rigs.Display(**display)), **table)
+        camera = opened.enter_context(camera_class(**camera_options))
+        display = opened.enter_context(rigs.Display(**display_options))
+        rig = rigs.LiveRig(camera, display, **options)
         opened.pop_all()
     return rig

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Rig`: what a set-up of projector and camera must offer. `Shots`: the one way the package uses it.
+"""`Rig`: the interface of a set-up of projector and camera. `Shots`: the one way it is used.
 
 `Shots` checks codes before they go into a rig and images that come from it, counts the
 photographs, and scales their codes:
@@ -150,7 +150,7 @@ class Shots(Closing):
 
     @property
     def keeps_photographs(self) -> bool:
-        """Whether the rig stores its photographs itself, as one that a person operates does."""
+        """True if the rig stores its photographs itself, as one that a person operates does."""
         return getattr(self.rig, "keeps_photographs", False)
 
     def name(self, number: int) -> str:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`CaptureSession`: the photographs of a calibration; and the folder that holds them until it has ended.
+"""`CaptureSession`: the photographs of a calibration, and the folder that keeps them until its end.
 
-The photographs of a calibration decide on the next one. So one that was stopped is run again from
-its start, with the photographs in STORE.calibration, until it asks for a new one: known by codes,
-seconds, and how often a list of requests had the same before.
+Each photograph of a calibration may decide on the next one. So a calibration that was stopped is
+run again from its start, with the photographs in STORE.calibration, until it asks for a new one.
+A photograph is identified by its codes, its seconds, and how often a list of requests had the same
+before.
 """
 
 from __future__ import annotations
@@ -19,8 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ltcl.acquisition import agreement
-from ltcl.acquisition.agreement import CameraModel
+from ltcl.acquisition.agreement import AgreementRecord, CameraModel
 from ltcl.acquisition.radiometry import Radiance, Response, merge
 from ltcl.acquisition.rig import Shots, shot_key
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
@@ -30,13 +30,20 @@ from ltcl.store import ArrayLog
 logger = logging.getLogger(__name__)
 VOLATILE_KEYS = frozenset({"survey", "seed", "mitsuba", "source", "backend", "index", "driver"})
 """Keys of `describe()`, on any level, that may differ when a scan is resumed."""
-_RIG, _SHOT = "rig", "shot_"  # names in the log: what the rig said of itself, photographs
+# Names in the log: the description of the rig, and the beginning of those of photographs.
+RIG_ENTRY = "rig"
+SHOT_PREFIX = "shot_"
 
 Request = tuple[np.ndarray, float]  # codes (h, w[, 3]) and seconds
+Progress = Callable[[str, int, int], None]
+
+
+def ignore_progress(step: str, done: int, total: int) -> None:
+    """Progress that nobody asked for."""
 
 
 class Photograph(NamedTuple):
-    """Codes (H, W[, 3]) in [0, 1] of full scale, seconds, and its number."""
+    """Image (H, W[, 3]) in [0, 1] of full scale, its seconds, and its number."""
 
     image: np.ndarray
     seconds: float
@@ -44,72 +51,123 @@ class Photograph(NamedTuple):
 
 
 class CaptureSession:
-    """A rig for a calibration, and what is known of its camera so far.
+    """A rig during a calibration, and what is known of its camera so far.
 
-    `sensor` is its response, noise and offset, `hot` (H, W) its defective pixels; `record` has all
-    photographs, to be compared when the noise is known.
+    Attributes
+    ----------
+    shots : Shots
+        The rig.
+    camera : CameraModel
+        Response, noise and offset.
+    hot : ndarray of bool
+        Defective pixels (H, W).
+    record : AgreementRecord
+        All photographs, to be compared when the noise is known.
     """
 
     def __init__(self, shots: Shots, log: ArrayLog | None, progress: Callable[[int], None]) -> None:
-        self.sensor, self.hot = CameraModel(Response.identity()), np.zeros((1, 1), bool)
-        self.shots, self.record = shots, agreement.AgreementRecord()
-        self._log, self._progress = log, progress
+        self.shots = shots
+        self.camera = CameraModel(response=Response.identity())
+        self.hot = np.zeros((1, 1), bool)
+        self.record = AgreementRecord()
+        self._log = log
+        self._progress = progress
         self._uniform: dict[str, Photograph] = {}
 
     def prepare(self, requests: Iterable[Request]) -> None:
         """Announce photographs to the rig, so that a person can take all of them in one go."""
-        self.shots.prepare([r for name, r in _named(requests) if name not in self._uniform])
+        missing = []
+        for name, request in _named(requests):
+            if name not in self._uniform:
+                missing.append(request)
+        self.shots.prepare(missing)
 
     def take(self, groups: Sequence[Sequence[Request]]) -> list[list[Photograph]]:
         """Photographs of requests, in order; those of uniform patterns are used again."""
         requests = [request for group in groups for request in group]
         self.prepare(requests)
-        photographs = iter(
-            [self._uniform.get(name) or self._take(name, r) for name, r in _named(requests)]
-        )
-        return [[next(photographs) for _ in group] for group in groups]
+        photographs = []
+        for name, request in _named(requests):
+            photograph = self._uniform.get(name)
+            if photograph is None:
+                photograph = self._take(name, request)
+            photographs.append(photograph)
+        remaining = iter(photographs)
+        return [[next(remaining) for _ in group] for group in groups]
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
         """The image of one request: codes, or light as soon as the response is known."""
-        return self.sensor.response.linear(self.take([[(codes, seconds)]])[0][0].image)
+        [[photograph]] = self.take([[(codes, seconds)]])
+        return self.linear(photograph)
+
+    def linear(self, photograph: Photograph) -> np.ndarray:
+        """Linear values of a photograph, as far as the response is known."""
+        return self.camera.response.linear(photograph.image)
+
+    def name(self, photograph: Photograph) -> str:
+        """Name of a photograph in messages."""
+        return self.shots.name(photograph.number)
 
     def merge(self, photographs: Sequence[Photograph]) -> Radiance:
-        """Photographs of one pattern as radiance, ambient light included; AcquisitionError where none is."""
-        images, seconds, numbers = zip(*photographs, strict=True)
-        response, noise, offset = self.sensor
+        """Photographs of one pattern as radiance, ambient light included.
+
+        AcquisitionError if they determine none.
+        """
+        numbers = [photograph.number for photograph in photographs]
         with acquisition_error(f"photographs {min(numbers)} to {max(numbers)}"):
-            return merge(images, seconds, response, noise, levels=self.shots.levels, black=offset)
+            return merge(
+                [photograph.image for photograph in photographs],
+                [photograph.seconds for photograph in photographs],
+                self.camera.response,
+                self.camera.noise,
+                levels=self.shots.levels,
+                black=self.camera.offset,
+            )
+
+    def check_agreement(self) -> None:
+        """Raise AcquisitionError with the names of photographs that deviate, if any."""
+        self.record.check(self.camera, self.shots.name)
 
     @contextlib.contextmanager
     def naming_photographs(self) -> Iterator[None]:
-        """Name photographs that deviate, where the block cannot use them."""
+        """Name photographs that deviate, if the block cannot use them."""
         try:
             yield
         except AcquisitionError as error:
             if not isinstance(error, PhotographMissing):
-                self.record.check(self.sensor, self.shots.name)
+                self.check_agreement()
             raise
 
     def _take(self, name: str, request: Request) -> Photograph:
-        stored = None
-        with contextlib.suppress(FileError, KeyError):  # missing or damaged: it is taken again
-            stored = self._log and self._log.get(name)["image"]
-        image = self.shots.photograph(*request, stored)
-        if self._log and stored is None:
+        """Take one photograph, or read it from the log."""
+        codes, seconds = request
+        stored = self._stored_image(name)
+        image = self.shots.photograph(codes, seconds, stored)
+        if self._log is not None and stored is None:
             self._log.put(name, image=self.shots.image)
-        photograph = Photograph(image, request[1], self.shots.number)
-        self.record.add(*request, image, photograph.number)
-        if request[0].min() == request[0].max():
+        photograph = Photograph(image, seconds, self.shots.number)
+        self.record.add(codes, seconds, image, photograph.number)
+        if codes.min() == codes.max():
             self._uniform[name] = photograph
         self._progress(self.shots.count)
         return photograph
 
+    def _stored_image(self, name: str) -> np.ndarray | None:
+        """Image of an earlier run; None if it is missing or damaged, and must be taken again."""
+        if self._log is None:
+            return None
+        try:
+            return self._log.get(name)["image"]
+        except (FileError, KeyError):
+            return None
+
 
 def _named(requests: Iterable[Request]) -> Iterator[tuple[str, Request]]:
+    """Requests with their names in the log; equal ones are counted."""
     counts: Counter[str] = Counter()
     for codes, seconds in requests:
         key = shot_key(codes, seconds)
-        yield f"{_SHOT}{key}_{counts[key]}", (codes, seconds)
+        yield f"{SHOT_PREFIX}{key}_{counts[key]}", (codes, seconds)
         counts[key] += 1
 
 
@@ -123,42 +181,40 @@ def acquisition_error(subject: str) -> Iterator[None]:
 
 
 def calibration_folder(store: Path) -> Path:
-    """T.zarr.calibration for T.zarr."""
+    """Folder of the photographs, T.zarr.calibration for T.zarr."""
     return store.with_name(f"{store.name}.calibration")
 
 
 def calibration_photographs(store: Path) -> int:
-    """How many photographs there are."""
-    return sum(name.startswith(_SHOT) for name in ArrayLog(calibration_folder(store)).names)
+    """Number of photographs in the folder."""
+    names = ArrayLog(calibration_folder(store)).names
+    return sum(name.startswith(SHOT_PREFIX) for name in names)
 
 
 def remove_photographs(store: Path) -> None:
-    """Remove them after the calibration was committed, also those that a killed run left."""
+    """Remove the folder after the calibration was committed, also one that a killed run left."""
     names = ArrayLog(calibration_folder(store)).names
-    if names and all(name == _RIG or name.startswith(_SHOT) for name in names):
+    is_ours = [name == RIG_ENTRY or name.startswith(SHOT_PREFIX) for name in names]
+    if names and all(is_ours):
         shutil.rmtree(calibration_folder(store), ignore_errors=True)
 
 
 @contextlib.contextmanager
 def photograph_log(store: Path, shots: Shots) -> Iterator[ArrayLog | None]:
-    """The folder for a session, which is removed where the block ends well.
+    """The folder of a session, which is removed when the block ends well.
 
-    None where the rig stores its photographs itself. InputError where those in it are of another
-    rig; FileError where it cannot be written, or another process is at work there.
+    None if the rig stores its photographs itself. InputError if the folder has photographs of
+    another rig; FileError if it cannot be written, or another process is at work there.
     """
-    if getattr(shots.rig, "keeps_photographs", False):
+    if shots.keeps_photographs:
         yield None
         return
-    log = ArrayLog(calibration_folder(store))
-    if log.path.is_dir():
-        sweep(log.path)
-    if not log.names and log.path.exists() and any(log.path.iterdir()):
-        raise FileError(f"{log.path}: was not made by ltcl; it will not be replaced")
-    if not log.names:
-        log.put(_RIG, json=np.array(json.dumps(shots.describe()["rig"], default=str)))
+    log = _open_log(calibration_folder(store), shots)
     with locked(log.path, wait=False):
-        check_same_rig(json.loads(str(log.get(_RIG)["json"])), shots, log.path)
-        if count := calibration_photographs(store):
+        description = json.loads(str(log.get(RIG_ENTRY)["json"]))
+        check_same_rig(description, shots, log.path)
+        count = calibration_photographs(store)
+        if count:
             logger.info("calibration: %d photographs of an earlier run are used again", count)
         try:
             yield log
@@ -168,31 +224,49 @@ def photograph_log(store: Path, shots: Shots) -> Iterator[ArrayLog | None]:
     remove_photographs(store)
 
 
+def _open_log(path: Path, shots: Shots) -> ArrayLog:
+    """The log in a folder; a new one begins with the description of the rig."""
+    log = ArrayLog(path)
+    if path.is_dir():
+        sweep(path)
+    if log.names:
+        return log
+    if path.exists() and any(path.iterdir()):
+        raise FileError(f"{path}: was not made by ltcl; it will not be replaced")
+    description = json.dumps(shots.describe()["rig"], default=str)
+    log.put(RIG_ENTRY, json=np.array(description))
+    return log
+
+
 def check_same_rig(description: Any, shots: Shots, path: Path) -> None:
-    """Refuse a rig that describes itself otherwise than that of the photographs in `path`."""
+    """Refuse a rig with another description than that of the photographs in `path`."""
     check_same("rig", _identity(shots.describe()["rig"]), _identity(description), path)
 
 
 def check_same(name: str, now: Any, before: Any, path: Path) -> None:
-    """Refuse to go on with `path` where a setting, or what a rig says of itself, has another value."""
+    """Refuse to go on with `path` if a setting, or a fact about a rig, has another value."""
     if isinstance(now, dict) and isinstance(before, dict):
         for key in sorted(now.keys() | before.keys()):
             check_same(f"{name}.{key}", now.get(key), before.get(key), path)
     elif now != before:
-        text = f"{path} was begun with {before!r:.80}; it must be that, or another store"
-        raise InputError(f"{name} is {now!r:.80}, but {text}")
+        raise InputError(
+            f"{name} is {now!r:.80}, but {path} was begun with {before!r:.80}; "
+            "it must be that, or another store"
+        )
 
 
 def _identity(description: Any) -> dict[str, Any]:
-    """What a rig says of itself as plain JSON, numbers to four digits, without `VOLATILE_KEYS`.
+    """Description of a rig as plain JSON, numbers to four digits, without `VOLATILE_KEYS`.
 
     >>> _identity({"camera": {"kind": "opencv", "source": 0}, "period": 1 / 60, "seed": 3})
     {'camera': {'kind': 'opencv'}, 'period': 0.01667}
     """
-    return json.loads(
-        json.dumps(description, default=str),
-        parse_float=lambda digits: float(f"{float(digits):.4g}"),
-        object_pairs_hook=lambda pairs: {
-            key: value for key, value in pairs if key not in VOLATILE_KEYS
-        },
-    )
+
+    def four_digits(digits: str) -> float:
+        return float(f"{float(digits):.4g}")
+
+    def without_volatile(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        return {key: value for key, value in pairs if key not in VOLATILE_KEYS}
+
+    text = json.dumps(description, default=str)
+    return json.loads(text, parse_float=four_digits, object_pairs_hook=without_volatile)

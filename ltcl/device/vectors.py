@@ -135,12 +135,12 @@ def dot_pairs(*pairs: str) -> int:
     return code
 
 
-def kernel_of(device: Device, name: str) -> Kernel:
-    """A kernel of a file that includes `common/columns.h`."""
+def kernel_of(device: Device, name: str, **defines: int | str) -> Kernel:
+    """A kernel of a file that includes `common/columns.h`, with the defines of that file."""
     file = name.partition("_")[0]
     if device.is_cpu:
-        return device.kernel(file, name)
-    return device.kernel(file, name, ADJACENT=0)
+        return device.kernel(file, name, **defines)
+    return device.kernel(file, name, ADJACENT=0, **defines)
 
 
 DOT_OF_A_AND_B = dot_pairs("ab")

@@ -1,53 +1,45 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What every linear operator on a device promises.
+"""The contract of every linear operator on a device.
 
-A subclass implements `_product`, which queues a product, or `_bound`, which prepares one for many
-calls.
+A subclass writes `_queue_product`; all other products derive from it. `_bind_product` is written
+as well where a product can be prepared for many calls. A subclass that knows its entries writes
+`diagonal`, `norms`, `norm_bound` and `_float64_form`.
 """
 
 from __future__ import annotations
 
+import abc
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse.linalg
 
 from ltcl import checks
-from ltcl.device import Array, Device, vectors
+from ltcl.device import Array, Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.operators.epilogue import PLAIN, Epilogue
+from ltcl.operators.knowledge import (
+    Float64Form,
+    Knowledge,
+    NormBound,
+    Norms,
+    Product,
+    RowSumRange,
+)
+from ltcl.operators.stepper import Stepper
 
-WIDTHS = (8, 4, 3, 2, 1)  # right-hand sides one launch of a product kernel takes
-_BLOCK = 64  # columns of a product that makes entries
+if TYPE_CHECKING:
+    from ltcl.operators.bases import Basis
 
-
-class Norms(NamedTuple):
-    """Norms of a matrix, and its smallest entry where one is negative, else 0."""
-
-    one: float
-    inf: float
-    frobenius: float
-    lowest: float
-
-
-class Epilogue(NamedTuple):
-    """out = a (A x) + b y + c x in one launch; y, which may be `out`, is not read where b is 0."""
-
-    a: float = 1.0
-    b: float = 0.0
-    y: Array | None = None
-    c: float = 0.0
-
-    def without_shift(self, x: Array) -> Epilogue:
-        """The same for a product that is not of x itself: x takes the place of y where that is free."""
-        return Epilogue(self.a, self.c, x) if self.b == 0.0 else self
+# Columns of a product that computes entries.
+ENTRY_COLUMNS = 64
+# Bytes up to which a product in float64 on the host takes no longer than a few waits for a device.
+CHEAP_PRODUCT_BYTES = 4 << 20
 
 
-PLAIN = Epilogue()  # out = A x
-
-
-class Operator(scipy.sparse.linalg.LinearOperator):
+class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     """An (M, N) linear operator in float32 on an OpenCL device.
 
     NumPy in, NumPy out, wherever SciPy takes a `LinearOperator`; `apply` takes and gives device
@@ -58,46 +50,47 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     error : float
         Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
     solution_error, error_bound : float
-        What compression changes solutions by, ``||x~ - x|| / ||x||``: as its norm states, and at most.
+        Change of solutions by compression, ``||x~ - x|| / ||x||``: estimated by its norm, and at
+        most.
     weights : (N,) float64 or None
-        Of an inner product <x, y> = sum_i w_i x_i y_i in which it should be self-adjoint, where one
-        is known.
+        Weights of an inner product <x, y> = sum_i w_i x_i y_i in which the operator should be
+        self-adjoint, if one is known.
+    core_basis : Basis or None
+        The isometric basis W of an operator W^T C W.
+    coefficient_basis : Basis or None
+        The isometric basis W of an operator I + W^T C W, which can be solved on coefficients. On the
+        coefficients that W leaves out it is the identity, as W^T C W itself is not.
+    known : Knowledge
+        Facts that are found once in the life of the operator.
     """
 
-    error = solution_error = error_bound = 0.0
+    error: float = 0.0
+    solution_error: float = 0.0
+    error_bound: float = 0.0
     weights: np.ndarray | None = None
+    core_basis: Basis | None = None
+    coefficient_basis: Basis | None = None
 
     def __init__(
         self, device: Device, shape: tuple[int, int], *parts: Operator | Array | None
     ) -> None:
         super().__init__(np.float32, shape)
         self.device = device
-        self._parts: tuple[Operator | Array | None, ...] = parts  # what it is made of
-        self._row_sums: np.ndarray | None = None
+        self.known = Knowledge()
+        # Operators and arrays that it is made of.
+        self._parts: tuple[Operator | Array | None, ...] = parts
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device; what several parts share counts once."""
-        return sum(array.nbytes for array in self.arrays())
+    # The contract.
 
-    def arrays(self) -> set[Array]:
-        """All that it keeps on the device."""
-        members = (x for x in self._parts if x is not None)
-        return set[Array]().union(*({x} if isinstance(x, Array) else x.arrays() for x in members))
-
-    def bytes_read(self) -> int:
-        """Bytes that each product reads from a disk."""
-        return sum(part.bytes_read() for part in self._parts if isinstance(part, Operator))
-
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+    @abc.abstractmethod
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         """Queue ``out = a (A x) + b y + c x``, or with A^T. `out` is never `x`."""
-        self._bound(x, out, epilogue, transpose)()
 
-    def _bound(
+    def _bind_product(
         self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
     ) -> Callable[[], object]:
-        """What queues the product at each call."""
-        return functools.partial(self._product, x, out, epilogue, transpose)
+        """A function that queues the product at each call."""
+        return functools.partial(self._queue_product, x, out, epilogue, transpose)
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64, on the host."""
@@ -109,6 +102,53 @@ class Operator(scipy.sparse.linalg.LinearOperator):
             f"{type(self).__name__} cannot see its entries, so their norms are unknown"
         )
 
+    def norm_bound(self) -> NormBound:
+        """A bound on the 2-norm of |A|, entry by entry, or else an estimate.
+
+        Without entries it is the largest row sum: a bound if A is symmetric and nonnegative.
+        """
+        row_sums = self.row_sum_range()
+        return NormBound(max(1.0, row_sums.largest, -row_sums.least), is_bound=False)
+
+    def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
+        """The numbers as they were given, in float64; None if they are on the device alone.
+
+        `reads_blocks` allows reading the blocks of a store once more.
+        """
+        return None
+
+    @property
+    def has_entries(self) -> bool:
+        """True if its entries lie on one device, in rows."""
+        return False
+
+    def on_coefficients(self) -> Operator:
+        """The same operator between the coefficients of its basis."""
+        raise InputError(f"{type(self).__name__} is not between the coefficients of one basis")
+
+    # Memory.
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device; arrays that several parts share count once."""
+        return sum(array.nbytes for array in self.arrays())
+
+    def arrays(self) -> set[Array]:
+        """All arrays that it keeps on the device."""
+        arrays: set[Array] = set()
+        for part in self._parts:
+            if isinstance(part, Array):
+                arrays.add(part)
+            elif part is not None:
+                arrays |= part.arrays()
+        return arrays
+
+    def bytes_read(self) -> int:
+        """Bytes that each product reads from a disk."""
+        return sum(part.bytes_read() for part in self._parts if isinstance(part, Operator))
+
+    # Products on the device.
+
     def apply(
         self,
         x: Array,
@@ -119,87 +159,197 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         add_scale: float = 1.0,
         shift: float = 0.0,
     ) -> Array:
-        """Queue ``out = scale (A x) + add_scale add + shift x``; returns `out`, made when not given.
+        """Queue ``out = scale (A x) + add_scale add + shift x``; returns `out`.
 
-        x is (N,) or (N, k), `add` and `out` are (M,) or (M, k); `out` may be `add`, but not `x`.
-        `shift` needs a square operator. InputError for shapes that do not fit.
+        Parameters
+        ----------
+        x : Array, (N,) or (N, k)
+        out : Array, (M,) or (M, k), optional
+            A new array when not given. It may be `add`, but not `x`.
+        scale : float
+        add : Array, like `out`, optional
+        add_scale : float
+        shift : float
+            Not 0 only for a square operator.
+
+        Raises
+        ------
+        InputError
+            If shapes, types or devices do not fit.
         """
-        epilogue = Epilogue(
-            float(scale), 0.0 if add is None else float(add_scale), add, float(shift)
-        )
-        out = self._checked(x, out, epilogue)
-        self._bound(x, out, epilogue, False)()
+        add_factor = 0.0 if add is None else float(add_scale)
+        epilogue = Epilogue(a=float(scale), b=add_factor, y=add, c=float(shift))
+        self._check_operand(x, epilogue)
+        if out is None:
+            out = self.device.empty((self.shape[0], *x.shape[1:]))
+        self._check_arrays(x, out, epilogue)
+        self._bind_product(x, out, epilogue, False)()
         return out
 
     def apply_transpose(self, x: Array, out: Array | None = None, **epilogue: Any) -> Array:
-        """Queue ``out = scale (A^T x) + add_scale add + shift x``; keywords are those of `apply`."""
+        """Queue ``out = scale (A^T x) + add_scale add + shift x``; keywords as those of `apply`."""
         return self.T.apply(x, out, **epilogue)
 
     def bind(
         self, x: Array, out: Array, epilogue: Epilogue = PLAIN, *, transpose: bool = False
     ) -> Callable[[], object]:
-        """A function that queues ``out = a (A x) + b y + c x`` in microseconds; refuses what `apply` does."""
+        """A function that queues ``out = a (A x) + b y + c x`` in microseconds.
+
+        It refuses what `apply` refuses.
+        """
         A = self.T if transpose else self
-        A._checked(x, out, epilogue)
-        return A._bound(x, out, epilogue, False)
+        A._check_operand(x, epilogue)
+        A._check_arrays(x, out, epilogue)
+        return A._bind_product(x, out, epilogue, False)
 
     def stepper(
         self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0
     ) -> Stepper:
-        """Steps of a stationary iteration on S x = b, S = a A + c I, which change `x` and its residual `r`.
+        """Steps of a stationary iteration on S x = b, S = a A + c I.
 
-        Norms of residuals of up to `slots` steps may wait on the device until they are read.
+        They change `x` and its residual `r`. Norms of residuals of up to `slots` steps may wait on
+        the device until they are read.
         """
         return Stepper(self, x, r, slots, a, c)
 
+    def _check_operand(self, x: Array, epilogue: Epilogue) -> None:
+        rows, columns = self.shape
+        if x.shape[0] != columns or len(x.shape) > 2:
+            raise InputError(
+                f"x has shape {x.shape}; the operator {self.shape} needs "
+                f"({columns},) or ({columns}, k)"
+            )
+        # Kernels count elements in 32 bits.
+        max_columns = ((1 << 31) - 1) // max(rows, columns, 1)
+        if x.columns > max_columns:
+            raise InputError(f"x has {x.columns} right-hand sides; one product takes {max_columns}")
+        if epilogue.c and rows != columns:
+            raise InputError(f"shift is {epilogue.c:g}; it must be 0 for the operator {self.shape}")
+
+    def _check_arrays(self, x: Array, out: Array, epilogue: Epilogue) -> None:
+        expected = (self.shape[0], *x.shape[1:])
+        self._check_array("x", x, x.shape)
+        self._check_array("out", out, expected)
+        if epilogue.y is not None:
+            self._check_array("add", epilogue.y, expected)
+        if out.buffer is x.buffer:
+            raise InputError("out is x; a product cannot be written over its own operand")
+
+    def _check_array(self, name: str, array: Array, shape: tuple[int, ...]) -> None:
+        if array.dtype != np.float32:
+            raise InputError(f"{name} holds {array.dtype}; operators take float32")
+        if array.device is not self.device:
+            raise InputError(
+                f"{name} is on another device, {array.device}; it must be on {self.device}"
+            )
+        if array.shape != shape:
+            raise InputError(f"{name} has shape {array.shape}; it must be {shape}")
+
+    # Facts.
+
     def row_sums(self) -> np.ndarray:
         """A 1, (M,) float32: one product, at the first call only."""
-        if self._row_sums is None:
-            ones, sums = (
-                self.device.upload(np.ones(self.shape[1])),
-                self.device.empty(self.shape[0]),
-            )
+        if self.known.row_sums is None:
+            ones = self.device.upload(np.ones(self.shape[1]))
+            sums = self.device.empty(self.shape[0])
             self.bind(ones, sums)()
-            self._row_sums = sums.get()
-        return self._row_sums
+            self.known.row_sums = sums.get()
+        return self.known.row_sums
+
+    def row_sum_range(self) -> RowSumRange:
+        """The least, the mean and the largest row sum, computed once.
+
+        The mean is the Rayleigh quotient of the even picture, in the inner product of `weights`.
+        """
+        if self.known.row_sum_range is None:
+            sums = self.row_sums()
+            # Sums that left float32 stay infinite.
+            with np.errstate(all="ignore"):
+                mean = np.average(sums.astype(np.float64), weights=self.weights)
+            self.known.row_sum_range = RowSumRange(
+                least=float(np.min(sums)), mean=float(mean), largest=float(np.max(sums))
+            )
+        return self.known.row_sum_range
+
+    @property
+    def has_cheap_float64_product(self) -> bool:
+        """True if a float64 product on the host takes no longer than a few waits, if there is one."""
+        return self.nbytes + self.bytes_read() <= CHEAP_PRODUCT_BYTES
+
+    def product_float64(self) -> Product | None:
+        """The function x -> A x, (N, k) -> (M, k) float64, with the numbers as they were given.
+
+        None if they are on the device alone, or the host has no room for them.
+        """
+        form = self.known.float64_form
+        if form is None:
+            try:
+                form = self._float64_form()
+            except MemoryLimitError:
+                return None
+        if form is None:
+            return None
+        # An operator that multiplies on the host itself would refer to itself.
+        if form.matrix is not self and self.has_cheap_float64_product:
+            self.known.float64_form = form
+        return form.product()
+
+    def matrix_float64(self) -> tuple[np.ndarray, bool]:
+        """A square A as (N, N) float64, and whether its numbers are those given.
+
+        Else they are float32 products. MemoryLimitError if the host has no room.
+        """
+        n = self.shape[0]
+        checks.fits_host(f"a dense S of N = {n}", 8 * n**2)
+        form = self._float64_form(reads_blocks=True)
+        if form is None:
+            return self.to_dense(), False
+        return form.to_dense(), True
 
     def to_dense(self) -> np.ndarray:
-        """The whole matrix as (M, N) float64 on the host; MemoryLimitError where that has no room for it."""
+        """The whole matrix as (M, N) float64 on the host.
+
+        MemoryLimitError if that has no room for it.
+        """
         rows, columns = self.shape
-        what, nbytes = f"a dense {rows} x {columns} matrix", 8 * rows * columns
+        what = f"a dense {rows} x {columns} matrix"
+        nbytes = 8 * rows * columns
         checks.fits_host(what, nbytes)
         try:
             return self._dense()
         except MemoryLimitError:
             raise
-        except MemoryError as error:  # a limit of the process, below what the host has
+        except MemoryError as error:
+            # A limit of the process, below the memory of the host.
             raise MemoryLimitError(
                 f"{what} needs {checks.size(nbytes)}, more than the host gives"
             ) from error
 
     def _dense(self) -> np.ndarray:
-        return self.between(*map(np.arange, self.shape))
+        rows, columns = self.shape
+        return self.between(np.arange(rows), np.arange(columns))
 
     def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """The entries (rows, columns), both lists of indices, in float64: a product for each column."""
+        """The entries (rows, columns), two lists of indices, in float64, by a product a column."""
         entries = np.empty((len(rows), len(columns)))
-        for start in range(0, len(columns), _BLOCK):
-            some = columns[start : start + _BLOCK]
-            unit = np.zeros((self.shape[1], len(some)), np.float32)
-            unit[some, np.arange(len(some))] = 1
-            entries[:, start : start + _BLOCK] = self._matmat(unit)[rows]
+        for start in range(0, len(columns), ENTRY_COLUMNS):
+            stop = start + ENTRY_COLUMNS
+            block = columns[start:stop]
+            unit_vectors = np.zeros((self.shape[1], len(block)), np.float32)
+            unit_vectors[block, np.arange(len(block))] = 1
+            entries[:, start:stop] = self._matmat(unit_vectors)[rows]
         return entries
 
     def __reduce__(self) -> Any:
         raise InputTypeError(
-            f"{type(self).__name__} lies on a device and cannot be pickled; pickle its Transport or "
-            "Inverse, or what to_dense() gives"
+            f"{type(self).__name__} lies on a device and cannot be pickled; pickle its Transport "
+            "or Inverse, or the result of to_dense()"
         )
 
-    # What SciPy asks for: NumPy in, NumPy out. It makes the other products of these.
+    # The methods that SciPy asks for: NumPy in, NumPy out. It derives the other products from them.
 
     def dot(self, x: Any) -> Any:
-        """A x, of an array or an operator; masked values, which SciPy would fill, are refused."""
+        """A x for an array or an operator; masked values, which SciPy would fill, are refused."""
         checks.unmasked("x", x)
         return super().dot(x)
 
@@ -208,116 +358,50 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         return super()._rdot(x)
 
     def _matmat(self, X: np.ndarray) -> np.ndarray:
-        return self.apply(self.device.upload(checks.real("x", X))).get()
+        operand = self.device.upload(checks.real("x", X))
+        return self.apply(operand).get()
 
     def _transpose(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
         return Transposed(self)
 
+    # The adjoint of real numbers is the transpose.
     def _adjoint(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self._transpose()  # real numbers
-
-    def _checked(self, x: Array, out: Array | None, epilogue: Epilogue) -> Array:
-        """`out`, made where it is None; operands that do not fit are refused."""
-        rows, columns = self.shape
-        if x.shape[0] != columns or len(x.shape) > 2:
-            raise InputError(
-                f"x has shape {x.shape}; the operator {self.shape} needs ({columns},) or ({columns}, k)"
-            )
-        most = ((1 << 31) - 1) // max(rows, columns, 1)
-        if x.columns > most:
-            raise InputError(f"x has {x.columns} right-hand sides; one product takes {most}")
-        if epilogue.c and rows != columns:
-            raise InputError(f"shift is {epilogue.c:g}; it must be 0 for the operator {self.shape}")
-        expected = (rows, *x.shape[1:])
-        out = self.device.empty(expected) if out is None else out
-        for name, array in (("x", x), ("out", out), ("add", epilogue.y)):
-            if array is None:
-                continue
-            if array.dtype != np.float32:
-                raise InputError(f"{name} holds {array.dtype}; operators take float32")
-            if array.device is not self.device:
-                raise InputError(
-                    f"{name} is on another device, {array.device}; it must be on {self.device}"
-                )
-            if array is not x and array.shape != expected:
-                raise InputError(f"{name} has shape {array.shape}; it must be {expected}")
-        if out.buffer is x.buffer:
-            raise InputError("out is x; a product cannot be written over its own operand")
-        return out
-
-
-class Stepper:
-    """Steps of a stationary iteration: x += d; r -= S d; d = keep d + gain r.
-
-    With keep = 0 they are Jacobi's (gain 1, eq. 20) or Richardson's; with the right numbers
-    Chebyshev's. `waiting` counts the steps whose norms were not read yet.
-    """
-
-    def __init__(self, A: Operator, x: Array, r: Array, slots: int, a: float, c: float) -> None:
-        self.A, self.x, self.r, self.slots = A, x, r, slots
-        self.d, self.other = x.like(), x.like()
-        self.waiting = 0
-        self._a, self._c = a, c
-        self._prepare()
-
-    def _prepare(self) -> None:
-        # (slots, groups, k) squares of residuals
-        self._partials = self.A.device.empty(
-            (self.slots, vectors.step_groups(self.x), self.x.columns)
-        )
-        self._product = self.A.bind(self.d, self.other, Epilogue(self._a, c=self._c))
-
-    def start(self, gain: float) -> None:
-        """Queue d = gain r, the first direction."""
-        vectors.axpby(gain, self.r, 0.0, self.r, self.d)
-
-    def step(self, keep: float, gain: float) -> None:
-        """Queue one step: x moves along d, and the next d is keep d + gain r with the new r."""
-        self._product()
-        vectors.queue_step(
-            self.other, self.x, self.r, self.d, keep, gain, self._partials, self.waiting
-        )
-        self.waiting += 1
-
-    def norms(self) -> np.ndarray:
-        """Norms (waiting, k) float64 of the residuals since the last call, newest last; waits once."""
-        squares = self.A.device.empty((self.slots, self.x.columns))
-        vectors.queue_sum_partials(self._partials, self.waiting, squares)
-        host = squares.get()[: self.waiting]
-        self.waiting = 0
-        return np.sqrt(host.astype(np.float64))
+        return self._transpose()
 
 
 class Transposed(Operator):
     """A^T of another operator, sharing its memory."""
 
     def __init__(self, base: Operator) -> None:
-        super().__init__(base.device, base.shape[::-1], base)
+        rows, columns = base.shape
+        super().__init__(base.device, (columns, rows), base)
         self.base = base
-        self.error, self.solution_error, self.error_bound = (
-            base.error,
-            base.error_bound,
-            base.error_bound,
-        )
+        self.error = base.error
+        # The estimate is one of A alone.
+        self.solution_error = base.error_bound
+        self.error_bound = base.error_bound
 
     def diagonal(self) -> np.ndarray:
-        """That of A."""
+        """The diagonal of A."""
         return self.base.diagonal()
 
-    def _bound(
+    def norm_bound(self) -> NormBound:
+        """The bound of A."""
+        bound = self.base.norm_bound()
+        return bound if bound.is_bound else super().norm_bound()
+
+    def matrix_float64(self) -> tuple[np.ndarray, bool]:
+        """The transpose of A as (N, N) float64, and whether its numbers are those given."""
+        matrix, is_given = self.base.matrix_float64()
+        return matrix.T, is_given
+
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self.base._queue_product(x, out, epilogue, not transpose)
+
+    def _bind_product(
         self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
     ) -> Callable[[], object]:
-        return self.base._bound(x, out, epilogue, not transpose)
+        return self.base._bind_product(x, out, epilogue, not transpose)
 
     def _transpose(self) -> Operator:
         return self.base
-
-
-def widths(columns: int) -> list[tuple[int, int]]:
-    """Launches of k right-hand sides, as (offset, width) pairs: (0, 8) and (8, 3) of 11."""
-    pieces, offset = [], 0
-    while offset < columns:
-        width = next(w for w in WIDTHS if w <= columns - offset)
-        pieces.append((offset, width))
-        offset += width
-    return pieces

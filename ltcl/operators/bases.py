@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bases: in which coefficients a picture is written, and some of their coefficients as bases of their own.
+"""Bases: the coefficients in which a picture is written, and subsets of them as bases of their own.
 
 An operator between two bases is R = W_out^T C W_in. Smooth light transport in wavelets leaves most
-rows and columns of C empty; with P, (M, N), that picks the others, its support, C = P^T (P C P^T)
-P.
+rows and columns of C empty; with P, (M, N), that picks the others, its support,
+C = P^T (P C P^T) P.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import abc
 from typing import Any
 
 import numpy as np
@@ -18,31 +18,34 @@ from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
-from ltcl.operators.base import PLAIN, WIDTHS, Epilogue, Operator
+from ltcl.operators.base import Operator
+from ltcl.operators.epilogue import PLAIN, Epilogue, widest_launch
 
-_GROUP = 64  # work-items side by side
-_GROUPS = (
-    1 << 14
-)  # items along the second and third dimension, where kernels stride: GPUs take 65535 groups
-_MOST = 0.5  # of the coefficients: where more are in the support, restricting to them gains little
+# Work-items side by side on a GPU.
+GROUP_ITEMS = 64
+# Items along the second and third dimension, in which kernels stride: GPUs take 65535 groups.
+MAX_STRIDING_ITEMS = 1 << 14
+# Share of the coefficients in the support beyond which restricting to it gains little.
+MAX_SUPPORT_SHARE = 0.5
 
 
 class Basis(Operator):
     """W, (M, N): `apply` is analysis, from N pixels to M coefficients, `apply_transpose` synthesis.
 
+    Subclasses write `_transform`.
+
     Attributes
     ----------
-    grid : (h, w) of the pictures; N = h * w pixels, row-major
-    name : str, as `ltcl.operators.basis` takes it
+    grid : (h, w)
+        Size of the pictures; N = h * w pixels, row-major.
+    name : str
+        As `ltcl.operators.basis` takes it.
     orthonormal, isometric : bool
         Whether synthesis undoes analysis, W W^T = W^T W = I; whether it keeps norms, W W^T = I.
     """
 
     orthonormal = True
     isometric = True
-    # (x, out, a, b, y, transpose): queues out = a (W x) + b y, or with W^T; y is not read where b
-    # is 0.
-    _transform: Callable[[Array, Array, float, float, Array, bool], None]
 
     def __init__(
         self,
@@ -52,49 +55,71 @@ class Basis(Operator):
         coefficients: int,
         *parts: Operator | Array | None,
     ) -> None:
-        self.grid, self.name = checks.grid("grid", grid), name
-        super().__init__(device, (coefficients, self.grid[0] * self.grid[1]), *parts)
+        h, w = checks.grid("grid", grid)
+        self.grid = (h, w)
+        self.name = name
+        super().__init__(device, (coefficients, h * w), *parts)
+
+    @abc.abstractmethod
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
+        """Queue out = a (W x) + b y, or with W^T; y is not read if b is 0."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """What `ltcl.operators.basis_of` makes it of again, as arrays that a file can hold."""
+        """Arrays that a file can hold, from which `ltcl.operators.stored` makes the basis again."""
         return {"name": np.array(self.name), "grid": np.array(self.grid)}
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        a, b, y, c = epilogue.without_shift(x)
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        epilogue = epilogue.without_shift(x)
         if out.size:
-            self._transform(x, out, a, b, x if y is None else y, transpose)
-        if c:
-            vectors.axpy(c, x, out)
+            y = epilogue.operand(x)
+            self._transform(x, out, epilogue.a, epilogue.b, y, transpose)
+        if epilogue.c:
+            vectors.axpy(epilogue.c, x, out)
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
-        """A kernel for k right-hand sides, and in how many pieces it takes them."""
-        lanes = next(width for width in WIDTHS if width <= k)
-        return self.device.kernel(file, f"{file}_{name}", K=lanes, **defines), -(-k // lanes)
+        """A kernel for k right-hand sides, and the number of pieces in which it takes them."""
+        lanes = widest_launch(k)
+        kernel = self.device.kernel(file, f"{file}_{name}", K=lanes, **defines)
+        return kernel, -(-k // lanes)
 
 
-def launch_grid(kernel: Kernel, pieces: int, rows: int, columns: int, *arguments: Any) -> None:
-    """Queue a kernel that strides through rows and columns: an item a row on CPUs, one a place on GPUs."""
-    across, group = (1, 1) if kernel.device.is_cpu else (min(columns, _GROUPS), _GROUP)
-    kernel((pieces, across, min(rows, _GROUPS)), (1, group, 1), *arguments)
+def launch_grid(kernel: Kernel, pieces: int, grid: tuple[int, int], **arguments: Any) -> None:
+    """Queue a kernel that strides through rows and columns.
+
+    A CPU has an item for each row of `grid`, a GPU one for each place.
+    """
+    rows, columns = grid
+    if kernel.device.is_cpu:
+        across = 1
+        group = 1
+    else:
+        across = min(columns, MAX_STRIDING_ITEMS)
+        group = GROUP_ITEMS
+    items = (pieces, across, min(rows, MAX_STRIDING_ITEMS))
+    kernel(items, (1, group, 1), **arguments)
 
 
-def launch_group(kernel: Kernel, pieces: int, *arguments: Any) -> None:
-    """Queue a kernel of which one group does all: an item on CPUs, up to 16 x 16 of them on GPUs."""
+def launch_group(kernel: Kernel, pieces: int, **arguments: Any) -> None:
+    """Queue a kernel of which one group does all: one item on a CPU, up to 16 x 16 on a GPU."""
     group = (1, 1, 1) if kernel.device.is_cpu else kernel.group((1, 16, 16))
-    kernel((pieces, *group[1:]), group, *arguments)
+    kernel((pieces, *group[1:]), group, **arguments)
 
 
 class SubsetBasis(Basis):
-    """P, (M, N): coefficient i is pixel ``places[i]``; those left out are 0 in P^T. Of all: a permutation.
+    """P, (M, N): coefficient i is pixel ``places[i]``; pixels left out are 0 in P^T.
 
-    With `of` it is P W: some coefficients of W instead of pixels.
+    With `of` it is P W: some coefficients of W instead of pixels. All places make a permutation.
 
     Parameters
     ----------
+    device : Device
+    grid : (h, w)
     places : (M,) of int
-        Pixels, row-major, or coefficients of W; InputError where there are none, or one twice.
+        Pixels, row-major, or coefficients of W; InputError if there are none, or one twice.
     of : Basis, optional
-        W, of the same device and grid. Of a subset: places among its coefficients.
+        W, of the same device and grid. For a subset the places are among its coefficients.
 
     Examples
     --------
@@ -111,64 +136,102 @@ class SubsetBasis(Basis):
             raise InputError(
                 f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}"
             )
-        count, places = h * w if of is None else of.shape[0], checks.real("places", places)
-        if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
-            kind = f"{places.shape} of {places.dtype}"
-            raise InputError(f"places has shape {kind}; it must be (M,) whole numbers")
-        least, most = places.min(), places.max()
-        if least < 0 or most >= count or len(np.unique(places)) < len(places):
-            raise InputError(f"places are {least} to {most}; they must be different, below {count}")
-        self.places = places.astype(np.int64)
+        self.places = _check_places(places, _count_coefficients((h, w), of))
         if isinstance(of, SubsetBasis):
-            self.places, of = of.places[self.places], of.of
-        self.of, count = of, h * w if of is None else of.shape[0]
+            self.places = of.places[self.places]
+            of = of.of
+        self.of = of
+        count = _count_coefficients((h, w), of)
         inverse = np.full(count, -1)
         inverse[self.places] = np.arange(len(self.places))
-        self._orders = [device.upload(order, np.int32) for order in (self.places, inverse)]
+        self._order = device.upload(self.places, np.int32)
+        self._inverse_order = device.upload(inverse, np.int32)
         name = "pixels" if of is None else of.name
-        super().__init__(device, (h, w), name, len(self.places), *self._orders, of)
-        self.orthonormal = len(self.places) == count and (of is None or of.orthonormal)
+        super().__init__(
+            device, (h, w), name, len(self.places), self._order, self._inverse_order, of
+        )
+        is_permutation = len(self.places) == count
+        self.orthonormal = is_permutation and (of is None or of.orthonormal)
         self.isometric = of is None or of.isometric
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Those of W, or name and grid, and the places."""
-        own = super().to_arrays() if self.of is None else self.of.to_arrays()
-        return {**own, "places": self.places}
+        """The arrays of W, or name and grid, and the places."""
+        arrays = super().to_arrays() if self.of is None else self.of.to_arrays()
+        return {**arrays, "places": self.places}
 
     def _transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
     ) -> None:
-        order, k = self._orders[transpose], x.columns
-        kernel, pieces = self._kernel("ordered", "gather", k)
-        items, group = (pieces, min(order.size, _GROUPS)), (1, _GROUP)
         if self.of is None:
-            kernel(items, group, order.size, k, a, b, order, x, y, out)
+            self._gather(x, out, a, b, y, transpose)
             return
         coefficients = self.device.empty((self.of.shape[0], *x.shape[1:]))
         if transpose:
-            kernel(items, group, order.size, k, 1.0, 0.0, order, x, x, coefficients)
-            self.of._product(coefficients, out, Epilogue(a, b, y), True)
+            self._gather(x, coefficients, 1.0, 0.0, x, transpose)
+            self.of._queue_product(coefficients, out, Epilogue(a, b, y), True)
         else:
-            self.of._product(x, coefficients, PLAIN, False)
-            kernel(items, group, order.size, k, a, b, order, coefficients, y, out)
+            self.of._queue_product(x, coefficients, PLAIN, False)
+            self._gather(coefficients, out, a, b, y, transpose)
+
+    def _gather(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
+        """Queue out = a (P x) + b y, or with P^T."""
+        order = self._inverse_order if transpose else self._order
+        kernel, pieces = self._kernel("ordered", "gather", x.columns)
+        items = (pieces, min(order.size, MAX_STRIDING_ITEMS))
+        kernel(
+            items,
+            (1, GROUP_ITEMS),
+            rows=order.size,
+            k=x.columns,
+            a=a,
+            b=b,
+            order=order,
+            x=x,
+            y=y,
+            out=out,
+        )
+
+
+def _count_coefficients(grid: tuple[int, int], of: Basis | None) -> int:
+    """The pixels of a grid, or the coefficients of W."""
+    if of is None:
+        return grid[0] * grid[1]
+    return of.shape[0]
+
+
+def _check_places(places: Any, count: int) -> np.ndarray:
+    """`places` as (M,) int64; refused if they are not different numbers below `count`."""
+    places = checks.real("places", places)
+    if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
+        kind = f"{places.shape} of {places.dtype}"
+        raise InputError(f"places has shape {kind}; it must be (M,) whole numbers")
+    lowest = places.min()
+    highest = places.max()
+    if lowest < 0 or highest >= count or len(np.unique(places)) < len(places):
+        raise InputError(f"places are {lowest} to {highest}; they must be different, below {count}")
+    return places.astype(np.int64)
 
 
 def restrict_to_support(core: Any, W: Basis) -> tuple[scipy.sparse.csr_array, Basis]:
-    """C and W with W^T C W as before, on the support of the square sparse C alone: rows or columns not empty.
+    """C and W on the support of the square sparse C, its rows or columns not empty.
 
-    Where that is more than half of all coefficients, both come back as they were.
+    W^T C W is as before. If the support is more than half of all coefficients, both come back as
+    they were.
     """
     core = scipy.sparse.csr_array(core)
-    used = np.diff(core.indptr) > 0
-    used[core.indices] = True
-    places = np.flatnonzero(used) if used.any() else np.arange(min(1, len(used)))
-    if len(places) > _MOST * len(used):
+    is_used = np.diff(core.indptr) > 0
+    is_used[core.indices] = True
+    places = np.flatnonzero(is_used)
+    if not len(places):
+        places = np.arange(min(1, len(is_used)))
+    if len(places) > MAX_SUPPORT_SHARE * len(is_used):
         return core, W
-    return scipy.sparse.csr_array(core[places][:, places]), SubsetBasis(W.device, W.grid, places, W)
+    restricted = scipy.sparse.csr_array(core[places][:, places])
+    return restricted, SubsetBasis(W.device, W.grid, places, W)
 
 
 def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
-    """An order of 2-D wavelet coefficients in which those of one place and size stand together, (N,) int64.
+    """An order of 2-D wavelet coefficients with those of one place and size together, (N,) int64.
 
     From coarse to fine, in each level row by row, the details of a place side by side: rows of W R
     W^T then have their large entries in runs, which `Tiles` of 8 hold in a fifth fewer bytes.
@@ -180,12 +243,19 @@ def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
     h, w = checks.grid("grid", grid)
     checks.count("levels", levels, least=0)
     y, x = np.divmod(np.arange(h * w), w)
-    level, band = np.zeros((2, h * w), int)
-    for split in range(min(levels, (max(h, w) - 1).bit_length())):
-        rows, columns = -(-h >> 1), -(-w >> 1)
-        down, right = (y >= rows) & (level == 0), (x >= columns) & (level == 0)
-        y, x = y - rows * down, x - columns * right
-        band += 2 * down + right
-        level[down | right] = levels - split
-        h, w = rows, columns
+    level = np.zeros(h * w, int)
+    band = np.zeros(h * w, int)
+    splits = min(levels, (max(h, w) - 1).bit_length())
+    for split in range(splits):
+        rows = -(-h >> 1)
+        columns = -(-w >> 1)
+        # Details are below or right of the approximation.
+        is_below = (y >= rows) & (level == 0)
+        is_right = (x >= columns) & (level == 0)
+        y = y - rows * is_below
+        x = x - columns * is_right
+        band += 2 * is_below + is_right
+        level[is_below | is_right] = levels - split
+        h = rows
+        w = columns
     return np.lexsort((band, x, y, level))

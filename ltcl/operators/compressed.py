@@ -8,37 +8,41 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
-from ltcl.operators.base import PLAIN, Epilogue, Operator
+from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis
+from ltcl.operators.epilogue import PLAIN, Epilogue
+from ltcl.operators.knowledge import NormBound
 
-MAX_DIAGONAL_PRODUCTS = 4096  # pixels: the diagonal of no more is found by as many products
+# Pixels up to which the diagonal is found by as many products.
+MAX_DIAGONAL_PRODUCTS = 4096
 
 
 class Compressed(Operator):
-    """R = W_out^T C W_in, (M, N): a sparse core C between two bases; a side without one is of pixels.
+    """R = W_out^T C W_in, (M, N): a sparse core C between two bases; a side without one is pixels.
 
-    W on the right alone are the wavelet rows of the paper (section 6). Where both are one isometric
-    basis, R has the norm, the spectrum (and 0 with it) and the solves of its core; see
+    W on the right alone gives the wavelet rows of the paper (section 6). If both sides are one
+    isometric basis, R has the norm, the spectrum (and 0 with it) and the solves of its core; see
     `ltcl.solvers.solve`.
 
     Parameters
     ----------
     core : Operator, (coefficients of out, coefficients of into)
     out, into : Basis or None
-        None of pixels. `two_sided` tells whether both are one isometric basis.
+        None for pixels. `two_sided` tells whether both are one isometric basis.
     error : float, optional
         Bound on the 2-norm of what was dropped; that of the core when not given.
     diagonal : (min(M, N),), optional
 
     Examples
     --------
+    The core keeps of each picture the mean, and half of it:
+
     >>> import ltcl, numpy
     >>> from ltcl.operators import Compressed, Dense, Wavelet
     >>> device = ltcl.open_device()
     >>> W = Wavelet(device, (2, 2), "haar")
-    >>> R = Compressed(
-    ...     Dense(device, numpy.diag([0.5, 0, 0, 0])), W, W, error=1e-3
-    ... )  # of each the mean, half
+    >>> core = Dense(device, numpy.diag([0.5, 0, 0, 0]))
+    >>> R = Compressed(core, W, W, error=1e-3)
     >>> (R @ numpy.array([1.0, 2.0, 3.0, 6.0])).round(6).tolist(), R.error
     ([1.5, 1.5, 1.5, 1.5], 0.001)
     """
@@ -52,62 +56,94 @@ class Compressed(Operator):
         *,
         diagonal: np.ndarray | None = None,
     ) -> None:
-        shape = []
-        for name, W, count in (("out", out, core.shape[0]), ("into", into, core.shape[1])):
-            if W is not None and W.shape[0] != count:
-                raise InputError(
-                    f"{name} has {W.shape[0]} coefficients, but the core {core.shape}; it must have {count}"
-                )
-            if W is not None and W.device is not core.device:
-                raise InputError(
-                    f"{name} is on another device, {W.device}; it must be on {core.device}"
-                )
-            shape.append(count if W is None else W.shape[1])
-        super().__init__(core.device, (shape[0], shape[1]), core, out, into)
-        self.core, self.out, self.into = core, out, into
-        if error is None and core.error and not all(W is None or W.isometric for W in (out, into)):
+        rows = _pixels("out", out, core, core.shape[0])
+        columns = _pixels("into", into, core, core.shape[1])
+        super().__init__(core.device, (rows, columns), core, out, into)
+        self.core = core
+        self.out = out
+        self.into = into
+        self.two_sided = out is into and out is not None and out.isometric
+        if self.two_sided:
+            self.core_basis = into
+        if error is not None:
+            self.error = checks.number("error", error, least=0.0)
+        elif core.error and not self._keeps_norms:
             raise InputError(
                 f"error is None; it must be given, as {core.error:.3g} is that of coefficients"
             )
-        self.error = core.error if error is None else checks.number("error", error, least=0.0)
-        self.two_sided = out is into and out is not None and out.isometric
+        else:
+            self.error = core.error
         self.known_diagonal: np.ndarray | None = None
         if diagonal is not None:
-            diagonal = checks.shape(
-                "diagonal", checks.real("diagonal", diagonal), (min(self.shape),)
-            )
-            self.known_diagonal = checks.finite("diagonal", diagonal).astype(np.float64)
+            values = checks.real("diagonal", diagonal)
+            checks.shape("diagonal", values, (min(self.shape),))
+            self.known_diagonal = checks.finite("diagonal", values).astype(np.float64)
+
+    @property
+    def _keeps_norms(self) -> bool:
+        """True if the norms of R are those of its core."""
+        return all(W is None or W.isometric for W in (self.out, self.into))
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64: as given, else by products of at most 4096."""
-        if self.known_diagonal is None:
-            if self.out is None and self.into is None:
-                return self.core.diagonal()
-            if (n := min(self.shape)) > MAX_DIAGONAL_PRODUCTS:
-                raise InputError(
-                    f"the diagonal of a compressed operator of {n} pixels takes as many products; make it "
-                    "with diagonal=, or give first_bounce as an array (N,)"
-                )
-            self.known_diagonal = np.diagonal(self.to_dense()).copy()
+        if self.known_diagonal is not None:
+            return self.known_diagonal
+        if self.out is None and self.into is None:
+            return self.core.diagonal()
+        n = min(self.shape)
+        if n > MAX_DIAGONAL_PRODUCTS:
+            raise InputError(
+                f"the diagonal of a compressed operator of {n} pixels takes as many products; make "
+                "it with diagonal=, or give first_bounce as an array (N,)"
+            )
+        self.known_diagonal = np.diagonal(self.to_dense()).copy()
         return self.known_diagonal
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+    def norm_bound(self) -> NormBound:
+        """Between isometric bases the bound of the core."""
+        if self._keeps_norms:
+            return self.core.norm_bound()
+        return super().norm_bound()
+
+    def on_coefficients(self) -> Operator:
+        """The core C, where R = W^T C W in an isometric basis."""
+        return self.core if self.two_sided else super().on_coefficients()
+
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         first, last = (self.out, self.into) if transpose else (self.into, self.out)
         if first is None and last is None:
-            self.core._product(x, out, epilogue, transpose)
+            self.core._queue_product(x, out, epilogue, transpose)
             return
         a, b, y, c = epilogue.without_shift(x)
-        factors = [
-            (A, t)
-            for A, t in ((first, False), (self.core, transpose), (last, True))
-            if A is not None
-        ]
+        # Factors from right to left, with whether each is transposed.
+        factors: list[tuple[Operator, bool]] = [(self.core, transpose)]
+        if first is not None:
+            factors.insert(0, (first, False))
+        if last is not None:
+            factors.append((last, True))
+        *inner_factors, (last_factor, last_transposed) = factors
         operand = x
-        for A, transposed in factors[:-1]:
-            product = self.device.empty((A.shape[transposed], *x.shape[1:]))
-            A._product(operand, product, PLAIN, transposed)
+        for factor, is_transposed in inner_factors:
+            rows = factor.shape[1] if is_transposed else factor.shape[0]
+            product = self.device.empty((rows, *x.shape[1:]))
+            factor._queue_product(operand, product, PLAIN, is_transposed)
             operand = product
-        A, transposed = factors[-1]
-        A._product(operand, out, Epilogue(a, b, y), transposed)
+        last_factor._queue_product(operand, out, Epilogue(a, b, y), last_transposed)
         if c:
             vectors.axpy(c, x, out)
+
+
+def _pixels(name: str, basis: Basis | None, core: Operator, coefficients: int) -> int:
+    """The pixels of one side, checked to fit the core."""
+    if basis is None:
+        return coefficients
+    if basis.shape[0] != coefficients:
+        raise InputError(
+            f"{name} has {basis.shape[0]} coefficients, but the core {core.shape}; it must have "
+            f"{coefficients}"
+        )
+    if basis.device is not core.device:
+        raise InputError(
+            f"{name} is on another device, {basis.device}; it must be on {core.device}"
+        )
+    return basis.shape[1]

@@ -9,13 +9,21 @@ import numpy as np
 
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
-from ltcl.operators.base import Epilogue, Operator
+from ltcl.operators.base import Operator
+from ltcl.operators.epilogue import Epilogue
+
+CHANNELS = 3
 
 
 class Coupled(Operator):
-    """picture_c = sum_j T_cj light_j with light_j = sum_i M_ji x_i, channel below channel: (3 M, 3 N).
+    """picture_c = sum_j T_cj light_j, light_j = sum_i M_ji x_i, channel below channel: (3 M, 3 N).
 
-    `blocks` are 3 x 3 operators (M, N), None of zeros; `mixing` is M, (3, 3), or the identity.
+    Parameters
+    ----------
+    blocks : 3 x 3 sequences of Operator (M, N) or None
+        T_cj; None stands for zeros.
+    mixing : (3, 3), optional
+        M; the identity when not given.
 
     Examples
     --------
@@ -30,42 +38,64 @@ class Coupled(Operator):
     def __init__(
         self, blocks: Sequence[Sequence[Operator | None]], mixing: np.ndarray | None = None
     ) -> None:
-        own = [block for row in blocks for block in row if block is not None]
-        if [len(row) for row in blocks] != [3, 3, 3] or len({block.shape for block in own}) != 1:
+        present = [block for row in blocks for block in row if block is not None]
+        row_lengths = [len(row) for row in blocks]
+        shapes = {block.shape for block in present}
+        if row_lengths != [CHANNELS] * CHANNELS or len(shapes) != 1:
             raise InputError("blocks must be 3 x 3 operators of one shape, or None")
-        rows, columns = own[0].shape
-        super().__init__(own[0].device, (3 * rows, 3 * columns), *own)
-        self.blocks, self.mixing = (
-            blocks,
-            np.eye(3) if mixing is None else np.asarray(mixing, np.float64),
-        )
-        self.error = max(float(np.abs(self.mixing).sum()), 1.0) * sum(block.error for block in own)
+        rows, columns = present[0].shape
+        super().__init__(present[0].device, (CHANNELS * rows, CHANNELS * columns), *present)
+        self.blocks = blocks
+        if mixing is None:
+            self.mixing = np.eye(CHANNELS)
+        else:
+            self.mixing = np.asarray(mixing, np.float64)
+        mixing_norm = max(float(np.abs(self.mixing).sum()), 1.0)
+        self.error = mixing_norm * sum(block.error for block in present)
 
     @classmethod
     def mixed(cls, operators: Sequence[Operator], mixing: np.ndarray) -> Coupled:
         """Channels that see only their own light, which is mixed before."""
-        return cls(
-            [[T if c == j else None for j in range(3)] for c, T in enumerate(operators)], mixing
-        )
+        blocks: list[list[Operator | None]] = []
+        for channel, operator in enumerate(operators):
+            row: list[Operator | None] = [None] * CHANNELS
+            row[channel] = operator
+            blocks.append(row)
+        return cls(blocks, mixing)
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         a, b, y, c = epilogue
-        width, height = x.shape[0] // 3, out.shape[0] // 3
-        light = [x.rows(i * width, width) for i in range(3)]
-        light = light if transpose else _mixed(self.mixing, light)
-        sums = [vectors.fill(self.device.empty((height, *out.shape[1:])), 0.0) for _ in range(3)]
-        for i, j in np.ndindex(3, 3):
+        width = x.shape[0] // CHANNELS
+        height = out.shape[0] // CHANNELS
+        light = [x.rows(channel * width, width) for channel in range(CHANNELS)]
+        if not transpose:
+            light = _mixed(self.mixing, light)
+        sums = []
+        for _ in range(CHANNELS):
+            zeros = vectors.fill(self.device.empty((height, *out.shape[1:])), 0.0)
+            sums.append(zeros)
+        for i, j in np.ndindex(CHANNELS, CHANNELS):
             block = self.blocks[j][i] if transpose else self.blocks[i][j]
             if block is not None:
-                block._product(light[j], sums[i], Epilogue(a, 1.0, sums[i]), transpose)
-        for i, total in enumerate(_mixed(self.mixing.T, sums) if transpose else sums):
-            for factor, array in ((b, y), (c, x)):  # read before `out`, which may be y, is written
-                if factor and array is not None:
-                    vectors.axpy(factor, array.rows(i * height, height), total)
-            out.set_rows(i * height, total)
+                block._queue_product(light[j], sums[i], Epilogue(a, 1.0, sums[i]), transpose)
+        if transpose:
+            sums = _mixed(self.mixing.T, sums)
+        for channel, total in enumerate(sums):
+            first = channel * height
+            # y is read before `out`, which may be y, is written.
+            if b and y is not None:
+                vectors.axpy(b, y.rows(first, height), total)
+            if c:
+                vectors.axpy(c, x.rows(first, height), total)
+            out.set_rows(first, total)
 
 
-def _mixed(M: np.ndarray, light: list[Array]) -> list[Array]:
+def _mixed(mixing: np.ndarray, light: list[Array]) -> list[Array]:
     """sum_i M_ji x_i for each j."""
-    halves = [vectors.axpby(row[0], light[0], row[1], light[1], light[0].like()) for row in M]
-    return [vectors.axpy(row[2], light[2], half) for row, half in zip(M, halves, strict=True)]
+    sums = []
+    for weights in mixing:
+        total = vectors.axpby(weights[0], light[0], weights[1], light[1], light[0].like())
+        sums.append(total)
+    for weights, total in zip(mixing, sums, strict=True):
+        vectors.axpy(weights[2], light[2], total)
+    return sums

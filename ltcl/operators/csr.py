@@ -10,69 +10,99 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators.rows import RowOperator, Slab, cut
+from ltcl.operators.knowledge import Float64Form
+from ltcl.operators.rows import ReadableRows, Slab, SparseRows, cut
 
 Blocks = Callable[[], Iterator[tuple[int, Any]]]
-_SLAB = 1 << 26  # bytes: smaller blocks are joined, since each slab is a launch
+# Smaller blocks of a store are joined, since each slab is a launch.
+JOINED_BYTES = 1 << 26
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Pattern:
-    """Where the nonzeros are: pointers from 0 and columns of each slab, which channels may share."""
+    """The places of the nonzeros, which channels may share.
+
+    Attributes
+    ----------
+    indptr : (M + 1,) int64
+    indices : (nnz,) or None
+        None if the host does not keep them.
+    cuts : list of (start, stop)
+        The rows of each slab.
+    slabs : list of (pointers, columns)
+        On the device; pointers count from 0 in each slab.
+    """
 
     device: Device
     shape: tuple[int, int]
-    indptr: np.ndarray  # (M + 1,) int64
-    indices: np.ndarray | None  # (nnz,); None where the host does not keep them
+    indptr: np.ndarray
+    indices: np.ndarray | None
     cuts: list[tuple[int, int]]
     slabs: list[tuple[Array, Array]]
 
     @classmethod
-    def of(cls, device: Device, matrix: Any) -> Pattern:
-        """That of a checked `csr_array`, uploaded."""
-        indptr, upload = matrix.indptr.astype(np.int64), device.upload
-        row_bytes = np.maximum(4 * np.diff(indptr), 4)  # pointers weigh as much as one nonzero
+    def from_csr(cls, device: Device, matrix: Any) -> Pattern:
+        """The pattern of a checked `csr_array`, uploaded."""
+        indptr = matrix.indptr.astype(np.int64)
+        # Pointers weigh as much as one nonzero.
+        row_bytes = np.maximum(4 * np.diff(indptr), 4)
         cuts = cut(device, row_bytes, "the sparse matrix")
         slabs = []
         for start, stop in cuts:
             pointers = indptr[start : stop + 1]
             columns = matrix.indices[pointers[0] : pointers[-1]]
-            slabs.append((upload(pointers - pointers[0], np.int32), upload(columns, np.int32)))
-        return cls(device, matrix.shape, indptr, matrix.indices, cuts, slabs)
+            local_pointers = device.upload(pointers - pointers[0], np.int32)
+            slabs.append((local_pointers, device.upload(columns, np.int32)))
+        return cls(
+            device=device,
+            shape=matrix.shape,
+            indptr=indptr,
+            indices=matrix.indices,
+            cuts=cuts,
+            slabs=slabs,
+        )
 
     def with_values(self, data: np.ndarray, first: int = 0) -> list[Slab]:
         """The slabs of a matrix of this pattern with values `data` (nnz,), from row `first` on."""
         slabs = []
-        for (start, stop), places in zip(self.cuts, self.slabs, strict=True):
+        for (start, stop), (pointers, columns) in zip(self.cuts, self.slabs, strict=True):
             values = self.device.upload(data[self.indptr[start] : self.indptr[stop]])
-            slabs.append(Slab(first + start, stop - start, (*places, values)))
+            arguments = {"pointers": pointers, "columns": columns, "values": values}
+            slabs.append(Slab(first + start, stop - start, arguments))
         return slabs
 
     def matches(self, matrix: Any) -> bool:
-        """Whether `matrix` has its nonzeros in the same places, as far as the host can tell."""
+        """True if `matrix` has its nonzeros in the same places, as far as the host can tell."""
         if self.indices is None or self.shape != matrix.shape or len(self.indices) != matrix.nnz:
             return False
-        same = self.indices is matrix.indices or np.array_equal(self.indices, matrix.indices)
-        return same and np.array_equal(self.indptr, matrix.indptr)
+        if not np.array_equal(self.indptr, matrix.indptr):
+            return False
+        return self.indices is matrix.indices or np.array_equal(self.indices, matrix.indices)
 
 
-class CSR(RowOperator):
+class CSR(SparseRows):
     """A sparse (M, N) matrix on the device.
 
     Parameters
     ----------
+    device : Device
     matrix : scipy.sparse matrix or array, (M, N)
-        InputError where it is malformed or not finite, MemoryLimitError where the device has no
-        room for it.
     pattern : Pattern, optional
-        That of another channel; shared where the nonzeros are in the same places.
+        Pattern of another channel; shared if the nonzeros are in the same places.
+
+    Raises
+    ------
+    InputError
+        If the matrix is malformed or not finite.
+    MemoryLimitError
+        If the device has no room for it.
 
     Examples
     --------
@@ -83,23 +113,24 @@ class CSR(RowOperator):
     [3.0, 3.0]
     """
 
-    file = "csr"
+    file: ClassVar[str] = "csr"
+    numbers: ClassVar[str] = "values"
 
     def __init__(self, device: Device, matrix: Any, pattern: Pattern | None = None) -> None:
         matrix = checks.csr("matrix", matrix)
         super().__init__(device, matrix.shape)
-        shared = pattern is not None and pattern.device is device and pattern.matches(matrix)
-        device.require(
-            matrix.nnz * (4 if shared else 8), f"a sparse matrix of {matrix.nnz} nonzeros"
-        )
-        self.pattern = pattern if pattern is not None and shared else Pattern.of(device, matrix)
+        if pattern is not None and (pattern.device is not device or not pattern.matches(matrix)):
+            pattern = None
+        bytes_per_entry = 8 if pattern is None else 4
+        device.require(matrix.nnz * bytes_per_entry, f"a sparse matrix of {matrix.nnz} nonzeros")
+        self.pattern = Pattern.from_csr(device, matrix) if pattern is None else pattern
         self.slabs = self.pattern.with_values(matrix.data)
         self.nnz: int = matrix.nnz
         self._host = matrix
 
     def upload(self, rows: Any, first: int) -> list[Slab]:
         """Slabs of rows from `first` on, with a pattern of their own."""
-        return Pattern.of(self.device, rows).with_values(rows.data, first)
+        return Pattern.from_csr(self.device, rows).with_values(rows.data, first)
 
     @property
     def data(self) -> np.ndarray:
@@ -107,15 +138,15 @@ class CSR(RowOperator):
         return self._host.data
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
-        """The whole matrix."""
+        """The whole matrix in one block."""
         yield 0, self._host.astype(np.float64)
 
     def matrix(self) -> scipy.sparse.csr_array:
-        """What it stands for: (M, N), float32 values on the host."""
+        """The matrix (M, N) on the host, with the float32 values of the device."""
         return scipy.sparse.csr_array(self._host.astype(np.float32))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
+        """Plain arrays, from which `from_arrays` makes the same operator, to the bit."""
         return {
             "shape": np.array(self.shape, np.int64),
             "data": self.data.astype(np.float32),
@@ -127,15 +158,18 @@ class CSR(RowOperator):
     def from_arrays(
         cls, device: Device, arrays: Mapping[str, np.ndarray], pattern: Pattern | None = None
     ) -> CSR:
-        """Of what `to_arrays` gave; what does not fit together is refused."""
+        """The operator whose `to_arrays` gave `arrays`; arrays that do not fit are refused."""
         rows, columns = (int(n) for n in arrays["shape"])
-        data, indices, indptr = (arrays[name] for name in ("data", "indices", "indptr"))
-        checks.compressed(
-            "the stored matrix", indptr, indices, checks.real("data", data), (rows, columns)
-        )
-        return cls(
-            device, scipy.sparse.csr_array((data, indices, indptr), shape=(rows, columns)), pattern
-        )
+        shape = rows, columns
+        data = arrays["data"]
+        indices = arrays["indices"]
+        indptr = arrays["indptr"]
+        checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), shape)
+        matrix = scipy.sparse.csr_array((data, indices, indptr), shape=shape)
+        return cls(device, matrix, pattern)
+
+    def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
+        return Float64Form(matrix=self._host)
 
     def _transposed_rows(self) -> CSR:
         return CSR(self.device, scipy.sparse.csr_array(self._host.T))
@@ -148,44 +182,60 @@ class RowBlocks(CSR):
 
     Parameters
     ----------
+    device : Device
     shape : (M, N)
-    blocks : function that gives (first row, csr_array) of all blocks, in order
-    nnz : int, nonzeros there are at most
+    blocks : function
+        Gives (first row, csr_array) of all blocks, in order.
+    nnz : int
+        The most nonzeros there can be.
 
     Examples
     --------
     >>> import ltcl
     >>> A = scipy.sparse.csr_array([[1.0, 2.0], [0.0, 3.0]])
-    >>> rows = RowBlocks(
-    ...     ltcl.open_device(), (2, 2), lambda: ((i, A[i : i + 1]) for i in range(2)), A.nnz
-    ... )
+    >>> blocks = lambda: ((row, A[row : row + 1]) for row in range(2))
+    >>> rows = RowBlocks(ltcl.open_device(), (2, 2), blocks, A.nnz)
     >>> (rows @ np.array([1.0, 1.0])).tolist()
     [3.0, 3.0]
     """
 
     def __init__(self, device: Device, shape: tuple[int, int], blocks: Blocks, nnz: int) -> None:
-        RowOperator.__init__(self, device, shape)
+        SparseRows.__init__(self, device, shape)
         device.require(8 * nnz, f"a sparse matrix of {nnz} nonzeros")
         self._blocks = blocks
-        self.slabs, pointers = [], [np.zeros(1, np.int64)]
+        self.slabs = []
+        pointers = [np.zeros(1, np.int64)]
         for first, block in self.blocks():
             self.slabs += self.upload(block, first)
             pointers.append(block.indptr[1:] + pointers[-1][-1])
-        cuts = [(slab.first, slab.first + slab.rows) for slab in self.slabs]
-        places = [slab.arguments[:2] for slab in self.slabs]
-        self.pattern = Pattern(device, shape, np.concatenate(pointers), None, cuts, places)
+        places = [(slab.arguments["pointers"], slab.arguments["columns"]) for slab in self.slabs]
+        self.pattern = Pattern(
+            device=device,
+            shape=shape,
+            indptr=np.concatenate(pointers),
+            indices=None,
+            cuts=[(slab.first, slab.end) for slab in self.slabs],
+            slabs=places,
+        )
         self.nnz = int(self.pattern.indptr[-1])
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
-        """Read again; neighbouring ones in one, up to `_SLAB` bytes."""
+        """All blocks, read again; neighbouring small ones are joined."""
         gathered: list[Any] = []
         start = 0
+        nnz = 0
         for first, block in self._blocks():
-            if gathered and 8 * (sum(rows.nnz for rows in gathered) + block.nnz) > _SLAB:
+            if gathered and 8 * (nnz + block.nnz) > JOINED_BYTES:
                 yield start, _joined(start, gathered)
-                gathered, start = [], first
+                gathered = []
+                start = first
+                nnz = 0
             gathered.append(block)
+            nnz += block.nnz
         yield start, _joined(start, gathered)
+
+    def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
+        return ReadableRows._float64_form(self, reads_blocks=reads_blocks)
 
     @cached_property
     def _host(self) -> scipy.sparse.csr_array:
@@ -194,5 +244,7 @@ class RowBlocks(CSR):
 
 
 def _joined(first: int, blocks: list[Any]) -> scipy.sparse.csr_array:
+    """Blocks of rows below each other, checked, in float64."""
     rows = scipy.sparse.csr_array(scipy.sparse.vstack(blocks, "csr"))
-    return scipy.sparse.csr_array(checks.csr(f"rows from {first}", rows).astype(np.float64))
+    checked = checks.csr(f"rows from {first}", rows)
+    return scipy.sparse.csr_array(checked.astype(np.float64))

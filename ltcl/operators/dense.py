@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Dense matrices: float32, row-major, y = A x and y = A^T x by `kernels/dense.cl`, one copy for both."""
+"""Dense matrices: float32, row-major, y = A x and y = A^T x by `kernels/dense.cl`.
+
+One copy serves both products.
+"""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError
-from ltcl.operators.base import Epilogue, widths
+from ltcl.operators.epilogue import Epilogue, widths
+from ltcl.operators.knowledge import Float64Form
 from ltcl.operators.rows import RowOperator, Slab, cut
 
-_CHUNKS, _CHUNK_ROWS = (
-    64,
-    32,
-)  # of a transposed product: enough groups for a large GPU, none too short
+# Chunks of rows of a transposed product on a GPU: enough groups for a large one, none too short.
+MAX_CHUNKS = 64
+MIN_CHUNK_ROWS = 32
+# Columns of a work-item of a transposed product: a CPU reads them as a stream.
+CPU_STRIP = 256
+GPU_STRIP = 1
 
 
 class Dense(RowOperator):
@@ -26,8 +32,15 @@ class Dense(RowOperator):
 
     Parameters
     ----------
+    device : Device
     matrix : (M, N) array of real numbers
-        InputError where some are not finite, MemoryLimitError where the device has no room for it.
+
+    Raises
+    ------
+    InputError
+        If some numbers are not finite.
+    MemoryLimitError
+        If the device has no room for it.
 
     Examples
     --------
@@ -38,64 +51,113 @@ class Dense(RowOperator):
     [1.0, 5.0]
     """
 
-    file = "dense"
-    exact: tuple[np.ndarray, ...] | None = (
-        None  # (A, d, e): it is A / d - diag(e), rounded to float32
-    )
+    file: ClassVar[str] = "dense"
+    numbers: ClassVar[str] = "matrix"
 
     def __init__(self, device: Device, matrix: Any) -> None:
-        host = checks.real("matrix", matrix)
-        if host.ndim != 2:
-            raise InputError(f"matrix has shape {host.shape}; it must be (M, N)")
-        checks.finite("matrix", host)
-        super().__init__(device, host.shape)
-        device.require(4 * host.size, f"a dense matrix {host.shape}")
-        self.defines = {"STRIP": 256 if device.is_cpu else 1}
+        values = checks.real("matrix", matrix)
+        if values.ndim != 2:
+            raise InputError(f"matrix has shape {values.shape}; it must be (M, N)")
+        checks.finite("matrix", values)
+        super().__init__(device, values.shape)
+        device.require(4 * values.size, f"a dense matrix {values.shape}")
+        self.defines = {"STRIP": CPU_STRIP if device.is_cpu else GPU_STRIP}
         self._ones: Array | None = None
-        self.slabs = self.upload(host)
+        self.slabs = self.upload(values)
 
-    def upload(self, host: np.ndarray, first: int = 0) -> list[Slab]:
+    def upload(self, matrix: np.ndarray, first: int = 0) -> list[Slab]:
         """Slabs of rows from `first` on."""
-        rows, width = host.shape
-        cuts = cut(self.device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
-        return [Slab(first + a, b - a, (width, self.device.upload(host[a:b]))) for a, b in cuts]
+        rows, width = matrix.shape
+        row_bytes = np.full(rows, 4 * max(width, 1))
+        slabs = []
+        for start, stop in cut(self.device, row_bytes, "the dense matrix"):
+            buffer = self.device.upload(matrix[start:stop])
+            arguments = {"width": width, "matrix": buffer}
+            slabs.append(Slab(first + start, stop - start, arguments))
+        return slabs
 
     def blocks(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Slab by slab, as they lie on the device."""
+        """(first row, rows) of every slab, read from the device."""
         for slab in self.slabs:
-            yield slab.first, slab.arguments[1].get().astype(np.float64)
+            yield slab.first, slab.arguments["matrix"].get().astype(np.float64)
+
+    def matrix(self) -> np.ndarray:
+        """The matrix (M, N) float32, read from the device."""
+        return np.concatenate([slab.arguments["matrix"].get() for slab in self.slabs])
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
+        """Plain arrays, from which `from_arrays` makes the same operator, to the bit."""
         checks.fits_host(f"a dense matrix {self.shape}", 4 * self.shape[0] * self.shape[1])
-        return {"matrix": np.concatenate([slab.arguments[1].get() for slab in self.slabs])}
+        return {"matrix": self.matrix()}
 
     @classmethod
     def from_arrays(cls, device: Device, arrays: Mapping[str, np.ndarray]) -> Dense:
-        """Of what `to_arrays` gave; what does not fit together is refused."""
+        """The operator whose `to_arrays` gave `arrays`; arrays that do not fit are refused."""
         return cls(device, arrays["matrix"])
 
-    def _bound_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
-        return functools.partial(self._transposed_product, x, out, epilogue)
+    def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
+        if self.given is not None:
+            return self.given
+        return Float64Form(matrix=self.to_dense())
 
-    def _transposed_product(self, x: Array, out: Array, epilogue: Epilogue) -> None:
-        """Slab by slab, in chunks of rows where there are more work-items to feed than columns."""
-        strip = self.defines["STRIP"]
-        items, group = -(-self.shape[1] // strip), 1 if strip > 1 else 64
+    def _bind_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
+        return functools.partial(self._queue_transpose, x, out, epilogue)
+
+    def _queue_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> None:
         for slab in self.slabs:
-            chunks = 1 if strip > 1 else max(1, min(_CHUNKS, -(-slab.rows // _CHUNK_ROWS)))
-            a, b, y, c = epilogue
-            y = out if y is None else y
-            sums = out if chunks == 1 else self.device.empty((chunks, *out.shape))
-            for offset, width in widths(x.columns):
-                kernel = self.kernel("dense_rmatvec", width, x.columns)
-                place = (slab.rows, slab.first, x.columns, offset)
-                kernel((items, chunks), (group, 1), *place, a, b, c, x, y, sums, *slab.arguments)
-            if chunks > 1:
-                self._ones = self._ones or self.device.upload(np.ones(_CHUNKS))
-                place = (chunks, 0, 1, 0, 1.0, 0.0, 0.0)
-                kernel = self.kernel("dense_rmatvec", 1, 1)
-                kernel((out.size, 1), (64, 1), *place, self._ones, out, out, out.size, sums)
-            epilogue = Epilogue(
-                a, 1.0, out
-            )  # the following slabs add to what the first has written
+            self._queue_transposed_slab(slab, x, out, epilogue)
+            # The following slabs add to what the first has written.
+            epilogue = epilogue.added_to(out)
+
+    def _queue_transposed_slab(self, slab: Slab, x: Array, out: Array, epilogue: Epilogue) -> None:
+        """Queue the product of one slab, on a GPU in chunks of rows to feed more work-items."""
+        strip = self.defines["STRIP"]
+        items = -(-self.shape[1] // strip)
+        if strip == GPU_STRIP:
+            group = 64
+            chunks = max(1, min(MAX_CHUNKS, -(-slab.rows // MIN_CHUNK_ROWS)))
+        else:
+            group = 1
+            chunks = 1
+        sums = out if chunks == 1 else self.device.empty((chunks, *out.shape))
+        for offset, width in widths(x.columns):
+            kernel = self.kernel("dense_rmatvec", width, x.columns)
+            kernel(
+                (items, chunks),
+                (group, 1),
+                rows=slab.rows,
+                first=slab.first,
+                stride=x.columns,
+                offset=offset,
+                a=epilogue.a,
+                b=epilogue.b,
+                c=epilogue.c,
+                x=x,
+                y=epilogue.operand(out),
+                out=sums,
+                **slab.arguments,
+            )
+        if chunks > 1:
+            self._queue_chunk_sum(sums, chunks, out)
+
+    def _queue_chunk_sum(self, sums: Array, chunks: int, out: Array) -> None:
+        """Queue out = sum of the chunks, as a product of the transposed sums with ones."""
+        if self._ones is None:
+            self._ones = self.device.upload(np.ones(MAX_CHUNKS))
+        kernel = self.kernel("dense_rmatvec", 1, 1)
+        kernel(
+            (out.size, 1),
+            (64, 1),
+            rows=chunks,
+            first=0,
+            stride=1,
+            offset=0,
+            a=1.0,
+            b=0.0,
+            c=0.0,
+            x=self._ones,
+            y=out,
+            out=out,
+            width=out.size,
+            matrix=sums,
+        )

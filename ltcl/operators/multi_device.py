@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A matrix on several devices of a platform, which multiply at the same time."""
+"""A matrix on several devices of a platform, which multiply at the same time.
+
+Each device has as many rows as it is fast: a dense product is timed once per device, and the time
+is remembered.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,15 @@ from ltcl.device import Array, Device, tuning
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import Pattern, RowBlocks
 from ltcl.operators.dense import Dense
+from ltcl.operators.knowledge import Float64Form
 from ltcl.operators.parts import Parts, upload_part
 from ltcl.operators.rows import ReadableRows, RowOperator
 
-_TRIAL = 4096  # rows and columns of the product by which devices are compared: beyond the caches
+# Rows and columns of the product by which devices are compared: beyond the caches.
+TIMED_ROWS = 4096
+
+# (first row, rows) -> rows
+ChangeRows = Callable[[int, Any], Any]
 
 
 class MultiDevice(Parts, ReadableRows):
@@ -26,7 +35,7 @@ class MultiDevice(Parts, ReadableRows):
     Parameters
     ----------
     device : Device
-        Of the vectors.
+        Device of the vectors.
     parts : sequence of RowOperator, (rows, N) each
         From the first row on, each on its own device.
 
@@ -43,22 +52,29 @@ class MultiDevice(Parts, ReadableRows):
     where = "on several devices"
 
     def __init__(self, device: Device, parts: Sequence[RowOperator]) -> None:
-        ends = np.cumsum([part.shape[0] for part in parts]).tolist()
-        super().__init__(device, (ends[-1], parts[0].shape[1]), *parts)
-        self.parts = list(zip([0, *ends], parts, strict=False))  # (first row, rows)
+        self.parts: list[tuple[int, RowOperator]] = []
+        first = 0
+        for part in parts:
+            self.parts.append((first, part))
+            first += part.shape[0]
+        super().__init__(device, (first, parts[0].shape[1]), *parts)
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
-        """Those of all parts."""
-        return (
-            (start + first, rows) for start, part in self.parts for first, rows in part.blocks()
-        )
+        """(first row, rows) of all parts."""
+        for start, part in self.parts:
+            for first, rows in part.blocks():
+                yield start + first, rows
 
-    def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
-        host, products = x.get(), []
+    def _host_product(self, x: Array, transpose: bool) -> np.ndarray:
+        operand = x.get()
+        products = []
         for first, part in self.parts:
-            own = host[first : first + part.shape[0]] if transpose else host
-            A = part.T if transpose else part
-            products.append(A.apply(part.device.upload(own)))
+            if transpose:
+                own_rows = part.device.upload(operand[first : first + part.shape[0]])
+                products.append(part.T.apply(own_rows))
+            else:
+                products.append(part.apply(part.device.upload(operand)))
+            # The device starts before the next one is asked.
             part.device.flush()
         results = [product.get() for product in products]
         return np.sum(results, axis=0) if transpose else np.concatenate(results)
@@ -67,56 +83,89 @@ class MultiDevice(Parts, ReadableRows):
 def upload_matrix(
     device: Device,
     matrix: Any,
-    change: Callable[[int, Any], Any] = lambda first, rows: rows,
+    change: ChangeRows | None = None,
     pattern: Pattern | None = None,
-    more: int = 0,
+    added_entries: int = 0,
 ) -> Any:
-    """An array, a sparse matrix or a store, after `change` of (first row, rows), on a device and its others.
+    """An operator from an array, a sparse matrix or a store, on a device and the others beside it.
 
-    Rows of a store are uploaded block by block; `change` may give them so many `more` entries.
+    Parameters
+    ----------
+    device : Device
+    matrix : (M, N) array, scipy.sparse array, or an object with ``row_blocks()``
+        Rows of a store are uploaded block by block.
+    change : function (first row, rows) -> rows, optional
+        Applied to the rows before they are uploaded.
+    pattern : Pattern, optional
+        Pattern of another channel, for a sparse matrix on one device.
+    added_entries : int
+        The most entries that `change` adds to a store.
     """
-    if not (stored := hasattr(matrix, "row_blocks")):
-        if not device.others:
-            return upload_part(device, change(0, matrix), pattern)
-        check: Any = checks.csr if scipy.sparse.issparse(matrix) else checks.real
-        matrix = check("matrix", matrix)
+    if change is None:
+        change = _unchanged
+    if hasattr(matrix, "row_blocks"):
+        return _upload_store(device, matrix, change, added_entries)
+    if not device.others:
+        return upload_part(device, change(0, matrix), pattern)
+    if scipy.sparse.issparse(matrix):
+        matrix = checks.csr("matrix", matrix)
+    else:
+        matrix = checks.real("matrix", matrix)
 
-    def make(on: Device, own: slice) -> RowOperator:
-        if not stored:
-            return upload_part(on, change(own.start, matrix[own]))
+    def upload_rows(part_device: Device, rows: slice) -> RowOperator:
+        return upload_part(part_device, change(rows.start, matrix[rows]))
 
-        def blocks() -> Iterator[tuple[int, Any]]:
-            for first, rows in matrix.row_blocks():
-                start, stop = max(own.start - first, 0), min(own.stop - first, rows.shape[0])
-                if start < stop:
-                    yield first + start - own.start, change(first, rows)[start:stop]
-
-        M, N, count = *matrix.shape, own.stop - own.start
-        return RowBlocks(on, (count, N), blocks, (matrix.nnz + more) * count // M)
-
-    A: Any = split_over_devices(device, matrix.shape[0], make)
-    if not stored:
-        A.exact = matrix, np.ones(A.shape[1]), np.zeros(A.shape[1])
+    A: Any = split_over_devices(device, matrix.shape[0], upload_rows)
+    A.given = Float64Form(matrix=matrix)
     return A
 
 
+def _unchanged(_: int, rows: Any) -> Any:
+    return rows
+
+
+def _upload_store(device: Device, store: Any, change: ChangeRows, added_entries: int) -> Any:
+    M, N = store.shape
+
+    def upload_rows(part_device: Device, part: slice) -> RowOperator:
+        def blocks() -> Iterator[tuple[int, Any]]:
+            for first, rows in store.row_blocks():
+                start = max(part.start - first, 0)
+                stop = min(part.stop - first, rows.shape[0])
+                if start < stop:
+                    yield first + start - part.start, change(first, rows)[start:stop]
+
+        count = part.stop - part.start
+        nnz = (store.nnz + added_entries) * count // M
+        return RowBlocks(part_device, (count, N), blocks, nnz)
+
+    return split_over_devices(device, M, upload_rows)
+
+
 def split_over_devices(
-    device: Device, rows: int, make: Callable[[Device, slice], RowOperator]
+    device: Device, rows: int, upload_rows: Callable[[Device, slice], RowOperator]
 ) -> Operator:
-    """What `make` puts on a device: all rows, or of several devices or ranks as many as each is fast."""
-    if (split_over_ranks := getattr(device, "split_over_ranks", None)) is not None:
-        return split_over_ranks(rows, make)
+    """All rows on one device, or a share of them on each of several devices or ranks."""
+    split_over_ranks = getattr(device, "split_over_ranks", None)
+    if split_over_ranks is not None:
+        return split_over_ranks(rows, upload_rows)
+    if not device.others:
+        return upload_rows(device, slice(0, rows))
     devices = [device, *device.others]
-    speeds = np.array([1.0 / _trial(each) for each in devices]) if device.others else np.ones(1)
+    speeds = np.array([1.0 / _product_seconds(part_device) for part_device in devices])
     ends = np.rint(rows * np.cumsum(speeds) / speeds.sum()).astype(int).tolist()
-    spans = zip(devices, map(slice, [0, *ends], ends), strict=False)
-    parts = [make(each, own) for each, own in spans if own.stop > own.start]
+    parts = []
+    start = 0
+    for part_device, end in zip(devices, ends, strict=True):
+        if end > start:
+            parts.append(upload_rows(part_device, slice(start, end)))
+        start = end
     return parts[0] if len(parts) == 1 else MultiDevice(device, parts)
 
 
-def _trial(device: Device) -> float:
+def _product_seconds(device: Device) -> float:
     """Seconds of a dense product, measured once per device and then remembered."""
-    n = min(_TRIAL, int((device.max_allocation // 8) ** 0.5))
+    n = min(TIMED_ROWS, int((device.max_allocation // 8) ** 0.5))
     A = Dense(device, np.ones((n, n), np.float32))
     name = f"dense product of {n} rows, {device.compute_units} units"
     return tuning.seconds(device, name, A.bind(device.empty(n), device.empty(n)))

@@ -18,23 +18,31 @@ from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import FileError, MemoryLimitError
 from ltcl.files import check_mapped_file, read_ahead, underlying_array
-from ltcl.operators.base import Epilogue
 from ltcl.operators.csr import CSR
+from ltcl.operators.epilogue import Epilogue
+from ltcl.operators.knowledge import Float64Form
 from ltcl.operators.parts import Parts, upload_part
 from ltcl.operators.rows import ReadableRows
 
-READ_BYTES = 1 << 22  # of rows in a reading, which caches hold
+# Bytes of rows in one reading, which caches hold.
+READ_BYTES = 1 << 22
+# Readings at the same time.
 READS_AHEAD = 2
 
 
 class Streamed(Parts, ReadableRows):
-    """A matrix (M, N) on a disk, read at each product; host and device hold a few slabs of its rows.
+    """A matrix (M, N) on a disk, read at each product; host and device hold a few slabs of rows.
 
     Parameters
     ----------
-    matrix : numpy.memmap (M, N), or an array that looks at one; or an object with ``row_blocks()``
-        Not changed afterwards. FileError at a product where the file of an array is gone or
-        shorter.
+    device : Device
+    matrix : numpy.memmap (M, N), a view of one, or an object with ``row_blocks()``
+        Not changed afterwards.
+
+    Raises
+    ------
+    FileError
+        At a product, if the file of an array is gone or shorter.
 
     Examples
     --------
@@ -50,15 +58,16 @@ class Streamed(Parts, ReadableRows):
     where = "on a disk"
 
     def __init__(self, device: Device, matrix: Any) -> None:
-        none = (
-            matrix[:0]
-            if isinstance(matrix, np.ndarray)
-            else scipy.sparse.csr_array((0, matrix.shape[1]))
-        )
-        slab = upload_part(device, none)
+        if isinstance(matrix, np.ndarray):
+            no_rows = matrix[:0]
+        else:
+            no_rows = scipy.sparse.csr_array((0, matrix.shape[1]))
+        slab = upload_part(device, no_rows)
         super().__init__(device, matrix.shape, slab)
-        self.matrix, self._slab = matrix, slab
-        slab.shape = matrix.shape  # of which it has those rows that are on the device
+        self.matrix = matrix
+        # An operator of the whole shape that has the rows which are on the device.
+        self._slab = slab
+        slab.shape = matrix.shape
 
     def bytes_read(self) -> int:
         """Bytes of the matrix on the disk."""
@@ -66,47 +75,50 @@ class Streamed(Parts, ReadableRows):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """(first row, rows) in float64, read once."""
-        return ((first, rows.astype(np.float64)) for first, rows in row_blocks(self.matrix))
+        for first, rows in row_blocks(self.matrix):
+            yield first, rows.astype(np.float64)
 
     def product(self, x: np.ndarray, transpose: bool = False) -> np.ndarray:
-        """A x or A^T x on the host, of x (N, k) float64, with the numbers of the file."""
+        """A x or A^T x on the host, for x (N, k) float64, with the numbers of the file."""
         if not transpose:
             return np.concatenate([rows @ x for _, rows in self.blocks()])
-        products = (rows.T @ x[first : first + rows.shape[0]] for first, rows in self.blocks())
-        return sum(products, np.zeros((self.shape[1], x.shape[1])))
+        total = np.zeros((self.shape[1], x.shape[1]))
+        for first, rows in self.blocks():
+            total = total + rows.T @ x[first : first + rows.shape[0]]
+        return total
 
-    def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
-        return self.product(x.get().reshape(x.shape[0], -1).astype(np.float64), transpose)
+    def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
+        return Float64Form(matrix=self)
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        if transpose and isinstance(
-            self._slab, CSR
-        ):  # rows would have to be sorted by columns first
-            super()._product(x, out, epilogue, True)
+    def _host_product(self, x: Array, transpose: bool) -> np.ndarray:
+        operand = x.get().reshape(x.shape[0], -1)
+        return self.product(operand.astype(np.float64), transpose)
+
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        if transpose and isinstance(self._slab, CSR):
+            # On the device rows would have to be sorted by columns first.
+            super()._queue_product(x, out, epilogue, True)
             return
         for first, rows in row_blocks(self.matrix):
-            self._slab.slabs = []  # makes room
+            # Rows of the last reading make room.
+            self._slab.slabs = []
             self._slab.slabs = self._slab.upload(rows, first)
-            self._slab._bound(x, out, epilogue, transpose)()
-            if transpose:  # the following slabs add to what the first has written
-                epilogue = Epilogue(epilogue.a, 1.0, out)
+            self._slab._queue_product(x, out, epilogue, transpose)
+            if transpose:
+                # The following rows add to what the first have written.
+                epilogue = epilogue.added_to(out)
 
 
 def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
-    """Whether all `matrices` are on a disk, and their R in float32 would not fit the device or the host."""
-    for T in matrices:
-        is_mapped = isinstance(underlying_array(check_mapped_file(T)), np.memmap)
-        if not is_mapped and not hasattr(T, "row_blocks"):
+    """True if all `matrices` are on a disk, and their R in float32 would not fit device or host."""
+    for matrix in matrices:
+        is_mapped = isinstance(underlying_array(check_mapped_file(matrix)), np.memmap)
+        if not is_mapped and not hasattr(matrix, "row_blocks"):
             return False
-    dense = [4 * T.size for T in matrices if isinstance(T, np.ndarray)]
-    entries = sum(dense) + sum(8 * T.nnz for T in matrices if not isinstance(T, np.ndarray))
-    copied = max(dense, default=0)  # on the host, before it is uploaded
     try:
-        checks.fits_host("R", copied)
-        for each in [device, *device.others]:
-            each.require(entries // (1 + len(device.others)) + copied * each.is_cpu, "R")
+        _check_room(matrices, device)
     except MemoryLimitError as error:
-        size = checks.size(sum(T.nbytes for T in matrices))
+        size = checks.size(sum(matrix.nbytes for matrix in matrices))
         getLogger(__name__).warning(
             "T of %s stays on the disk and is read at each product: %s", size, error
         )
@@ -114,8 +126,28 @@ def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
     return False
 
 
+def _check_room(matrices: Sequence[Any], device: Device) -> None:
+    """Refuse matrices whose R in float32 does not fit the devices, or the host while it is made."""
+    nbytes = 0
+    # A dense matrix is copied on the host before it is uploaded.
+    copied = 0
+    for matrix in matrices:
+        if isinstance(matrix, np.ndarray):
+            nbytes += 4 * matrix.size
+            copied = max(copied, 4 * matrix.size)
+        else:
+            nbytes += 8 * matrix.nnz
+    checks.fits_host("R", copied)
+    devices = [device, *device.others]
+    for part_device in devices:
+        share = nbytes // len(devices)
+        if part_device.is_cpu:
+            share += copied
+        part_device.require(share, "R")
+
+
 def row_blocks(matrix: Any) -> Iterator[tuple[int, Any]]:
-    """(first row, rows) of an array or of what has `row_blocks`; those of a file are read ahead."""
+    """(first row, rows) of an array, a sparse matrix or a store; rows of a file are read ahead."""
     if hasattr(matrix, "row_blocks"):
         return matrix.row_blocks()
     if scipy.sparse.issparse(matrix):
@@ -125,27 +157,46 @@ def row_blocks(matrix: Any) -> Iterator[tuple[int, Any]]:
 
 
 def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndarray]]:
-    """Reads some rows from one on; of a mapped file not by page faults, which are several times slower."""
-    root, (height, width) = underlying_array(matrix), matrix.shape
+    """A function that reads `rows` rows from one on."""
+    root = underlying_array(matrix)
     path = getattr(root, "filename", None)
-    if path is None or root.mode == "c" or not matrix.flags.c_contiguous:
-        return lambda first: (first, matrix[first : first + rows])
-    offset = root.offset + matrix.ctypes.data - root.ctypes.data
-    checks.fits_host(f"{path}: reading it", (READS_AHEAD + 1) * rows * width * matrix.itemsize)
-    # In turn, as new memory takes as long as reading: rows are valid until the third reading after
-    # them.
-    buffers = np.empty((READS_AHEAD + 1, rows * width), matrix.dtype)
+    is_file = path is not None and root.mode != "c"
+    if is_file and matrix.flags.c_contiguous:
+        return MappedRowsReader(matrix, rows).read
+    return lambda first: (first, matrix[first : first + rows])
 
-    def read(first: int) -> tuple[int, np.ndarray]:
-        values = buffers[first // rows % len(buffers), : min(rows, height - first) * width]
+
+class MappedRowsReader:
+    """Reads rows of a mapped file by calls: page faults are several times slower.
+
+    It reads into a few buffers in turn, as new memory takes as long as reading: rows are valid
+    until the third reading after them.
+    """
+
+    def __init__(self, matrix: np.ndarray, rows: int) -> None:
+        root = underlying_array(matrix)
+        height, width = matrix.shape
+        self._matrix = matrix
+        self._path = root.filename
+        self._offset = root.offset + matrix.ctypes.data - root.ctypes.data
+        self._rows = rows
+        self._height = height
+        self._width = width
+        count = READS_AHEAD + 1
+        checks.fits_host(f"{self._path}: reading it", count * rows * width * matrix.itemsize)
+        self._buffers = np.empty((count, rows * width), matrix.dtype)
+
+    def read(self, first: int) -> tuple[int, np.ndarray]:
+        """(first row, rows)."""
+        turn = first // self._rows % len(self._buffers)
+        count = min(self._rows, self._height - first)
+        values = self._buffers[turn, : count * self._width]
         try:
-            with open(path, "rb") as file:
-                file.seek(offset + first * width * matrix.itemsize)
+            with open(self._path, "rb") as file:
+                file.seek(self._offset + first * self._width * self._matrix.itemsize)
                 size = file.readinto(values.data)
         except OSError as error:
-            raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+            raise FileError(f"{self._path}: cannot be read: {error.strerror}") from error
         if size < values.nbytes:
-            check_mapped_file(matrix)
-        return first, values.reshape(-1, width)
-
-    return read
+            check_mapped_file(self._matrix)
+        return first, values.reshape(-1, self._width)

@@ -9,36 +9,44 @@ part p,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import abc
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl.device import Array, Device, vectors
-from ltcl.operators.base import Epilogue, Operator
+from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
+from ltcl.operators.epilogue import Epilogue
 
 
 class Parts(Operator):
-    """An operator (M, N) whose products arrive on the host; subclasses give `_gathered`.
+    """An operator (M, N) whose products arrive on the host; subclasses write `_host_product`.
 
-    Methods that read rows on one device refuse it and say `where` the rows are.
+    Methods that read rows on one device refuse it, naming the place of its rows, `where`.
     """
 
     where: str
-    exact: tuple[Any, ...] | None = None  # as that of `Dense`
-    _gathered: Callable[[Array, bool], np.ndarray]  # A x or A^T x, on the host
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+    @abc.abstractmethod
+    def _host_product(self, x: Array, transpose: bool) -> np.ndarray:
+        """A x or A^T x, on the host."""
+
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         a, b, y, c = epilogue.without_shift(x)
-        product = out.like().set(self._gathered(x, transpose).reshape(out.shape))
-        vectors.axpby(a, product, b, product if y is None or not b else y, out)
+        host_product = self._host_product(x, transpose)
+        product = out.like().set(host_product.reshape(out.shape))
+        # axpby reads y also where b is 0.
+        added = product if y is None or not b else y
+        vectors.axpby(a, product, b, added, out)
         if c:
             vectors.axpy(c, x, out)
 
 
 def upload_part(device: Device, matrix: Any, pattern: Pattern | None = None) -> CSR | Dense:
-    """A sparse matrix as `CSR`, an array as `Dense`."""
-    return CSR(device, matrix, pattern) if scipy.sparse.issparse(matrix) else Dense(device, matrix)
+    """A sparse matrix as `CSR`, an array as `Dense`, on one device."""
+    if scipy.sparse.issparse(matrix):
+        return CSR(device, matrix, pattern)
+    return Dense(device, matrix)

@@ -7,23 +7,35 @@ from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.operators.bases import Basis, launch_grid, launch_group
 
-SMALL_LEVEL_PIXELS = 4096  # cells of a level from which on one launch does all the rest
+# Cells of a level up to which one launch does all the levels from it on.
+SMALL_LEVEL_PIXELS = 4096
 
 
 class Pyramid(Basis):
-    """A quad-tree: sums over the cells of all levels, (M, N), the finest first (`kernels/pyramid.cl`).
+    """A quad-tree: sums over the cells of all levels, (M, N), the finest first.
 
     Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the
     edges, until one cell is left: the basis of transports that were scanned adaptively. Not
-    orthonormal. `cells` holds (rows, columns) of each level, whose cells are row-major one behind
-    the other.
+    orthonormal.
+
+    Parameters
+    ----------
+    device : Device
+    grid : (h, w)
+
+    Attributes
+    ----------
+    cells : tuple of (rows, columns)
+        Of each level, whose cells are row-major one behind the other.
 
     Examples
     --------
+    Pixels, then the sums 0 + 1 + 3 + 4 and 2 + 5, then all:
+
     >>> import ltcl, numpy
     >>> from ltcl.operators import Pyramid
     >>> W = Pyramid(ltcl.open_device(), (2, 3))
-    >>> (W @ numpy.arange(6.0)).tolist()  # pixels, then 0 + 1 + 3 + 4 and 2 + 5, then all
+    >>> (W @ numpy.arange(6.0)).tolist()
     [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0, 7.0, 15.0]
     """
 
@@ -32,21 +44,60 @@ class Pyramid(Basis):
 
     def __init__(self, device: Device, grid: tuple[int, int]) -> None:
         h, w = checks.grid("grid", grid)
-        levels = range((max(h, w) - 1).bit_length() + 1)
-        self.cells = tuple((-(-h // 2**level), -(-w // 2**level)) for level in levels)
-        super().__init__(device, grid, "pyramid", sum(h * w for h, w in self.cells))
+        levels = (max(h, w) - 1).bit_length() + 1
+        cells = []
+        for level in range(levels):
+            size = 2**level
+            cells.append((-(-h // size), -(-w // size)))
+        self.cells = tuple(cells)
+        super().__init__(device, grid, "pyramid", sum(rows * columns for rows, columns in cells))
 
     def _transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
     ) -> None:
-        k, levels = x.columns, len(self.cells)
-        kernel, pieces = self._kernel("pyramid", "spread" if transpose else "gather", k)
         if transpose:
-            launch_grid(kernel, pieces, *self.grid, *self.grid, levels, k, a, b, x, y, out)
-            return
-        sums = self.device.empty((self.shape[0] + levels) * k)  # a spare cell a level
-        large = sum(h * w > SMALL_LEVEL_PIXELS for h, w in self.cells)
+            self._spread(x, out, a, b, y)
+        else:
+            self._gather(x, out, a, b, y)
+
+    def _spread(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
+        """Queue the transpose: of each pixel, the sum of the cells that it lies in."""
+        kernel, pieces = self._kernel("pyramid", "spread", x.columns)
+        height, width = self.grid
+        launch_grid(
+            kernel,
+            pieces,
+            self.grid,
+            height=height,
+            width=width,
+            levels=len(self.cells),
+            k=x.columns,
+            a=a,
+            b=b,
+            x=x,
+            y=y,
+            out=out,
+        )
+
+    def _gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
+        """Queue the sums of all cells: large levels one by one, then the others in one launch."""
+        kernel, pieces = self._kernel("pyramid", "gather", x.columns)
+        height, width = self.grid
+        levels = len(self.cells)
+        arguments = {
+            "height": height,
+            "width": width,
+            "k": x.columns,
+            "a": a,
+            "b": b,
+            "x": x,
+            # Wide loads reach a spare cell behind each level.
+            "sums": self.device.empty((self.shape[0] + levels) * x.columns),
+            "y": y,
+            "out": out,
+        }
+        large = sum(rows * columns > SMALL_LEVEL_PIXELS for rows, columns in self.cells)
         for level in range(large):
-            arguments = (*self.grid, level, level + 1, k, a, b, x, sums, y, out)
-            launch_grid(kernel, pieces, *self.cells[level], *arguments)
-        launch_group(kernel, pieces, *self.grid, large, levels, k, a, b, x, sums, y, out)
+            cells = self.cells[level]
+            launch_grid(kernel, pieces, cells, first_level=level, end_level=level + 1, **arguments)
+        launch_group(kernel, pieces, first_level=large, end_level=levels, **arguments)

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Operators whose matrix lies on the device as slabs of rows: how their products and steps are launched.
+"""Operators whose matrix lies on the device as slabs of rows: launches of products and of steps.
 
-Kernels are those of `kernels/common/product.h`: they take its arguments, a slab's and local memory.
+The kernels are those of `kernels/common/product.h`: they take its arguments, those of a slab, and
+local memory.
 """
 
 from __future__ import annotations
 
+import abc
+import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import permutations
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse
@@ -19,23 +22,43 @@ from ltcl.device import Array, Device, tuning, vectors
 from ltcl.device.device import SPARE_BYTES
 from ltcl.device.kernels import Kernel, Launch
 from ltcl.errors import MemoryLimitError
-from ltcl.operators.base import PLAIN, Epilogue, Norms, Operator, Stepper, widths
+from ltcl.operators.base import Operator
+from ltcl.operators.epilogue import PLAIN, Epilogue, widths
+from ltcl.operators.knowledge import Float64Form, NormBound, Norms
+from ltcl.operators.stepper import Stepper
 
-_KEEP, _GAIN, _GROUP_AT = 6, 7, 8  # arguments of a step that change, see kernels/common/product.h
+# The Frobenius norm up to which its square, a float32 sum on the device, is finite.
+MAX_SQUARED_NORM = 1e18
+# The square of a smaller entry is 0 on the device.
+MIN_SQUARED_ENTRY = 2.0**-63
+# Rounding of that sum.
+NORM_MARGIN = 1.01
+# Kernels count the elements of a slab in 32 bits, also a work-group beyond the end of a row.
+MAX_SLAB_ELEMENTS = (1 << 31) - 4096
 
 
 @dataclass(frozen=True)
 class Slab:
-    """Rows first .. first + rows of the matrix; `arguments` are what the format's kernels take for it."""
+    """Rows first .. first + rows of the matrix; `arguments` of the kernels of its format by name."""
 
     first: int
     rows: int
-    arguments: tuple[Any, ...]
+    arguments: dict[str, Any]
+
+    @property
+    def end(self) -> int:
+        """The row behind the last."""
+        return self.first + self.rows
+
+    @property
+    def arrays(self) -> list[Array]:
+        """All its arrays on the device."""
+        return [value for value in self.arguments.values() if isinstance(value, Array)]
 
     @property
     def nbytes(self) -> int:
         """Bytes of its buffers."""
-        return sum(argument.nbytes for argument in self.arguments if isinstance(argument, Array))
+        return sum(array.nbytes for array in self.arrays)
 
 
 @dataclass(frozen=True)
@@ -47,144 +70,241 @@ class Variant:
     shared: bool
 
     def shape(self, kernel: Kernel, rows: int, width: int) -> tuple[int, int, Any]:
-        """Work-items, work-group and local memory of a launch over `rows` with `width` right-hand sides."""
+        """Work-items, work-group and local memory of a launch with `width` right-hand sides."""
         group = kernel.group(self.group)
-        return (rows * group if self.shared else rows), group, kernel.device.local(width * group)
+        items = rows * group if self.shared else rows
+        return items, group, kernel.device.local(width * group)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EntrySums:
+    """Sums over the entries A_ij of a matrix in float64.
+
+    `columns` are the sums of |A_ij| in each column, (N,), `largest_row` is the largest in a row;
+    `lowest` is the lowest entry, or 0.
+    """
+
+    columns: np.ndarray
+    largest_row: float
+    squares: float
+    lowest: float
 
 
 class ReadableRows(Operator):
-    """An operator whose entries the host can read. Subclasses give `blocks`."""
+    """An operator whose entries the host can read; subclasses write `blocks`.
 
-    # (first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for.
-    blocks: Callable[[], Iterator[tuple[int, Any]]]
+    Attributes
+    ----------
+    given : Float64Form or None
+        Its numbers as they were given, before they were rounded to float32.
+    """
+
+    given: Float64Form | None = None
+
+    @abc.abstractmethod
+    def blocks(self) -> Iterator[tuple[int, Any]]:
+        """(first row, rows): float64 arrays or csr_arrays (rows, N), in order."""
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
         diagonal = np.zeros(min(self.shape))
         for first, rows in self.blocks():
-            here = rows.diagonal(first)
-            diagonal[first : first + len(here)] = here
+            piece = rows.diagonal(first)
+            diagonal[first : first + len(piece)] = piece
         return diagonal
 
     def norms(self) -> Norms:
-        """Norms of what it stands for, in float64."""
-        columns, inf, squares, lowest = self.sums()
-        return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
+        """Norms of the matrix, in float64."""
+        sums = self.sums()
+        return Norms(
+            one=float(sums.columns.max(initial=0.0)),
+            inf=sums.largest_row,
+            frobenius=sums.squares**0.5,
+            lowest=sums.lowest,
+        )
 
-    def sums(self) -> tuple[np.ndarray, float, float, float]:
-        """Of |A_ij| in each column, (N,), and the largest of a row; of squares; and the lowest entry or 0."""
-        columns, inf, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
+    def sums(self) -> EntrySums:
+        """Sums over all entries."""
+        columns = np.zeros(self.shape[1])
+        largest_row = 0.0
+        squares = 0.0
+        lowest = 0.0
         for _, rows in self.blocks():
             values = rows.data if scipy.sparse.issparse(rows) else rows
             squares += float(np.vdot(values, values))
             lowest = min(lowest, float(values.min(initial=0.0)))
             sizes = abs(rows)
             columns += sizes.sum(axis=0)
-            inf = max(inf, float(sizes.sum(axis=1).max(initial=0.0)))
-        return columns, inf, squares, lowest
+            row_sums = sizes.sum(axis=1)
+            largest_row = max(largest_row, float(row_sums.max(initial=0.0)))
+        return EntrySums(columns=columns, largest_row=largest_row, squares=squares, lowest=lowest)
 
     def _dense(self) -> np.ndarray:
         dense = np.empty(self.shape)
         for first, rows in self.blocks():
-            here = rows.toarray() if scipy.sparse.issparse(rows) else rows
-            dense[first : first + len(here)] = here
+            block = rows.toarray() if scipy.sparse.issparse(rows) else rows
+            dense[first : first + len(block)] = block
         return dense
+
+    def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
+        if self.given is None and reads_blocks:
+            return Float64Form(matrix=self.to_dense())
+        return self.given
 
 
 class RowOperator(ReadableRows):
-    """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
+    """An operator stored as slabs of rows.
 
-    file: str  # stem of the kernel file
+    Subclasses set `file`, `numbers`, `defines` and `slabs`, and write `blocks` and
+    `_bind_transpose`.
+
+    Attributes
+    ----------
+    file : str
+        Stem of the kernel file.
+    numbers : str
+        The argument of a slab that holds the entries.
+    unit : float
+        Unit of the numbers in the slabs.
+    """
+
+    file: ClassVar[str]
+    numbers: ClassVar[str]
     defines: dict[str, Any]
-    unit = 1.0  # of the numbers in the slabs
+    unit: float = 1.0
     slabs: list[Slab]
-    _transposed_rows: Callable[[], RowOperator]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(device, shape)
         self.defines = {}
         self._fastest: dict[tuple[int, int], Variant] = {}
-        self._transposed: RowOperator | None = None
-        self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
-        self.tables: dict[str, Any] = {}  # of walks.py
+
+    @abc.abstractmethod
+    def _bind_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
+        """A function that queues the product with A^T at each call."""
+
+    @property
+    def has_entries(self) -> bool:
+        """True: its entries lie on one device, in rows."""
+        return True
 
     def arrays(self) -> set[Array]:
-        """Of all slabs, and of the transpose once it was asked for."""
-        arrays = {x for slab in self.slabs for x in slab.arguments if isinstance(x, Array)}
-        return arrays if self._transposed is None else arrays | self._transposed.arrays()
+        """The arrays of all slabs."""
+        return {array for slab in self.slabs for array in slab.arrays}
 
-    def transposed_copy(self) -> RowOperator:
-        """A^T in rows of its own, made at the first call and kept."""
-        if self._transposed is None:
-            self._transposed = self._transposed_rows()
-        return self._transposed
+    def norm_bound(self) -> NormBound:
+        """The Frobenius norm, a bound on the 2-norm of |A|."""
+        if self.known.norm_bound is None:
+            norm = self._frobenius_norm()
+            value = math.inf
+            if norm < MAX_SQUARED_NORM:
+                value = NORM_MARGIN * norm + MIN_SQUARED_ENTRY * max(self.shape)
+            self.known.norm_bound = NormBound(value, is_bound=True)
+        return self.known.norm_bound
 
-    def variants(self) -> dict[str, Variant]:
-        """The kernels and work-groups that make a product here, the default first."""
-        if self.device.is_cpu:
-            return {"item": Variant("", 16, shared=False)}
-        groups = [size for size in (32, 64, 128, 256) if size <= self.device.max_group]
-        shared = {f"group{size}": Variant("_group", size, shared=True) for size in groups}
-        return shared | {"item": Variant("", 64, shared=False)}
+    def _frobenius_norm(self) -> float:
+        """The Frobenius norm of the numbers on the device."""
+        squares = []
+        for slab in self.slabs:
+            values = slab.arguments[self.numbers]
+            if values.size:
+                flat = dataclasses.replace(values, shape=(values.size,))
+                squares.append(float(vectors.dot(flat, flat)[0]))
+        return math.sqrt(math.fsum(squares))
 
-    def fastest(self, x: Array, width: int) -> Variant:
-        """The variant for products with `width` of the right-hand sides `x`, timed at the first call."""
-        key = (width, x.columns)
-        if key in self._fastest:
-            return self._fastest[key]
-        variants, slab = self.variants(), max(self.slabs, key=lambda slab: slab.nbytes)
-        best = next(iter(variants))
-        if (
-            len(variants) > 1
-        ):  # timed on the real matrix, into an array nobody needs: `out` may be an operand
-            spare = self.device.empty((self.shape[0], *x.shape[1:]))
-            trials = {
-                name: self._launch(v, slab, x, spare, 0, width, PLAIN)
-                for name, v in variants.items()
-            }
-            row = slab.nbytes // max(slab.rows, 1)
-            kind = " ".join(f"{name}={value}" for name, value in sorted(self.defines.items()))
-            problem = f"{kind} k={width} of {x.columns}, rows of about 2^{row.bit_length()} bytes"
-            best = tuning.choose(self.device, self.file, problem, trials)
-        self._fastest[key] = variants[best]
-        return variants[best]
+    # Kernels and their variants.
 
     def kernel(self, name: str, width: int, columns: int, **defines: int) -> Kernel:
         """The kernel `name` for `width` of `columns` right-hand sides."""
         packed = {"PACKED": 1} if width == columns else {}
         return self.device.kernel(self.file, name, K=width, **packed, **defines, **self.defines)
 
-    def _launch(
+    def variants(self) -> dict[str, Variant]:
+        """The kernels and work-groups that can make a product here, the default first."""
+        if self.device.is_cpu:
+            return {"item": Variant("", 16, shared=False)}
+        variants = {}
+        for group in (32, 64, 128, 256):
+            if group <= self.device.max_group:
+                variants[f"group{group}"] = Variant("_group", group, shared=True)
+        variants["item"] = Variant("", 64, shared=False)
+        return variants
+
+    def fastest(self, x: Array, width: int) -> Variant:
+        """The variant for products with `width` of the right-hand sides `x`, timed once."""
+        key = (width, x.columns)
+        if key not in self._fastest:
+            variants = self.variants()
+            if len(variants) == 1:
+                self._fastest[key] = next(iter(variants.values()))
+            else:
+                self._fastest[key] = variants[self._fastest_name(variants, x, width)]
+        return self._fastest[key]
+
+    def _fastest_name(self, variants: dict[str, Variant], x: Array, width: int) -> str:
+        """Time the variants on the largest slab, once per device and kind of problem."""
+        slab = max(self.slabs, key=lambda slab: slab.nbytes)
+        # The result goes into a spare array: `out` may be an operand.
+        spare = self.device.empty((self.shape[0], *x.shape[1:]))
+        trials = {}
+        for name, variant in variants.items():
+            trials[name] = self._bind_slab(slab, (0, width), x, spare, PLAIN, variant)
+        row_bytes = slab.nbytes // max(slab.rows, 1)
+        settings = " ".join(f"{name}={value}" for name, value in sorted(self.defines.items()))
+        problem = (
+            f"{settings} k={width} of {x.columns}, rows of about 2^{row_bytes.bit_length()} bytes"
+        )
+        return tuning.choose(self.device, self.file, problem, trials)
+
+    # Products.
+
+    def _bind_slab(
         self,
-        variant: Variant,
         slab: Slab,
+        piece: tuple[int, int],
         x: Array,
         out: Array,
-        offset: int,
-        width: int,
         epilogue: Epilogue,
-    ) -> Callable[[], None]:
+        variant: Variant,
+    ) -> Launch:
+        """The launch for one slab and one piece (offset, width) of right-hand sides."""
+        offset, width = piece
         kernel = self.kernel(f"{self.file}_matvec{variant.suffix}", width, x.columns)
         items, group, local = variant.shape(kernel, slab.rows, width)
-        a, b, y, c = epilogue
-        numbers = (slab.rows, slab.first, x.columns, offset, a * self.unit, b, c)
-        operands = (x, out if y is None else y, out)
-        return kernel.bind(items, group, *numbers, *operands, *slab.arguments, local)
+        return kernel.bind(
+            items,
+            group,
+            rows=slab.rows,
+            first=slab.first,
+            stride=x.columns,
+            offset=offset,
+            a=epilogue.a * self.unit,
+            b=epilogue.b,
+            c=epilogue.c,
+            x=x,
+            y=epilogue.operand(out),
+            out=out,
+            scratch=local,
+            **slab.arguments,
+        )
 
-    def _bound(
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self._bind_product(x, out, epilogue, transpose)()
+
+    def _bind_product(
         self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
     ) -> Callable[[], object]:
         if transpose:
-            return self._bound_transpose(x, out, epilogue)
-        launches = [
-            self._launch(self.fastest(x, width), slab, x, out, offset, width, epilogue)
-            for offset, width in widths(x.columns)
-            for slab in self.slabs
-        ]
-        return launches[0] if len(launches) == 1 else lambda: [launch() for launch in launches]
-
-    def _bound_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
-        return self.transposed_copy()._bound(x, out, epilogue, False)
+            return self._bind_transpose(x, out, epilogue)
+        launches = []
+        for offset, width in widths(x.columns):
+            variant = self.fastest(x, width)
+            for slab in self.slabs:
+                launch = self._bind_slab(slab, (offset, width), x, out, epilogue, variant)
+                launches.append(launch)
+        if len(launches) == 1:
+            return launches[0]
+        return lambda: [launch() for launch in launches]
 
     def stepper(
         self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0
@@ -193,44 +313,133 @@ class RowOperator(ReadableRows):
         return RowStepper(self, x, r, slots, a * self.unit, c)
 
 
+class SparseRows(RowOperator):
+    """Slabs of sparse rows, whose transposed products use A^T in rows of its own."""
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        super().__init__(device, shape)
+        self._transposed: RowOperator | None = None
+
+    @abc.abstractmethod
+    def _transposed_rows(self) -> RowOperator:
+        """A^T in rows, in the same format."""
+
+    def transposed_copy(self) -> RowOperator:
+        """A^T in rows of its own, made at the first call and kept."""
+        if self._transposed is None:
+            self._transposed = self._transposed_rows()
+        return self._transposed
+
+    def arrays(self) -> set[Array]:
+        """The arrays of all slabs, and of the transpose once it was asked for."""
+        arrays = super().arrays()
+        if self._transposed is not None:
+            arrays |= self._transposed.arrays()
+        return arrays
+
+    def _bind_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
+        return self.transposed_copy()._bind_product(x, out, epilogue, False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepPiece:
+    """A launch of a step: a slab, a piece of right-hand sides, and the groups before its own."""
+
+    kernel: Kernel
+    items: int
+    group: int
+    local: Any
+    slab: Slab
+    offset: int
+    first_group: int
+
+    @property
+    def end_group(self) -> int:
+        """The group behind its last."""
+        return self.first_group + -(-self.items // self.group)
+
+
 class RowStepper(Stepper):
-    """Steps of one launch a slab and eight right-hand sides."""
+    """Steps of one launch for each slab and each eight right-hand sides."""
 
     A: RowOperator
 
     def _prepare(self) -> None:
-        A, columns = self.A, self.x.columns
-        pieces, ends = [], []
+        pieces = self._step_pieces()
+        columns = self.x.columns
+        self._groups = max((piece.end_group for piece in pieces), default=1)
+        self._partials = self.A.device.empty((self.slots, self._groups, columns))
+        if len({self._column_end(pieces, piece.offset) for piece in pieces}) > 1:
+            # Some pieces of right-hand sides have fewer groups than others.
+            vectors.fill(self._partials, 0.0)
+        # Many rows read the direction while the next one is written: the two take turns.
+        self._turns = [
+            self._bind_turn(pieces, self.d, self.other),
+            self._bind_turn(pieces, self.other, self.d),
+        ]
+
+    def _step_pieces(self) -> list[StepPiece]:
+        A = self.A
+        columns = self.x.columns
+        pieces = []
         for offset, width in widths(columns):
-            variant, at = A.fastest(self.x, width), 0
+            variant = A.fastest(self.x, width)
+            kernel = A.kernel(f"{A.file}_matvec{variant.suffix}", width, columns, STEP=1)
+            first_group = 0
             for slab in A.slabs:
-                kernel = A.kernel(f"{A.file}_matvec{variant.suffix}", width, columns, STEP=1)
-                shape = variant.shape(kernel, slab.rows, width)
-                pieces.append((kernel, shape, slab, offset, at))
-                at += -(-shape[0] // shape[1])
-            ends.append(at)
-        self._groups = max(ends, default=1)
-        self._partials = A.device.empty((self.slots, self._groups, columns))
-        if len(set(ends)) > 1:
-            vectors.fill(
-                self._partials, 0.0
-            )  # some pieces of right-hand sides have fewer groups than others
-        # The direction is read by many rows while the next one is written: the two take turns.
-        self._turns: list[list[tuple[Launch, int]]] = [[], []]
-        for turn, (d, following) in zip(
-            self._turns, permutations((self.d, self.other)), strict=True
-        ):
-            for kernel, (items, group, local), slab, offset, at in pieces:
-                numbers = (slab.rows, slab.first, columns, offset, self._a, self._c, 0.0, 0.0, at)
-                arrays = (d, self.x, self.r, following, self._partials, *slab.arguments)
-                turn.append((kernel.bind(items, group, *numbers, *arrays, local), at))
+                items, group, local = variant.shape(kernel, slab.rows, width)
+                piece = StepPiece(
+                    kernel=kernel,
+                    items=items,
+                    group=group,
+                    local=local,
+                    slab=slab,
+                    offset=offset,
+                    first_group=first_group,
+                )
+                pieces.append(piece)
+                first_group = piece.end_group
+        return pieces
+
+    @staticmethod
+    def _column_end(pieces: list[StepPiece], offset: int) -> int:
+        """The groups of all slabs, for the right-hand sides from `offset` on."""
+        return max(piece.end_group for piece in pieces if piece.offset == offset)
+
+    def _bind_turn(
+        self, pieces: list[StepPiece], d: Array, next_d: Array
+    ) -> list[tuple[Launch, int]]:
+        """The launches of a step along d that write the next direction, with their first groups."""
+        turn = []
+        for piece in pieces:
+            launch = piece.kernel.bind(
+                piece.items,
+                piece.group,
+                rows=piece.slab.rows,
+                first=piece.slab.first,
+                stride=self.x.columns,
+                offset=piece.offset,
+                a=self._a,
+                c=self._c,
+                keep=0.0,
+                gain=0.0,
+                first_group=piece.first_group,
+                x=d,
+                iterate=self.x,
+                r=self.r,
+                next_x=next_d,
+                partials=self._partials,
+                scratch=piece.local,
+                **piece.slab.arguments,
+            )
+            turn.append((launch, piece.first_group))
+        return turn
 
     def step(self, keep: float, gain: float) -> None:
         """Queue one step; see `Stepper.step`."""
-        for launch, at in self._turns[0]:
-            launch.set(_KEEP, keep)
-            launch.set(_GAIN, gain)
-            launch.set(_GROUP_AT, self.waiting * self._groups + at)
+        for launch, first_group in self._turns[0]:
+            waiting_groups = self.waiting * self._groups
+            launch.set(keep=keep, gain=gain, first_group=waiting_groups + first_group)
             launch()
         self._turns.reverse()
         self.d, self.other = self.other, self.d
@@ -240,17 +449,22 @@ class RowStepper(Stepper):
 def cut(
     device: Device, row_bytes: np.ndarray, what: str, itemsize: int = 4
 ) -> list[tuple[int, int]]:
-    """Rows (start, stop) of as few slabs as possible whose buffer, of `row_bytes` (M,), the device takes."""
-    # Kernels count in 32 bits, also a work-group beyond the end of a row; pointers are rows + 1.
-    limit = min(device.max_allocation - SPARE_BYTES - 4, itemsize * ((1 << 31) - 4096))
+    """Rows (start, stop) of as few slabs as possible, each in one buffer that the device takes.
+
+    `row_bytes` (M,) are the bytes of each row; `what` names the matrix in a refusal.
+    """
+    # Pointers are one more than rows.
+    limit = min(device.max_allocation - SPARE_BYTES - 4, itemsize * MAX_SLAB_ELEMENTS)
     ends = np.concatenate([[0], np.cumsum(row_bytes, dtype=np.int64)])
-    pieces, start = [], 0
+    pieces = []
+    start = 0
     while start < len(row_bytes):
         stop = int(np.searchsorted(ends, ends[start] + limit, side="right")) - 1
         if stop == start:
             row = checks.size(int(row_bytes[start]))
             raise MemoryLimitError(
-                f"row {start} of {what} has {row}, the largest buffer of this device {checks.size(limit)}"
+                f"row {start} of {what} has {row}, the largest buffer of this device "
+                f"{checks.size(limit)}"
             )
         pieces.append((start, stop))
         start = stop

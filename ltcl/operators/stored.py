@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bases by name; operators S = I + R and bases as plain arrays, which files hold, and made of such again.
+"""Operators S = I + R and bases as plain arrays, which files hold, and made from such again.
 
-    system_0.sign, .solution_error, .weights    of each channel, .error_bound; weights where S has
-    them system_0.R.kind, .error                     "csr", "dense", "tiles" or "compressed"; of
-    what was dropped system_0.R.core.kind, ...                   of "compressed", with .out and
-    .into: bases, -1 of pixels basis_0.name, ...                           as `Basis.to_arrays` has
-    it; one that is shared is there once
+=====================================================  ==================================
+system_0.sign, .solution_error, .error_bound           of each channel
+system_0.weights                                       if S has them
+system_0.R.kind                                        "csr", "dense", "tiles" or "compressed"
+system_0.R.error                                       norm of what was dropped
+system_0.R.core.kind, ...                              of "compressed"
+system_0.R.out, .into                                  numbers of bases, -1 for pixels
+basis_0.name, ...                                      see `Basis.to_arrays`
+=====================================================  ==================================
 
-Constructors check every size and index, before anything is uploaded.
+A basis that several operators share is there once. Constructors check every size and index before
+anything is uploaded.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,41 +35,63 @@ from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet, basis
 
 Arrays = dict[str, np.ndarray]
-_CORES = {"csr": CSR, "dense": Dense, "tiles": Tiles}
+KINDS: dict[str, Any] = {"csr": CSR, "dense": Dense, "tiles": Tiles}
+# The number of a basis where a side is pixels.
+PIXELS = -1
 
 
 def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
-    """The arrays of all channels, as they lie on the device; an R that is not of these kinds is refused."""
+    """The arrays of all channels, as they lie on the device; an R of another kind is refused."""
     bases: dict[Basis, int] = {}
     arrays: Arrays = {}
     for number, S in enumerate(systems):
-        own = {
-            name: np.array(getattr(S, name)) for name in ("sign", "solution_error", "error_bound")
+        system = {
+            "sign": np.array(S.sign),
+            "solution_error": np.array(S.solution_error),
+            "error_bound": np.array(S.error_bound),
         }
         if S.weights is not None:
-            own["weights"] = np.asarray(S.weights, np.float64)
-        arrays |= _named(f"system_{number}", own | _named("R", _compressed(S.R, bases)))
+            system["weights"] = np.asarray(S.weights, np.float64)
+        system |= _prefixed("R", _operator_arrays(S.R, bases))
+        arrays |= _prefixed(f"system_{number}", system)
     for W, number in bases.items():
-        arrays |= _named(f"basis_{number}", W.to_arrays())
+        arrays |= _prefixed(f"basis_{number}", W.to_arrays())
     return arrays
 
 
+def _operator_arrays(R: Operator, bases: dict[Basis, int]) -> Arrays:
+    if not isinstance(R, Compressed):
+        return _core_arrays(R)
+    arrays = {
+        "kind": np.array("compressed"),
+        "error": np.array(float(R.error)),
+        "out": np.array(_number_basis(R.out, bases)),
+        "into": np.array(_number_basis(R.into, bases)),
+    }
+    arrays |= _prefixed("core", _core_arrays(R.core))
+    if R.known_diagonal is not None:
+        arrays["diagonal"] = R.known_diagonal
+    return arrays
+
+
+def _number_basis(W: Basis | None, bases: dict[Basis, int]) -> int:
+    """The number of a basis, a new one at the first time."""
+    if W is None:
+        return PIXELS
+    return bases.setdefault(W, len(bases))
+
+
+def _core_arrays(A: Any) -> Arrays:
+    for kind, known in KINDS.items():
+        if type(A) is known:
+            return {"kind": np.array(kind), "error": np.array(float(A.error)), **A.to_arrays()}
+    raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
+
+
 def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[IdentityPlus, ...]:
-    """The S of all channels, of what `to_arrays` gave; arrays that do not fit each other are refused."""
-    bases = functools.cache(
-        lambda number: None if number == -1 else basis_of(device, under(arrays, f"basis_{number}"))
-    )
-    systems, pattern = [], None
+    """The S of all channels whose `to_arrays` gave `arrays`; arrays that do not fit are refused."""
     try:
-        while f"system_{len(systems)}.sign" in arrays:
-            own = under(arrays, f"system_{len(systems)}")
-            R, pattern = _read(device, under(own, "R"), bases, pattern)
-            weights, error = own.get("weights"), float(own["solution_error"])
-            if weights is not None and not np.all(checks.finite("weights", weights) > 0.0):
-                raise InputError("weights of a stored S are not all positive; they must be")
-            systems.append(IdentityPlus(R, float(own["sign"]), weights, solution_error=error))
-            systems[-1].error_bound = max(error, float(own.get("error_bound", error)))
-        return tuple(systems)
+        return StoredSystems(device, arrays).read()
     except LtclError:
         raise
     except KeyError as error:
@@ -74,64 +100,81 @@ def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[Ident
         raise InputError(f"the parts of the operators do not fit: {str(error)!a:.150}") from None
 
 
-def _compressed(R: Operator, bases: dict[Basis, int]) -> Arrays:
-    if not isinstance(R, Compressed):
-        return _core(R)
-    own = {"kind": np.array("compressed"), "error": np.array(float(R.error))} | _named(
-        "core", _core(R.core)
-    )
-    for name, W in (("out", R.out), ("into", R.into)):
-        own[name] = np.array(-1 if W is None else bases.setdefault(W, len(bases)))
-    return own if R.known_diagonal is None else own | {"diagonal": R.known_diagonal}
+class StoredSystems:
+    """Reads the systems of all channels, which may share bases and a pattern."""
 
+    def __init__(self, device: Device, arrays: Mapping[str, np.ndarray]) -> None:
+        self._device = device
+        self._arrays = arrays
+        self._bases: dict[int, Basis] = {}
+        self._pattern: Pattern | None = None
 
-def _core(A: Any) -> Arrays:
-    kind = next((kind for kind, known in _CORES.items() if type(A) is known), None)
-    if kind is None:
-        raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
-    return {"kind": np.array(kind), "error": np.array(float(A.error))} | A.to_arrays()
+    def read(self) -> tuple[IdentityPlus, ...]:
+        """The systems of all channels."""
+        systems: list[IdentityPlus] = []
+        while f"system_{len(systems)}.sign" in self._arrays:
+            system = under(self._arrays, f"system_{len(systems)}")
+            systems.append(self._read_system(system))
+        return tuple(systems)
 
+    def _read_system(self, arrays: Mapping[str, Any]) -> IdentityPlus:
+        R = self._read_operator(under(arrays, "R"))
+        weights = arrays.get("weights")
+        if weights is not None and not np.all(checks.finite("weights", weights) > 0.0):
+            raise InputError("weights of a stored S are not all positive; they must be")
+        solution_error = float(arrays["solution_error"])
+        S = IdentityPlus(R, float(arrays["sign"]), weights, solution_error=solution_error)
+        S.error_bound = max(solution_error, float(arrays.get("error_bound", solution_error)))
+        return S
 
-def _read(
-    device: Device,
-    own: Mapping[str, Any],
-    bases: Callable[[int], Basis | None],
-    pattern: Pattern | None,
-) -> tuple[Operator, Pattern | None]:
-    """R, and the pattern of its core, which that of the next channel may share."""
-    between = str(own["kind"]) == "compressed"
-    inner = under(own, "core") if between else own
-    kind = str(inner["kind"])
-    if kind not in _CORES:
-        raise InputError(
-            f"kind of a stored operator is {kind!r}; it must be {', '.join(_CORES)} or compressed, "
-            "between bases: compress again"
+    def _read_operator(self, arrays: Mapping[str, Any]) -> Operator:
+        if str(arrays["kind"]) != "compressed":
+            return self._read_core(arrays)
+        return Compressed(
+            self._read_core(under(arrays, "core")),
+            self._read_basis(int(arrays["out"])),
+            self._read_basis(int(arrays["into"])),
+            float(arrays["error"]),
+            diagonal=arrays.get("diagonal"),
         )
-    shared = (pattern,) if kind == "csr" else ()
-    core = _CORES[kind].from_arrays(device, inner, *shared)
-    core.error = checks.number("error of a stored operator", float(inner["error"]), least=0.0)
-    pattern = core.pattern if isinstance(core, CSR) else pattern
-    if not between:
-        return core, pattern
-    out, into = (bases(int(own[name])) for name in ("out", "into"))
-    return Compressed(core, out, into, float(own["error"]), diagonal=own.get("diagonal")), pattern
 
+    def _read_core(self, arrays: Mapping[str, Any]) -> Operator:
+        kind = str(arrays["kind"])
+        if kind not in KINDS:
+            raise InputError(
+                f"kind of a stored operator is {kind!r}; it must be {', '.join(KINDS)} or "
+                "compressed, between bases: compress again"
+            )
+        if kind == "csr":
+            core = CSR.from_arrays(self._device, arrays, self._pattern)
+            # The next channel may share it.
+            self._pattern = core.pattern
+        else:
+            core = KINDS[kind].from_arrays(self._device, arrays)
+        error = float(arrays["error"])
+        core.error = checks.number("error of a stored operator", error, least=0.0)
+        return core
 
-def _named(prefix: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
-    return {f"{prefix}.{name}": array for name, array in arrays.items()}
+    def _read_basis(self, number: int) -> Basis | None:
+        if number == PIXELS:
+            return None
+        if number not in self._bases:
+            self._bases[number] = basis_of(self._device, under(self._arrays, f"basis_{number}"))
+        return self._bases[number]
 
 
 def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
     """The basis whose `to_arrays` gave `arrays`; others are refused."""
-    if missing := sorted({"name", "grid"} - set(arrays)):
+    missing = sorted({"name", "grid"} - set(arrays))
+    if missing:
         raise InputError(f"the arrays of a basis lack {' and '.join(missing)}; compress again")
-    name, grid, levels = (
-        str(arrays["name"]),
-        tuple(np.ravel(arrays["grid"]).tolist()),
-        arrays.get("levels"),
-    )
-    levels = None if levels is None else np.asarray(levels).tolist()
-    W = basis(device, grid, name) if levels is None else Wavelet(device, grid, name, levels)
+    name = str(arrays["name"])
+    grid = tuple(np.ravel(arrays["grid"]).tolist())
+    levels = arrays.get("levels")
+    if levels is None:
+        W = basis(device, grid, name)
+    else:
+        W = Wavelet(device, grid, name, np.asarray(levels).tolist())
     if "places" in arrays:
         return SubsetBasis(device, grid, arrays["places"], W)
     if W is None:
@@ -140,8 +183,14 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
 
 
 def under(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Those whose name begins with `prefix` and a point, without these."""
+    """The arrays whose name begins with `prefix` and a point, by the rest of the name."""
     start = f"{prefix}."
-    return {
-        name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)
-    }
+    chosen = {}
+    for name, array in arrays.items():
+        if name.startswith(start):
+            chosen[name.removeprefix(start)] = array
+    return chosen
+
+
+def _prefixed(prefix: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
+    return {f"{prefix}.{name}": array for name, array in arrays.items()}

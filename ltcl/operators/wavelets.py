@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Orthonormal 2-D wavelets, periodized, of grids of any size (`kernels/wavelet.cl`).
+"""Orthonormal 2-D wavelets, periodized, on grids of any size (`kernels/wavelet.cl`).
 
-Coefficients stand as PyWavelets arranges them (`coeffs_to_array`); where all sides halve evenly
-they equal those of its ``wavedec2(..., mode="periodization")``. Where one does not, PyWavelets
-repeats the last sample; here it stands for fewer pixels than the others and passes by the filters
-into the approximation: as many coefficients as pixels, and one of a constant picture on every grid.
+Coefficients stand as PyWavelets arranges them (`coeffs_to_array`); if all sides halve evenly they
+equal those of its ``wavedec2(..., mode="periodization")``. If one does not, PyWavelets repeats the
+last sample; here it stands for fewer pixels than the others and passes by the filters into the
+approximation: as many coefficients as pixels, and one of a constant picture on every grid.
 """
 
 from __future__ import annotations
@@ -20,27 +20,38 @@ from ltcl.errors import InputError
 from ltcl.operators.bases import Basis, launch_grid, launch_group
 from ltcl.operators.pyramid import Pyramid
 
-_pywt: Any = pywt  # compiled, so that no type checker knows its names
-SMALL_LEVEL_PIXELS = 4096  # pixels of a level from which on one launch does all the rest
+# Compiled, so that no type checker knows its names.
+_pywt: Any = pywt
+# Pixels of a level up to which one launch does all the levels from it on.
+SMALL_LEVEL_PIXELS = 4096
+# Deviation from orthonormality: that of dmey is 2e-3.
+MAX_FILTER_DEVIATION = 1e-7
+# Pairs of coefficients that a CPU computes in one wide load.
+CPU_PAIRS = 8
 
 
 class Wavelet(Basis):
-    """A picture's coefficients in orthonormal wavelets: W W^T = W^T W = I.
+    """The coefficients of a picture in orthonormal wavelets: W W^T = W^T W = I.
 
     Parameters
     ----------
-    grid : (h, w), of any sides
+    device : Device
+    grid : (h, w)
+        Of any sides.
     name : str
         An orthonormal wavelet of PyWavelets, "haar", "db2" (the paper's), "sym8", ...; InputError
         for others.
-    levels : int, how often the approximation is split; until one pixel is left when not given
+    levels : int, optional
+        Number of splits of the approximation; until one pixel is left when not given.
 
     Examples
     --------
+    A constant picture has one coefficient, its norm sqrt(15):
+
     >>> import ltcl, numpy
     >>> from ltcl.operators import Wavelet
     >>> W = Wavelet(ltcl.open_device(), (3, 5), "db2")
-    >>> print(abs(W @ numpy.ones(15)).round(4)[:3])  # sqrt(15), the norm, and nothing else
+    >>> print(abs(W @ numpy.ones(15)).round(4)[:3])
     [3.873 0.    0.   ]
     """
 
@@ -50,16 +61,22 @@ class Wavelet(Basis):
         self._taps = device.upload(filters(name))
         h, w = checks.grid("grid", grid)
         super().__init__(device, grid, name, h * w, self._taps)
-        most = (max(self.grid) - 1).bit_length()
-        self.levels = most if levels is None else checks.count("levels", levels, least=0, most=most)
-        self._large = sum(
-            h * w > SMALL_LEVEL_PIXELS for h, w in map(self._sides, range(self.levels))
-        )
-        # Where the approximations of levels 1, 2, ... begin, a spare pixel between: wide loads
-        # reach there.
-        pixels = [h * w + 1 for h, w in map(self._sides, range(1, self.levels + 1))]
-        self._starts = device.upload(np.cumsum([0, *pixels]), np.int32)
-        self._room = sum(pixels)
+        max_levels = (max(self.grid) - 1).bit_length()
+        if levels is None:
+            self.levels = max_levels
+        else:
+            self.levels = checks.count("levels", levels, least=0, most=max_levels)
+        sizes = []
+        for level in range(self.levels + 1):
+            rows, columns = self._sides(level)
+            sizes.append(rows * columns)
+        self._large_levels = sum(size > SMALL_LEVEL_PIXELS for size in sizes[:-1])
+        # The approximations of levels 1, 2, ... stand one behind the other; wide loads reach a
+        # spare pixel between.
+        approximation_sizes = [size + 1 for size in sizes[1:]]
+        starts = np.cumsum([0, *approximation_sizes])
+        self._starts = device.upload(starts, np.int32)
+        self._scratch_size = sum(approximation_sizes)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Name, grid and levels."""
@@ -68,7 +85,8 @@ class Wavelet(Basis):
     def _sides(self, level: int) -> tuple[int, int]:
         """Rows and columns of the approximation after `level` splits."""
         h, w = self.grid
-        return -(-h // 2**level), -(-w // 2**level)
+        size = 2**level
+        return -(-h // size), -(-w // size)
 
     def _transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
@@ -76,56 +94,80 @@ class Wavelet(Basis):
         if self.levels == 0:
             vectors.axpby(a, x, b, y, out)
             return
-        name, k, levels = "join" if transpose else "split", x.columns, self.levels
-        wide = 8 if k == 1 and self.device.is_cpu else 1
-        kernel, pieces = self._kernel("wavelet", name, k, TAPS=self._taps.shape[1], PAIRS=wide)
-        near = self.device.empty(self._room * k)
-        launches = [(level, level + 1) for level in range(self._large)]
-        launches += [(self._large, levels)] if self._large < levels else []
-        for first, last in reversed(launches) if transpose else launches:
-            arguments = (
-                *self.grid,
-                first,
-                last,
-                levels,
-                k,
-                a,
-                b,
-                self._starts,
-                self._taps,
-                x,
-                near,
-                y,
-                out,
-            )
-            if last <= self._large:
-                launch_grid(kernel, pieces, *self._sides(last), *arguments)
+        name = "join" if transpose else "split"
+        k = x.columns
+        pairs = CPU_PAIRS if k == 1 and self.device.is_cpu else 1
+        taps = self._taps.shape[1]
+        kernel, pieces = self._kernel("wavelet", name, k, TAPS=taps, PAIRS=pairs)
+        height, width = self.grid
+        arguments = {
+            "height": height,
+            "width": width,
+            "levels": self.levels,
+            "k": k,
+            "scale": a,
+            "add_scale": b,
+            "starts": self._starts,
+            "taps": self._taps,
+            "x": x,
+            "approximations": self.device.empty(self._scratch_size * k),
+            "add": y,
+            "out": out,
+        }
+        launches = self._launches()
+        if transpose:
+            launches.reverse()
+        for first, end in launches:
+            levels = {"first_level": first, "end_level": end}
+            if end <= self._large_levels:
+                launch_grid(kernel, pieces, self._sides(end), **levels, **arguments)
             else:
-                launch_group(kernel, pieces, *arguments)
+                launch_group(kernel, pieces, **levels, **arguments)
+
+    def _launches(self) -> list[tuple[int, int]]:
+        """The levels first .. end - 1 of each launch: large ones one by one, then the others."""
+        launches = [(level, level + 1) for level in range(self._large_levels)]
+        if self._large_levels < self.levels:
+            launches.append((self._large_levels, self.levels))
+        return launches
 
 
 def filters(name: Any) -> np.ndarray:
-    """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64, in the order of samples."""
+    """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64."""
     offered = "an orthonormal wavelet of PyWavelets, such as haar, db2, sym8 or coif1"
     if name not in _pywt.wavelist(kind="discrete"):
         raise InputError(f"wavelet is {name!r}; it must be {offered}")
     wavelet = _pywt.Wavelet(name)
     taps = np.array([wavelet.rec_lo, wavelet.rec_hi])
-    length = taps.shape[1]
-    shifted = [
-        taps[:, s:] @ taps[:, : length - s].T - np.eye(2) * (s == 0) for s in range(0, length, 2)
-    ]
-    if not np.max(np.abs(shifted)) < 1e-7:  # that of dmey is 2e-3
+    if not _deviation(taps) < MAX_FILTER_DEVIATION:
         raise InputError(f"wavelet {name} is not orthonormal; it must be {offered}")
     return taps
 
 
+def _deviation(taps: np.ndarray) -> float:
+    """The largest deviation of the products of filters, shifted by pairs, from those of a basis."""
+    length = taps.shape[1]
+    deviations = []
+    for shift in range(0, length, 2):
+        products = taps[:, shift:] @ taps[:, : length - shift].T
+        expected = np.eye(2) if shift == 0 else np.zeros((2, 2))
+        deviations.append(np.max(np.abs(products - expected)))
+    return float(np.max(deviations))
+
+
 def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
-    """The basis called `name` of pictures of h x w pixels.
+    """The basis called `name` for pictures of h x w pixels.
 
-    That is "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets:
-    "haar", "db2", "db4", ...; InputError for others.
+    Parameters
+    ----------
+    device : Device
+    grid : (h, w)
+    name : str
+        "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets:
+        "haar", "db2", "db4", ...; InputError for others.
 
+    Examples
+    --------
     >>> import ltcl
     >>> from ltcl.operators import basis
     >>> basis(ltcl.open_device(), (8, 8), "db2").orthonormal
@@ -133,4 +175,6 @@ def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
     """
     if name == "pixels":
         return None
-    return Pyramid(device, grid) if name == "pyramid" else Wavelet(device, grid, name)
+    if name == "pyramid":
+        return Pyramid(device, grid)
+    return Wavelet(device, grid, name)

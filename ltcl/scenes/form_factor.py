@@ -29,7 +29,7 @@ from ltcl import checks
 from ltcl.device import Array, Device, open_device
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Operator
-from ltcl.operators.base import Epilogue, widths
+from ltcl.operators.epilogue import Epilogue, widths
 from ltcl.scenes import exchange
 from ltcl.scenes.patches import (
     Patches,
@@ -151,7 +151,7 @@ class FormFactor(Operator):
         """Zeros, (N,): a flat patch does not light itself."""
         return np.zeros(self.shape[0])
 
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         right, left = (self._albedo, self._area) if transpose else (self._area, self._albedo)
         scale, b, y, c = epilogue
         count, pitch = self.shape[0], self._geometry.shape[1]
@@ -180,7 +180,7 @@ class FormFactor(Operator):
                 size = min(rows, count - first)
                 place = (size, first, x.columns, offset, scale, b, c)
                 matvec(size, 16 if self.device.is_cpu else 64, *place, *vectors)
-        self._near._product(x, out, Epilogue(scale, 1.0, out), transpose)
+        self._near._queue_product(x, out, Epilogue(scale, 1.0, out), transpose)
 
     def _correction(
         self, patches: Patches, blocks: np.ndarray, albedo: np.ndarray, area: np.ndarray

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`auto`: choosing a method before the first step, and saying why.
+"""`auto`: choose a method before the first step, and say why.
 
 Row sums show whether the plain iteration is best. Else the first solve with S tries GMRES, for no
-more steps than a survey and Chebyshev within free bounds: a survey pays where that fails, or S is
-solved again. Made once in the life of S, it is three steps of GMRES from a random picture: Ritz
-values estimate the spectrum, residuals how fast Krylov methods converge, directions whether S is
-self-adjoint. The least estimated time decides: bytes over bandwidth, launches, waits. Speeds that
-matter are measured, once per device.
+more steps than a survey and Chebyshev within free bounds take: a survey pays where that fails, or
+if S is solved again (`ltcl.solvers.survey`). The least estimated time decides: bytes over
+bandwidth, launches, waits. The speeds are measured, once per device.
 """
 
 from __future__ import annotations
@@ -14,196 +12,297 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
-
-import numpy as np
 
 from ltcl import theory
 from ltcl.device import Array, Device, tuning, vectors
-from ltcl.operators import IdentityPlus, Operator
-from ltcl.operators.rows import RowOperator
-from ltcl.solvers.krylov import CG, GMRES, KrylovSpace
-from ltcl.solvers.precision import Direct, factors
-from ltcl.solvers.stationary import Chebyshev, Jacobi, drawn_in
-from ltcl.solvers.stopping import Monitor, System
+from ltcl.errors import InputError, MemoryLimitError, ToleranceError
+from ltcl.operators import Operator
+from ltcl.solvers.chebyshev import Chebyshev
+from ltcl.solvers.direct import Direct
+from ltcl.solvers.krylov import CG, GMRES
+from ltcl.solvers.method import Method
+from ltcl.solvers.problem import LinearProblem
+from ltcl.solvers.refinement import step_tolerance
+from ltcl.solvers.result import Solution
+from ltcl.solvers.stationary import Jacobi
+from ltcl.solvers.stopping import CountedOperator, Monitor
+from ltcl.solvers.survey import STEPS, Survey, survey
 
-SMALL = 512  # pixels: below, a dense factorization takes less time than launching kernels
-LARGEST_DIRECT = 8192  # pixels: above, a dense factorization takes gigabytes and minutes
-PRECISE = 1e-6  # relative residual that float32 products reach for certain
-STEPS = 3  # of a survey
-_AT_ONCE = 8  # right-hand sides in one product
-_SELF_ADJOINT = (
-    0.02  # defect of R up to which inner products are nearly those of a self-adjoint one
-)
-_SLENDER = 0.25  # of the smallest real part: imaginary parts that an interval may leave out
-_LAUNCHES = 16  # timed together
-# Vectors read or written, launches and waits for each product.
-_STEPS = {"chebyshev": (4, 1, 0.5), "cg": (9, 3, 0.5), "gmres": (12, 5, 1.0)}
+# A dense factorization of no more pixels takes less time than launching kernels.
+SMALL = 512
+
+# A dense factorization of more pixels takes gigabytes and minutes.
+LARGEST_DIRECT = 8192
+
+# Relative residual that float32 products reach for certain.
+PRECISE = 1e-6
+
+# Largest relative residual that a plan is made for, whatever the tolerance.
+LOOSEST_PLAN = 0.5
+
+# Right-hand sides of one product.
+COLUMNS_OF_A_PRODUCT = 8
+
+# Launches that are timed together.
+TIMED_LAUNCHES = 16
 
 
-@dataclass(frozen=True)
-class Survey:
-    """Complex Ritz values of S, an interval around their real parts, within the free bounds, and more.
+@dataclass(frozen=True, kw_only=True)
+class StepCost:
+    """The needs of a method between two products: vectors read or written, launches and waits."""
 
-    `residuals` are those of GMRES after 0, 1, ... products, relative; `defect` is the part of R
-    that is not self-adjoint in the inner product of `S.weights`, or the plain one: 0 where it is, 1
-    of a rotation.
+    vectors: int
+    launches: int
+    waits: float
+
+
+STEP_COSTS = {
+    "chebyshev": StepCost(vectors=4, launches=1, waits=0.5),
+    "cg": StepCost(vectors=9, launches=3, waits=0.5),
+    "gmres": StepCost(vectors=12, launches=5, waits=1.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A method, and what it needs, roughly.
+
+    `nbytes` are to be moved, `overhead` are seconds of launches and waits.
     """
 
-    ritz: np.ndarray
-    spectrum: tuple[float, float]
-    residuals: tuple[float, ...]
-    defect: float
-
-    @property
-    def in_an_interval(self) -> bool:
-        """Whether all eigenvalues seem to lie near some interval of positive numbers."""
-        least = float(np.min(np.real(self.ritz), initial=np.inf))
-        return least > 0.0 and np.max(np.abs(np.imag(self.ritz)), initial=0.0) <= _SLENDER * least
-
-    @property
-    def self_adjoint(self) -> bool:
-        """Whether cg will work as in theory."""
-        return self.defect <= _SELF_ADJOINT
-
-    def krylov_products(self, rtol: float) -> float:
-        """Products of a Krylov method to `rtol`; infinite where it stalls."""
-        if self.residuals[-1] <= rtol:  # they never grow
-            return float(np.argmax(np.array(self.residuals) <= rtol))
-        factor = self.residuals[-1] / self.residuals[-2]
-        missing = (
-            math.log(rtol / self.residuals[-1]) / math.log(factor) if factor < 1.0 else math.inf
-        )
-        return len(self.residuals) - 1.0 + float(np.ceil(missing))
-
-    def __str__(self) -> str:
-        real, imaginary = np.real(self.ritz), np.imag(self.ritz)
-        least, most = np.min(real, initial=np.inf), np.max(real, initial=-np.inf)
-        rotation = (
-            "" if self.in_an_interval else f" with imaginary parts up to {np.max(imaginary):.2g}"
-        )
-        spectrum = f"eigenvalues of S seen between {least:.2g} and {most:.2g}{rotation}"
-        return f"{self.defect:.2g} of R is not self-adjoint, {spectrum} by {len(self.residuals) - 1} products"
-
-
-_surveys: weakref.WeakKeyDictionary[Operator, Survey] = weakref.WeakKeyDictionary()
-_tried: weakref.WeakSet[Operator] = weakref.WeakSet()
-
-
-def survey(S: Operator) -> Survey:
-    """The survey of S, made at the first call."""
-    if S in _surveys:
-        return _surveys[S]
-    start = S.device.upload(np.random.default_rng(0).uniform(size=S.shape[0]))
-    space, residuals, ended = (
-        KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0])),
-        [1.0],
-        False,
-    )
-    while space.count < space.steps and not ended:
-        ended = space.extend()[0]
-        residuals.append(float(space.residuals[0]))
-    ritz = space.ritz_values()
-    spectrum = drawn_in(theory.free_bounds(S), S, ritz)
-    _surveys[S] = Survey(ritz, spectrum, tuple(residuals), _defect(S, space))
-    return _surveys[S]
-
-
-def _defect(S: Operator, space: KrylovSpace) -> float:
-    """||G - G^T|| / 2 ||G|| of G = V^T W R V, from S V = V H: products that are made already."""
-    steps = space.count
-    basis = [dataclasses.replace(space.V.rows(j, 1), shape=S.shape[:1]) for j in range(steps + 1)]
-    gram = S.device.empty((steps * (steps + 1), 1))  # <v_i, W v_j>, read in one go
-    weights = None if S.weights is None else S.device.upload(S.weights / np.max(S.weights))
-    for j, v in enumerate(basis[:steps]):
-        wv = v if weights is None else vectors.scale_rows(weights, v, v.like())
-        for i, u in enumerate(basis):
-            vectors.queue_dot(u, wv, gram, j * (steps + 1) + i)
-    R = space.H[0, : steps + 1, :steps] - np.eye(steps + 1, steps)
-    G = gram.get().reshape(steps, steps + 1).astype(np.float64) @ R
-    return float(np.linalg.norm(G - G.T) / (2.0 * np.linalg.norm(G) or 1.0))
-
-
-class _Candidate(NamedTuple):
-    """A method, and what it needs, roughly: bytes to move, seconds of launches and waits, operations."""
-
-    method: Any
+    method: Method
     products: float
     nbytes: float = 0.0
     overhead: float = 0.0
     operations: float = 0.0
 
     def seconds(self, bandwidth: float, flops: float) -> float:
+        """Return the estimated time."""
         return self.nbytes / bandwidth + self.overhead + self.operations / flops
 
     def __str__(self) -> str:
-        return f"{self.method.name}: {self.products:g} product{'s' * (self.products != 1)}"
+        unit = "product" if self.products == 1 else "products"
+        return f"{self.method.name}: {self.products:g} {unit}"
 
 
-class _Trial(GMRES):
-    """One cycle, however many steps the caller allows."""
+@dataclass(frozen=True, kw_only=True)
+class PlannedMethod:
+    """A method to try, why, and the products that it took to know."""
 
-    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
-        monitor.rule = dataclasses.replace(
-            monitor.rule, maxiter=min(self.restart, monitor.rule.maxiter)
-        )
+    method: Method
+    reason: str
+    products: int = 0
+
+
+class GMRESTrial(GMRES):
+    """A single cycle of GMRES, however many steps the caller allows."""
+
+    def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
+        """Improve `x`, whose residual is `r`, for one cycle."""
+        maxiter = min(self.restart, monitor.rule.maxiter)
+        monitor.rule = dataclasses.replace(monitor.rule, maxiter=maxiter)
         super().iterate(system, x, r, monitor)
 
 
+def solve_automatically(problem: LinearProblem) -> Solution:
+    """Return the solution of the first planned method that converges, else the best iterate.
+
+    Its products are those of all methods.
+    """
+    attempts = _Attempts(problem)
+    attempts.run()
+    return attempts.solution()
+
+
+class _Attempts:
+    """The methods that were tried for a problem, and what came of them."""
+
+    def __init__(self, problem: LinearProblem) -> None:
+        self.problem = problem
+        self.target = min(problem.required_rtol, LOOSEST_PLAN)
+        self.solutions: list[Solution] = []
+        self.reasons: list[str] = []
+        self.products = 0
+        self.failure: MemoryLimitError | InputError | None = None
+        if problem.exact is None:
+            self._refine_where_needed()
+        if self.problem.exact is not None:
+            self.target = step_tolerance(problem.S)
+
+    def _refine_where_needed(self) -> None:
+        """Refine in float64 if the tolerance is below what float32 products tell of a large S."""
+        S = self.problem.S
+        pixels = S.shape[0]
+        if self.target >= PRECISE or pixels <= SMALL:
+            return
+        if S.product_float64() is not None:
+            self.problem = dataclasses.replace(self.problem, exact=S)
+            self.reasons.append(
+                f"refined in float64, since rtol={self.target:g} is below what float32 products "
+                "reach"
+            )
+        elif pixels > LARGEST_DIRECT:
+            raise ToleranceError(
+                f"rtol is {self.target:g}, less than float32 products tell of S, whose numbers are "
+                f"on the device alone and whose N = {pixels} is too large to factorize; it must be "
+                "at least 1e-06",
+                PRECISE,
+            )
+
+    def run(self) -> None:
+        """Try the planned methods until one converges."""
+        S = self.problem.S
+        columns = self.problem.b[0].size
+        is_refined = self.problem.exact is not None
+        for planned in plan(S, self.target, columns, is_refined):
+            self.reasons.append(planned.reason)
+            self.products += planned.products
+            if self._try(planned.method):
+                return
+
+    def _try(self, method: Method) -> bool:
+        """Try a method, from the best iterate so far; return whether it converged."""
+        try:
+            solution = method.solve(self.problem)
+        except (MemoryLimitError, InputError) as error:
+            # No room, or no transpose; but what the first method refuses is bad input.
+            if not self.solutions and isinstance(error, InputError):
+                raise
+            self.failure = error
+            self.reasons.append(f"{method.name} failed: {error}")
+            return False
+        self.solutions.append(solution)
+        self.products += solution.products
+        if solution.converged:
+            return True
+        self.reasons.append(f"{solution.method} ended {solution.status.name.lower()}")
+        if solution.residual < 1.0:
+            start = solution.x / self.problem.unit
+            self.problem = dataclasses.replace(self.problem, x0=start)
+        return False
+
+    def solution(self) -> Solution:
+        """Return the last solution if it converged, else the best one."""
+        if self.failure is not None and not self.solutions:
+            raise self.failure
+        best = self.solutions[-1]
+        if not best.converged:
+            best = min(self.solutions, key=lambda solution: solution.residual)
+        return dataclasses.replace(best, products=self.products, reason="; ".join(self.reasons))
+
+
 def plan(
-    S: Operator, rtol: float, columns: int, refines: bool = False
-) -> Iterator[tuple[Any, str, int]]:
-    """Methods to try for S x = b to `rtol`, one where those before fail; why; products it took to know."""
-    n = S.shape[0]
-    if n <= SMALL:
-        yield Direct(), f"direct: {n} pixels are few enough for a dense factorization", 0
+    S: Operator, rtol: float, columns: int, is_refined: bool = False
+) -> Iterator[PlannedMethod]:
+    """Return the methods to try for S x = b to `rtol`, the next one where those before fail."""
+    pixels = S.shape[0]
+    if pixels <= SMALL:
+        reason = f"direct: {pixels} pixels are few enough for a dense factorization"
+        yield PlannedMethod(method=Direct(), reason=reason)
         return
-    if rtol < PRECISE and n <= LARGEST_DIRECT:
-        yield Direct(), f"direct: rtol={rtol:g} is below what float32 products reach", 0
+    if rtol < PRECISE and pixels <= LARGEST_DIRECT:
+        reason = f"direct: rtol={rtol:g} is below what float32 products reach"
+        yield PlannedMethod(method=Direct(), reason=reason)
         return
-    least, _, most = theory.row_sum_range(S)
-    rho = max(most - 1.0, 1.0 - least)
+
+    row_sums = S.row_sum_range()
+    rho = max(row_sums.largest - 1.0, 1.0 - row_sums.least)
     if not math.isfinite(rho):
-        yield GMRES(), "gmres: it needs no bounds, and row sums of S leave float32", 0
+        reason = "gmres: it needs no bounds, and row sums of S leave float32"
+        yield PlannedMethod(method=GMRES(), reason=reason)
         return
-    plain = _Candidate(Jacobi(), theory.series_products(rho, rtol))
-    free = _Candidate(Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
+    plain = Candidate(method=Jacobi(), products=theory.series_products(rho, rtol))
+    free_products = theory.chebyshev_products(*theory.free_bounds(S), rtol)
+    free = Candidate(method=Chebyshev(), products=free_products)
     if plain.products <= free.products:
-        yield plain.method, f"{plain}, {free}; row sums of R are at most {rho:.2g}", 0
-    elif not (
-        refines or columns > _AT_ONCE or any(S in known for known in (_tried, _surveys, factors))
-    ):
-        _tried.add(S)
+        reason = f"{plain}, {free}; row sums of R are at most {rho:.2g}"
+        yield PlannedMethod(method=plain.method, reason=reason)
+    elif not is_refined and columns <= COLUMNS_OF_A_PRODUCT and not _was_solved(S):
+        S.known.was_tried = True
         most = min(STEPS + int(free.products), GMRES.restart)
-        yield (
-            _Trial(most),
-            f"gmres: at most {most} products, without a survey at the first solve",
-            0,
-        )
-    made_before = S in _surveys
+        reason = f"gmres: at most {most} products, without a survey at the first solve"
+        yield PlannedMethod(method=GMRESTrial(most), reason=reason)
+    yield from _plan_by_survey(S, rtol, columns)
+
+
+def _was_solved(S: Operator) -> bool:
+    """Return whether S was solved before, so that a survey pays."""
+    known = S.known
+    return known.was_tried or known.survey is not None or known.factorization is not None
+
+
+def _plan_by_survey(S: Operator, rtol: float, columns: int) -> Iterator[PlannedMethod]:
+    """Return the methods in the order of their estimated time, and two that need no bounds."""
+    made_before = S.known.survey is not None
     surveyed = survey(S)
-    products = surveyed.krylov_products(rtol)
-    candidates = [_candidate(S, columns, GMRES(), products)]
+    candidates = _candidates(S, rtol, columns, surveyed)
+    bandwidth = _bandwidth(S.device)
+    flops = _flops()
+    candidates.sort(key=lambda candidate: candidate.seconds(bandwidth, flops))
+    # Ranks of a cluster measure different speeds, but have to make one choice.
+    candidates = S.device.agreed(candidates)
+
+    ranking = ", ".join(map(str, candidates))
+    reason = f"fastest first: {ranking}; {surveyed}"
+    products = len(surveyed.residuals) - 1
+    if made_before:
+        reason += " made before"
+        products = 0
+    first = candidates[0].method
+    yield PlannedMethod(method=first, reason=reason, products=products)
+    if not isinstance(first, GMRES):
+        yield PlannedMethod(method=GMRES(), reason="gmres: next, as it needs no bounds")
+    if S.shape[0] <= LARGEST_DIRECT and not isinstance(first, Direct):
+        yield PlannedMethod(method=Direct(), reason="direct: last, as products did not do")
+
+
+def _candidates(S: Operator, rtol: float, columns: int, surveyed: Survey) -> list[Candidate]:
+    """Return what each method that fits S needs."""
+    krylov_products = surveyed.krylov_products(rtol)
+    candidates = [_iterative_candidate(S, columns, GMRES(), krylov_products)]
     if surveyed.in_an_interval:
         if surveyed.self_adjoint:
-            candidates.append(_candidate(S, columns, CG(), products + 1))  # which confirms its end
+            # One more product confirms the end.
+            candidates.append(_iterative_candidate(S, columns, CG(), krylov_products + 1))
         products = theory.chebyshev_products(*surveyed.spectrum, rtol)
-        candidates.append(_candidate(S, columns, Chebyshev(surveyed.spectrum), products))
-    if n <= LARGEST_DIRECT and isinstance(S.R if isinstance(S, IdentityPlus) else S, RowOperator):
-        candidates.append(_candidate(S, columns, Direct()))
-    bandwidth, flops = _bandwidth(S.device), _flops()
-    candidates.sort(key=lambda candidate: candidate.seconds(bandwidth, flops))
-    candidates = S.device.agreed(candidates)
-    first, ranking = candidates[0].method, f"fastest first: {', '.join(map(str, candidates))}"
-    reasons = f"{ranking}; {surveyed}{' made before' if made_before else ''}"
-    yield first, reasons, 0 if made_before else len(surveyed.residuals) - 1
-    if not isinstance(first, GMRES):
-        yield GMRES(), "gmres: next, as it needs no bounds", 0
-    if n <= LARGEST_DIRECT and not isinstance(first, Direct):
-        yield Direct(), "direct: last, as products did not do", 0
+        chebyshev = Chebyshev(surveyed.spectrum)
+        candidates.append(_iterative_candidate(S, columns, chebyshev, products))
+    if S.shape[0] <= LARGEST_DIRECT and S.has_entries:
+        candidates.append(_direct_candidate(S, columns))
+    return candidates
+
+
+def _iterative_candidate(S: Operator, columns: int, method: Method, products: float) -> Candidate:
+    """Return what so many products by an iterative method need."""
+    cost = STEP_COSTS[method.name]
+    passes = math.ceil(columns / COLUMNS_OF_A_PRODUCT)
+    vector_bytes = 4.0 * S.shape[0] * columns
+    nbytes = S.nbytes * passes + S.bytes_read() + vector_bytes * cost.vectors
+    launch, wait = _overheads(S.device)
+    overhead = passes * cost.launches * launch + cost.waits * wait
+    return Candidate(
+        method=method,
+        products=products,
+        nbytes=products * nbytes,
+        overhead=products * overhead,
+    )
+
+
+def _direct_candidate(S: Operator, columns: int) -> Candidate:
+    """Return what a dense factorization, if it is not there yet, and its use need."""
+    n = S.shape[0]
+    operations = 4.0 * n * n * columns
+    if S.known.factorization is None:
+        operations += 2.0 / 3.0 * n**3
+    return Candidate(
+        method=Direct(),
+        products=0,
+        # Both triangles, and S for the residual.
+        nbytes=16.0 * n * n,
+        operations=operations,
+    )
 
 
 _bandwidth = functools.cache(tuning.bandwidth)
@@ -212,23 +311,13 @@ _flops = functools.cache(tuning.factorization_flops)
 
 @functools.cache
 def _overheads(device: Device) -> tuple[float, float]:
-    """Seconds of a launch and of a wait."""
+    """Return the seconds of a launch and of a wait."""
     x = device.empty(64)
-    fills = lambda: [vectors.fill(x, 0.0) for _ in range(_LAUNCHES)]  # noqa: E731
+
+    def fill_repeatedly() -> None:
+        for _ in range(TIMED_LAUNCHES):
+            vectors.fill(x, 0.0)
+
     wait = tuning.seconds(device, "a wait", lambda: vectors.dot(x, x))
-    return tuning.seconds(device, f"{_LAUNCHES} launches", fills) / _LAUNCHES, wait
-
-
-def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _Candidate:
-    """What so many products need; or a dense factorization, where it is not there yet, and its use."""
-    n = S.shape[0]
-    if isinstance(method, Direct):
-        factorize = 0.0 if S in factors else 2.0 / 3.0 * n**3
-        nbytes = 16.0 * n * n  # both triangles, and S for the residual
-        return _Candidate(method, 0, nbytes, 0.0, factorize + 4.0 * n * n * columns)
-    moved, launches, waits = _STEPS[method.name]
-    passes = math.ceil(columns / _AT_ONCE)
-    nbytes = S.nbytes * passes + S.bytes_read() + 4.0 * n * columns * moved
-    launch, wait = _overheads(S.device)
-    overhead = passes * launches * launch + waits * wait
-    return _Candidate(method, products, products * nbytes, products * overhead)
+    launches = tuning.seconds(device, f"{TIMED_LAUNCHES} launches", fill_repeatedly)
+    return launches / TIMED_LAUNCHES, wait

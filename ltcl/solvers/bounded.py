@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Least squares within bounds: min ||w (A x - b)|| over lower <= x <= upper, by products with A and A^T.
+"""Least squares within bounds: min ||w (A x - b)|| over lower <= x <= upper.
 
-Projected conjugate directions. With r = w (b - A x), g = -A^T w r, and z = -g but for what the
-bounds forbid,
+Only products with A and A^T are needed. A is (M, N), x (N, k), b and w (M, k). Projected conjugate
+directions: with r = w (b - A x), g = -A^T w r, and z = -g but for what the bounds forbid,
 
     p = z + beta d,   d' = clip(x + alpha p) - x,   x' = x + lambda d'
 
-with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda
+where beta makes p conjugate to the last d, alpha is the step of Barzilai and Borwein, and lambda is
 exact along d' or as far as the bounds allow: conjugate gradients on a face of the box, and many
-bounds at once (Moré and Toraldo, SIAM J. Optimization 1, 1991). Where the last lambda was short, or
+bounds at once (Moré and Toraldo, SIAM J. Optimization 1, 1991). If the last lambda was short, or
 0, p = z. A step is two products.
 
 The certificate: with the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), by
@@ -17,8 +17,8 @@ Cauchy and Schwarz
     ||r*|| >= r.r* / ||r|| >= ||r|| - gap / ||r||,
 
 and the largest of these bounds so far is kept. Done when the error is within the tolerance, of 0 or
-of that, with what rounding of A x may hide: of S = I + R, whose columns may be far below 1, at
-least that of x itself.
+of that bound, with what rounding of A x may hide. Known limit: for S = I + R, whose columns may be
+far below 1, that is at least the rounding of x itself.
 """
 
 from __future__ import annotations
@@ -32,15 +32,31 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ltcl.device import vectors
+from ltcl.device.kernels import Launch
 from ltcl.operators import Operator
-from ltcl.solvers.krylov import Columns, ratio
+from ltcl.solvers.column_reductions import ColumnReductions, safe_ratio
 from ltcl.solvers.result import Solution, Status
 
-_KERNELS = ("bounded_direction", "vector_dots", "bounded_move", "bounded_look")
-_ROUNDING = 2.0**-22  # of ||w b||: an error is not told from the least one by less
-_FAR = 1e30  # in units of b: a bound where none was meant, inside float32
-Box = tuple[np.ndarray, np.ndarray]  # lower, upper (N,)
-_PATIENCE = 50  # steps without a better certificate: rounding has the say
+# An error is not told from the least one by less than this part of ||w b||.
+ROUNDING_SHARE = 2.0**-22
+
+# A bound beyond this, in units of b, means that there is none; it is within float32.
+FARTHEST_BOUND = 1e30
+
+# Rounding hides any further gain after so many steps without a better certificate.
+PATIENCE = 50
+
+# Rows of numbers that the kernels keep, before the partial sums: alpha, the curvature of the last
+# direction, lambda, and one that is free.
+NUMBER_ROWS = 4
+
+_DIRECTION = "bounded_direction"
+_DOTS = "vector_dots"
+_MOVE = "bounded_move"
+_LOOK = "bounded_look"
+
+# lower, upper (N,)
+Box = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -50,7 +66,7 @@ class Bounded(Solution):
     Attributes
     ----------
     errors, least : (k,) float64
-        ``||w (A x - b)||`` of every column, and what no x within the bounds is below.
+        ``||w (A x - b)||`` of every column, and a lower bound on it for all x within the bounds.
     saturated : (N, k) bool
         Where x is at a bound or all but there, and a step beyond would lower the error.
     gap : float
@@ -63,8 +79,8 @@ class Bounded(Solution):
     gap: float
 
     def __str__(self) -> str:
-        why = "" if self.converged else f": {self.status.value}"
-        return f"{self._outcome()}, at most {self.gap:.2g} above the least{why}"
+        text = f"{self._outcome()}, at most {self.gap:.2g} above the least"
+        return text if self.converged else f"{text}: {self.status.value}"
 
 
 def minimise(
@@ -80,190 +96,363 @@ def minimise(
     maxiter: int = 1000,
     callback: Callable[[int, float], object] | None = None,
 ) -> Bounded:
-    """The x within the bounds for which A x is nearest to b; STAGNATED where rounding hides any further gain.
+    """Find the x within the bounds for which A x is nearest to b.
 
-    A is (M, N) with columns of like size, for instance S; b and the weights w >= 0, ones when not
-    given, are (M, k), the finite bounds (N,), and the start x0 (N, k) is moved within. Done when
-    the error, or what it is above the least possible one, is at most ``max(rtol ||w b||, atol)`` in
-    every column; where b = 0, rtol is of the error at the start. ``callback(iteration, relative
-    gap)`` is called after each step.
+    Done when the error, or its distance from the least possible one, is at most
+    ``max(rtol ||w b||, atol)`` in every column; if b = 0, rtol is relative to the error at the
+    start. STAGNATED if rounding hides any further gain.
+
+    Parameters
+    ----------
+    A : (M, N) Operator
+        With columns of similar size, for instance S.
+    b, weights : (M, k)
+        The weights w are at least 0; ones when not given.
+    lower, upper : (N,)
+        Finite bounds.
+    x0 : (N, k)
+        The start, which is moved within the bounds.
+    callback : callable(iteration, relative gap), optional
+        Called after each step.
     """
     start = time.perf_counter()
     largest = float(np.max(np.abs(b)))
-    unit = _power(largest or float(np.max(np.abs([lower, upper]))))
-    unit_w = 1.0 if weights is None else _power(float(np.max(weights)))
-    box = inwards(
-        *(np.clip(np.asarray(bound, np.float64) / unit, -_FAR, _FAR) for bound in (lower, upper))
+    if largest == 0.0:
+        largest = float(np.max(np.abs([lower, upper])))
+    unit = _power_of_two(largest)
+    weight_unit = 1.0
+    if weights is not None:
+        weight_unit = _power_of_two(float(np.max(weights)))
+        weights = weights / weight_unit
+
+    scaled_lower = np.clip(np.asarray(lower, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
+    scaled_upper = np.clip(np.asarray(upper, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
+    box = round_inwards(scaled_lower, scaled_upper)
+    first = _clip((x0 / unit).astype(np.float32), box)
+    descent = _Descent(A, b / unit, weights, box, first)
+    search = _Search(descent, rtol, atol / (unit * weight_unit), maxiter, callback)
+    status = search.run()
+
+    x = np.where(search.is_worse, first, search.x) * unit
+    x = _clip(x.astype(np.float32), round_inwards(lower, upper))
+    error_unit = unit * weight_unit
+    return Bounded(
+        x=x,
+        status=status,
+        iterations=len(search.residuals) - 1,
+        products=descent.products,
+        residuals=tuple(search.residuals),
+        seconds=time.perf_counter() - start,
+        method="bounded",
+        errors=search.errors * error_unit,
+        least=np.maximum(search.least - search.hidden, 0.0) * error_unit,
+        saturated=search.saturated,
+        gap=float(np.max(search.excess / search.scale)),
     )
-    first = np.clip((x0 / unit).astype(np.float32), *(bound[:, None] for bound in box))
-    descent = _Descent(A, b / unit, None if weights is None else weights / unit_w, box, first)
-    initial, _ = descent.read()
-    scale = np.where(descent.scale > 0.0, descent.scale, np.where(initial > 0.0, initial, 1.0))
-    tolerance, least = np.maximum(rtol * scale, atol / (unit * unit_w)), np.zeros_like(scale)
-    residuals: list[float] = []
-    lowest, lowest_at, hidden = np.inf, 0, descent.rounding()
-    while True:
-        errors, gap = descent.read()
-        least = np.fmax(least, np.minimum(errors - ratio(gap, errors, errors > 0.0), errors))
-        excess = np.maximum(errors - least + 2.0 * hidden, _ROUNDING * scale)  # over the least
-        excess = np.where(np.isfinite(errors), excess, np.inf)
-        unsolved, steps, above = excess > tolerance, len(residuals), float(np.max(excess / scale))
-        status = Status.STAGNATED if steps - lowest_at > _PATIENCE else None
-        status = Status.MAXITER if steps >= maxiter else status
-        status = status if unsolved.any() else Status.CONVERGED
-        if status is not None and not descent.true:  # to be said only of a true residual
-            descent.refresh()
-            hidden = descent.rounding()
-            continue
-        if above < lowest:
-            lowest, lowest_at = above, steps
-        if callback is not None:
-            callback(steps, above)
-        residuals.append(float(np.max(errors / scale)))
-        if status is not None:
-            break
-        descent.step(unsolved)
-    x, worse = descent.x.get(), ~(errors <= initial)  # rounding alone can do that
-    errors, saturated = (
-        np.where(worse, initial, errors),
-        np.where(worse, False, descent.saturated(x)),
-    )
-    excess = np.where(worse, np.maximum(initial - least + 2.0 * hidden, _ROUNDING * scale), excess)
-    x = (np.where(worse, first, x) * unit).astype(np.float32)
-    x = np.clip(x, *(bound[:, None] for bound in inwards(lower, upper)))
-    history = len(residuals) - 1, descent.products, tuple(residuals), time.perf_counter() - start
-    least = np.maximum(least - hidden, 0.0) * unit * unit_w
-    certificate = {
-        "errors": errors * unit * unit_w,
-        "least": least,
-        "gap": float(np.max(excess / scale)),
-    }
-    return Bounded(x, status, *history, "bounded", saturated=saturated, **certificate)
 
 
-def least_squares(
-    A: Operator,
-    b: np.ndarray,
-    free: np.ndarray,
-    weights: np.ndarray,
-    *,
-    rtol: float,
-    maxiter: int = 100,
-) -> np.ndarray:
-    """The x (N, ...), 0 but where `free`, for which w A x is nearest to w b (M, ...), by conjugate gradients.
+def round_inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
+    """Round bounds to float32 within the interval; to the nearest if it holds no float32.
 
-    Each column has free entries and weights of its own, which broadcast to x and b. Done when the
-    gradient of every column is at most rtol times the first one, or after `maxiter` steps of two
-    products.
-    """
-
-    def product(matrix: Any, a: np.ndarray) -> np.ndarray:
-        return (matrix @ a.reshape(len(a), -1).astype(np.float32)).reshape(-1, *b.shape[1:])
-
-    r, size, first = b, np.ones(b.shape[1:]), np.ones(b.shape[1:])
-    x = p = np.zeros((A.shape[1], *b.shape[1:]))
-    for step in range(maxiter):
-        s, before = free * product(A.T, weights**2 * r), size
-        size = np.sum(s**2, axis=0)
-        first = first if step else size
-        if (size <= rtol**2 * first).all():
-            break
-        p = s + ratio(size, before, before > 0.0) * p
-        Ap = product(A, p)
-        curvature = np.sum((weights * Ap) ** 2, axis=0)
-        alpha = ratio(size, curvature, curvature > 0.0)
-        x, r = x + alpha * p, r - alpha * Ap
-    return x
-
-
-def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
-    """Bounds in float32, rounded into the interval; where it holds no float32, the nearest one.
-
-    >>> low, high = inwards(0.1, 0.7)
+    >>> low, high = round_inwards(0.1, 0.7)
     >>> bool(np.float32(0.7) > 0.7 >= high), bool(low >= 0.1)
     (False, True)
     """
-    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-    nearest = low, high = lower.astype(np.float32), upper.astype(np.float32)
-    low = np.where(low < lower, np.nextafter(low, np.float32(np.inf)), low)
-    high = np.where(high > upper, np.nextafter(high, np.float32(-np.inf)), high)
-    return np.where(low > high, nearest[0], low), np.where(low > high, nearest[0], high)
+    lower = np.asarray(lower, np.float64)
+    upper = np.asarray(upper, np.float64)
+    nearest_low = lower.astype(np.float32)
+    nearest_high = upper.astype(np.float32)
+    next_above = np.nextafter(nearest_low, np.float32(np.inf))
+    next_below = np.nextafter(nearest_high, np.float32(-np.inf))
+    low = np.where(nearest_low < lower, next_above, nearest_low)
+    high = np.where(nearest_high > upper, next_below, nearest_high)
+    is_empty = low > high
+    return np.where(is_empty, nearest_low, low), np.where(is_empty, nearest_high, high)
+
+
+class _Search:
+    """The search for the least error, and its certificate.
+
+    Attributes, of the last iterate and by columns: `errors`, the bound `least` on the least error,
+    `hidden`, what rounding hides of the errors, and `excess`, the error above the least one.
+    """
+
+    def __init__(
+        self,
+        descent: _Descent,
+        rtol: float,
+        atol: float,
+        maxiter: int,
+        callback: Callable[[int, float], object] | None,
+    ) -> None:
+        self.descent = descent
+        self.maxiter = maxiter
+        self.callback = callback
+        self.initial, _ = descent.read()
+        start_scale = np.where(self.initial > 0.0, self.initial, 1.0)
+        self.scale = np.where(descent.norms > 0.0, descent.norms, start_scale)
+        self.tolerance = np.maximum(rtol * self.scale, atol)
+        self.errors = self.initial
+        self.least = np.zeros_like(self.scale)
+        self.excess = self.initial
+        self.hidden = descent.rounding()
+        self.residuals: list[float] = []
+        self._lowest = np.inf
+        self._lowest_at = 0
+
+    def run(self) -> Status:
+        """Take steps until the search ends; its end is said of a residual computed from x alone."""
+        descent = self.descent
+        while True:
+            self._measure()
+            unsolved = self.excess > self.tolerance
+            status = self._judge(unsolved)
+            if status is not None and not descent.has_true_residual:
+                descent.refresh()
+                self.hidden = descent.rounding()
+                continue
+            self._record()
+            if status is not None:
+                break
+            descent.step(unsolved)
+        self._fall_back()
+        return status
+
+    def _measure(self) -> None:
+        """Read the errors, and raise the bound on the least one."""
+        self.errors, gap = self.descent.read()
+        distance = safe_ratio(gap, self.errors, self.errors > 0.0)
+        bound = np.minimum(self.errors - distance, self.errors)
+        self.least = np.fmax(self.least, bound)
+        excess = self._excess_of(self.errors)
+        self.excess = np.where(np.isfinite(self.errors), excess, np.inf)
+
+    def _excess_of(self, errors: np.ndarray) -> np.ndarray:
+        """Return what errors are above the least one, with all that rounding may hide."""
+        excess = errors - self.least + 2.0 * self.hidden
+        return np.maximum(excess, ROUNDING_SHARE * self.scale)
+
+    def _judge(self, unsolved: np.ndarray) -> Status | None:
+        """Return how the search ends, or None while it goes on."""
+        steps = len(self.residuals)
+        if not unsolved.any():
+            return Status.CONVERGED
+        if steps >= self.maxiter:
+            return Status.MAXITER
+        if steps - self._lowest_at > PATIENCE:
+            return Status.STAGNATED
+        return None
+
+    def _record(self) -> None:
+        """Keep the history of the errors, and call the callback."""
+        steps = len(self.residuals)
+        relative_excess = float(np.max(self.excess / self.scale))
+        if relative_excess < self._lowest:
+            self._lowest = relative_excess
+            self._lowest_at = steps
+        if self.callback is not None:
+            self.callback(steps, relative_excess)
+        self.residuals.append(float(np.max(self.errors / self.scale)))
+
+    def _fall_back(self) -> None:
+        """Return to the start in columns that are worse; rounding alone can do that."""
+        self.x = self.descent.x.get()
+        self.is_worse = ~(self.errors <= self.initial)
+        saturated = self.descent.saturated(self.x)
+        self.saturated = np.where(self.is_worse, False, saturated)
+        self.errors = np.where(self.is_worse, self.initial, self.errors)
+        self.excess = np.where(self.is_worse, self._excess_of(self.initial), self.excess)
 
 
 class _Descent:
-    """The iterate and, on the device, r = b - A x, u = w^2 r, g = -A^T u, d, and h = A^T w^2 A d."""
+    """The iterate and, on the device, r = b - A x, u = w^2 r, g = -A^T u, d, and h = A^T w^2 A d.
+
+    `norms` (k,) are those of w b; `has_true_residual` tells whether r was computed from x itself.
+    """
 
     def __init__(
         self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray
     ) -> None:
-        device, self.A, self.products, self._box = A.device, A, 0, box
-        self.scale = np.linalg.norm(b if w is None else w * b, axis=0)
-        self._largest_weight = 1.0 if w is None else float(np.max(w))
-        self.b, self.x, *bounds = (device.upload(values) for values in (b, x, *box))
-        columns = Columns(self.x, *_KERNELS)
-        k, slices, weighted = columns.k, columns.slices, int(w is not None)
-        self._slices, self._resting = slices, np.zeros(k, bool)
-        self._rest = device.upload(self._resting, np.int32)
-        numbers = np.zeros((4 + 3 * slices, k))
-        numbers[0] = 1.0  # the first alpha
-        self._numbers = numbers = device.upload(numbers)
-        sums, curvatures = columns.sums(3), columns.sums(1)
-        self.r, Ad = self.b.like(), self.b.like()
-        self._u = self.r.like() if weighted else self.r
-        W = self.r if w is None else device.upload(np.square(w))
-        self.g, self._q, d, h = (vectors.fill(self.x.like(), 0.0) for _ in range(4))
-        around, rows, (direction, dots, move, look) = (*bounds, self.x), b.shape[0], _KERNELS
-        self._look_anew = columns.bind(look, 1, *around, self._q, self.g, h, numbers)
-        to_d = (slices, self._rest, numbers, *around, self.g, d, sums)
-        to_x = (weighted, numbers, sums, curvatures, *bounds, d, self.x, W, Ad, self.r, self._u)
-        self._weigh_r = columns.bind(move, rows, 0, *to_x, extra=4)
-        self._queued = (
-            columns.bind(direction, *to_d, extra=2),
-            A.bind(d, Ad),
-            columns.bind(dots, 0, 0, weighted, W, Ad, Ad, Ad, curvatures, rows=rows),
-            columns.bind(move, rows, slices, *to_x, extra=4),
-            A.bind(self._u, self._q, transpose=True),
-            columns.bind(look, 0, *around, self._q, self.g, h, numbers),
-        )
+        device = A.device
+        self.A = A
+        self.products = 0
+        self.has_true_residual = False
+        self._box = box
+        self.b = device.upload(b)
+        self.x = device.upload(x)
+        self.r = self.b.like()
+        if w is None:
+            self.norms = np.linalg.norm(b, axis=0)
+            self._largest_weight = 1.0
+            self._u = self.r
+            # The kernels do not read them.
+            self._weights = self.r
+        else:
+            self.norms = np.linalg.norm(w * b, axis=0)
+            self._largest_weight = float(np.max(w))
+            self._u = self.r.like()
+            self._weights = device.upload(np.square(w))
+        self.g = vectors.fill(self.x.like(), 0.0)
+        # A^T u
+        self._q = vectors.fill(self.x.like(), 0.0)
+        self._is_weighted = w is not None
+        self._allocate()
+        self._bind()
         self.refresh()
 
+    def _allocate(self) -> None:
+        """Allocate the vectors and numbers that stay on the device."""
+        device = self.A.device
+        self._columns = ColumnReductions(self.x, _DIRECTION, _DOTS, _MOVE, _LOOK)
+        k = self._columns.k
+        self._slices = self._columns.slices
+        self._is_resting = np.zeros(k, bool)
+        self._resting = device.upload(self._is_resting, np.int32)
+        numbers = np.zeros((NUMBER_ROWS + 3 * self._slices, k))
+        # The first alpha.
+        numbers[0] = 1.0
+        self._numbers = device.upload(numbers)
+        self._sums = self._columns.sums(3)
+        self._curvatures = self._columns.sums(1)
+        self._limits: dict[str, Any] = {
+            "lower": device.upload(self._box[0]),
+            "upper": device.upload(self._box[1]),
+        }
+        self._d = vectors.fill(self.x.like(), 0.0)
+        self._h = vectors.fill(self.x.like(), 0.0)
+        self._Ad = self.b.like()
+
+    def _bind(self) -> None:
+        """Bind the launches of a step, and those that start anew."""
+        self._look_anew = self._bind_look(restart=1)
+        # Without slices nothing moves, and r is weighted alone.
+        self._weigh_r = self._bind_move(slices=0)
+        self._launches = (
+            self._bind_direction(),
+            self.A.bind(self._d, self._Ad),
+            self._bind_curvature(),
+            self._bind_move(slices=self._slices),
+            self.A.bind(self._u, self._q, transpose=True),
+            self._bind_look(restart=0),
+        )
+
+    def _bind_direction(self) -> Launch:
+        """Bind the kernel of the next d."""
+        return self._columns.bind(
+            _DIRECTION,
+            extra=2,
+            slices=self._slices,
+            resting=self._resting,
+            numbers=self._numbers,
+            x=self.x,
+            g=self.g,
+            d=self._d,
+            sums=self._sums,
+            **self._limits,
+        )
+
+    def _bind_curvature(self) -> Launch:
+        """Bind the sums of w^2 (A d)^2."""
+        return self._columns.bind(
+            _DOTS,
+            rows=self.b.shape[0],
+            first=0,
+            pairs=0,
+            weighted=int(self._is_weighted),
+            weights=self._weights,
+            a=self._Ad,
+            b=self._Ad,
+            c=self._Ad,
+            partials=self._curvatures,
+        )
+
+    def _bind_move(self, slices: int) -> Launch:
+        """Bind the kernel that moves x along d, and r and u with it."""
+        return self._columns.bind(
+            _MOVE,
+            extra=4,
+            height=self.b.shape[0],
+            slices=slices,
+            weighted=int(self._is_weighted),
+            numbers=self._numbers,
+            sums=self._sums,
+            curvatures=self._curvatures,
+            d=self._d,
+            x=self.x,
+            w=self._weights,
+            Ad=self._Ad,
+            r=self.r,
+            u=self._u,
+            **self._limits,
+        )
+
+    def _bind_look(self, restart: int) -> Launch:
+        """Bind the kernel of g and h, and of the sums that depend on them."""
+        return self._columns.bind(
+            _LOOK,
+            restart=restart,
+            x=self.x,
+            q=self._q,
+            g=self.g,
+            h=self._h,
+            numbers=self._numbers,
+            **self._limits,
+        )
+
     def refresh(self) -> None:
-        """r and g from x itself, instead of by recursion."""
+        """Compute r and g from x itself, instead of by recursion."""
         self.A.apply(self.x, self.r, scale=-1.0, add=self.b)
         self._weigh_r()
         self.A.apply_transpose(self._u, self._q)
         self._look_anew()
         self.products += 2
-        self.true = True
+        self.has_true_residual = True
 
     def step(self, unsolved: np.ndarray) -> None:
         """Lower the error in the columns `unsolved`: six launches."""
-        if np.any(self._resting == unsolved):
-            self._resting = ~unsolved
-            self._rest.set(self._resting)
-        for launch in self._queued:
+        if np.any(self._is_resting == unsolved):
+            self._is_resting = ~unsolved
+            self._resting.set(self._is_resting)
+        for launch in self._launches:
             launch()
         self.products += 2
-        self.true = False
+        self.has_true_residual = False
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """The error and the Frank-Wolfe gap of every column; the wait."""
+        """Read the error and the Frank-Wolfe gap of every column, which waits."""
         numbers = self._numbers.get().astype(np.float64)
         self._alpha = numbers[0]
-        looks, squares = numbers[4 : 4 + 2 * self._slices], numbers[4 + 2 * self._slices :]
-        return np.sqrt(squares.sum(axis=0)), looks[::2].sum(axis=0)
+        end_of_looks = NUMBER_ROWS + 2 * self._slices
+        # Partial sums of the gap and of z.h take turns.
+        gaps = numbers[NUMBER_ROWS:end_of_looks:2]
+        squares = numbers[end_of_looks:]
+        return np.sqrt(squares.sum(axis=0)), gaps.sum(axis=0)
 
     def rounding(self) -> np.ndarray:
-        """What rounding of w A x hides of the errors, where columns of A are of size 1 at most."""
-        return _ROUNDING * self._largest_weight * np.asarray(vectors.norm(self.x))
+        """Return what rounding hides of the errors, if columns of A have size 1 at most."""
+        size = np.asarray(vectors.norm(self.x))
+        return ROUNDING_SHARE * self._largest_weight * size
 
     def saturated(self, x: np.ndarray) -> np.ndarray:
-        """Entries that a step along -g takes beyond a bound; some come close to it without touching."""
-        lower, upper = (bound[:, None] for bound in self._box)
-        beyond = x - self._alpha * self.g.get()
-        return (lower < upper) & ((beyond < lower) | (beyond > upper))
+        """Return the entries that a step along -g takes beyond a bound, touched or not."""
+        lower, upper = _as_columns(self._box)
+        stepped = x - self._alpha * self.g.get()
+        return (lower < upper) & ((stepped < lower) | (stepped > upper))
 
 
-def _power(largest: float) -> float:
-    """A power of two near `largest`: in such units squares stay inside float32."""
-    return float(np.exp2(np.floor(np.log2(largest)))) if largest > 0.0 else 1.0
+def _as_columns(box: Box) -> Box:
+    """Return bounds (N, 1), which broadcast to x."""
+    lower, upper = box
+    return lower[:, None], upper[:, None]
+
+
+def _clip(x: np.ndarray, box: Box) -> np.ndarray:
+    lower, upper = _as_columns(box)
+    return np.clip(x, lower, upper)
+
+
+def _power_of_two(largest: float) -> float:
+    """Return a power of two near `largest`: in such units squares stay within float32."""
+    if not largest > 0.0:
+        return 1.0
+    return float(np.exp2(np.floor(np.log2(largest))))

@@ -1,181 +1,77 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Monte Carlo (section 7 of the paper): every pixel of S^-1 b on its own, by random walks over the rows of R.
+"""Monte Carlo (section 7 of the paper): every pixel of S^-1 b by random walks over the rows of R.
 
     l_d(i) = l_out(i) + sum over k >= 1 and paths of (-1)^k R_i i1 R_i1 i2 ... l_out(ik)    (eq. 23)
 
-A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its length by eq. 24. The forward dual
-(eq. 22) is the same on I - A. Right-hand sides share their walks, and so do three colours where
-that leaves a finite variance. An infinite one (`ltcl.theory.walks`) is refused. Of n samples of a
-pixel with spread s
+A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its length by eq. 24. The
+forward dual (eq. 22) is the same on I - A. An infinite variance (`ltcl.theory.walks`) is refused.
+The standard error of n samples of a pixel with spread s is
 
     standard_error^2 = s^2 / n + 3 (W_i max |b|)^2 / n^2
 
 A light that no sample has met has a chance of at most about 3 / n (rule of three: Hanley and
-Lippman-Hand, 1983), and the second term of the variance; W_i is the root mean square weight of a
-walk after its first step. Rows with sums above 3/4 and above the others, that walks seldom meet,
-are not covered.
+Lippman-Hand, 1983), and adds the second term; W_i is the root mean square weight of a walk after
+its first step.
 
-The hybrid samples the products of Jacobi (eq. 20), with fresh columns j in each iteration, drawn by
-eq. 25:
-
-    l^(k+1)_i = l_out(i) - |R_i| mean of sign(R_ij) l^(k)_j over a few columns j
-
-The noise of the last product remains, unless final gather makes that exactly; no standard error is
-known. It converges in the mean where rho(R) < 1, with bounded noise from enough samples on; fewer
-are refused.
+Known limit: rows with sums above 3/4 and above the others, that walks seldom meet, are not covered.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
-import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ltcl import checks, theory
-from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl import checks
+from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import walks
 from ltcl.operators.walks import Lengths, Tables, Walker
 from ltcl.solvers.result import Solution, Status
-from ltcl.solvers.stopping import relative
-from ltcl.theory.walks import LONGEST, chance_to_go_on, enough_samples, has_variance, weights
+from ltcl.solvers.sampling import (
+    ADVICE,
+    MAX_SAMPLES,
+    Channels,
+    SampledChannel,
+    Sampler,
+    Watch,
+)
+from ltcl.theory.walks import LONGEST, Weights, chance_to_go_on, has_variance, weights
 
-Callback = Callable[[int, float], object]
-Watch = Callable[[], object]  # called after each step
-Estimate = tuple[
-    np.ndarray, np.ndarray, np.ndarray
-]  # means, standard errors, samples of each pixel
+# Samples of a stage: of the first one, and at most. Beyond, alias tables and float32 are biased.
+FIRST_STAGE_SAMPLES = 512
+MAX_STAGE_SAMPLES = 1 << 20
 
-_MOST = 1 << 20  # samples of a stage
-_FIRST = 512  # of the first
-_SPARE = 1.2  # times the samples that a stage seems to need, so that few pixels need one more
-_ADVICE = "try more samples=, or gather=True"
+# A stage has so many times the samples that seem to be needed, so that few pixels need one more.
+SPARE_SAMPLES = 1.2
 
-
-class Channel:
-    """A problem of `solve` to be sampled, S = I + sign R, from a start x with residual r.
-
-    Errors are asked for in the caller's units; those of b and x are `unit` of them.
-    """
-
-    def __init__(self, method: str, problem: Any) -> None:
-        self.method, self.S, self.b, self.unit = method, problem.S, problem.b, problem.unit
-        self.rtol, self.maxiter = min(problem.required, 1.0), problem.rule.maxiter
-        self.R, self.sign = walks.rows_of_R(self.S, method)
-        self.products, self._right = 0, self.S.device.upload(self.b)
-        self.r, self.x = self._right.get(), np.zeros(self.b.shape)
-        if problem.x0 is not None:
-            self.x = problem.x0.astype(np.float32).astype(np.float64)
-            self.r = self.residual(self.x)
-
-    def residual(self, x: np.ndarray) -> np.ndarray:
-        """b - S x, by one product."""
-        self.products += 1
-        return self.S.apply(self.S.device.upload(x), scale=-1.0, add=self._right).get()
-
-    def picture(
-        self,
-        x: np.ndarray,
-        error: np.ndarray | None,
-        count: int,
-        reason: str,
-        advice: str,
-        met: bool = True,
-    ) -> Solution:
-        """Of a whole picture x; converged where its true residual is within rtol and errors were `met`."""
-        if not np.all(np.abs(x) <= np.finfo(np.float32).max):
-            raise InputError(
-                "what was sampled has grown beyond float32; rescale, or use method='chebyshev'"
-            )
-        norms = np.linalg.norm(self.b.astype(np.float64), axis=0)
-        residual = relative(np.linalg.norm(self.residual(x).astype(np.float64), axis=0), norms)
-        status = Status.CONVERGED if met and residual <= self.rtol else Status.SAMPLED
-        reason = reason if status is Status.CONVERGED else f"{reason}; {advice}"
-        facts = x, status, count, self.products, (1.0, residual), 0.0, self.method, reason
-        return Solution(
-            *facts, lowest=residual, standard_error=error
-        )  # of x, be it worse than the start
+# Times 1 / n, the largest chance of a light that n samples have not met (rule of three).
+UNMET_CHANCE = 3.0
 
 
-Channels = Sequence[Channel]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PixelEstimates:
+    """Means and their standard errors, (P, columns), and the samples of each pixel, (P,)."""
 
-
-@dataclass(frozen=True)
-class Sampler:
-    """What the methods that draw random numbers share, and options of both; see `ltcl.solve`.
-
-    `_refusal` says why tables give no estimate, empty where they do; `_estimate` is of one channel,
-    or three.
-    """
-
-    name: ClassVar[str]
-    usual: ClassVar[int]
-    _refusal: ClassVar[Callable[..., str]]
-    _estimate: ClassVar[Callable[..., list[Solution]]]
-    adjoint = False
-    samples: int | None = None
-    seed: int = 0
-    gather: bool = False
-
-    def __post_init__(self) -> None:
-        if self.samples is not None:
-            checks.count("samples", self.samples, most=(1 << 32) - 1)
-        checks.count("seed", self.seed, least=0, most=(1 << 64) - 1)
-        checks.flag("gather", self.gather)
-
-    def sample(self, channels: Channels, callback: Callback | None = None) -> list[Solution]:
-        """One estimate a channel, in units of its b; the callback hears of the start, steps, and the end."""
-        steps, hear = itertools.count(), callback or (lambda step, residual: None)
-        hear(next(steps), 1.0)
-        estimates = self._together(channels, lambda: hear(next(steps), np.nan))
-        if not np.isnan(estimates[0].residuals[-1]):
-            hear(next(steps), max(estimate.residuals[-1] for estimate in estimates))
-        return estimates
-
-    def _together(self, channels: Channels, watch: Watch) -> list[Solution]:
-        if len(channels) == 1:
-            return self._alone(channels[0], watch)
-        why = "those from b are of one channel"
-        try:
-            if not self.adjoint:
-                tables = walks.linked([c.R for c in channels], [c.sign for c in channels])
-                why = self._refusal(channels, tables)
-                if not why:
-                    return self._estimate(channels, tables, 1.0, watch)
-        except MemoryLimitError as error:
-            why = str(error)
-        each = [of_channel(c, self._alone, channel, watch)[0] for c, channel in enumerate(channels)]
-        return [
-            dataclasses.replace(s, reason=f"{s.reason}; channels share no walks: {why}")
-            for s in each
-        ]
-
-    def _alone(self, channel: Channel, watch: Watch) -> list[Solution]:
-        tables = (walks.tables_of_columns if self.adjoint else walks.tables)(channel.R)
-        if refusal := self._refusal([channel], tables):
-            raise InputError(f"{refusal}; use method='auto'")
-        return self._estimate([channel], tables, channel.sign, watch)
+    mean: np.ndarray
+    standard_error: np.ndarray
+    samples: np.ndarray
 
 
 @dataclass(frozen=True)
 class MonteCarlo(Sampler):
     """Estimates with their standard errors.
 
-    An `error` takes stages of fresh samples, as many as the one before asks for; only the last one
-    of a pixel counts: samples chosen by their own spread are biased. So are alias tables and
-    float32, beyond 2^20.
+    An `error` takes stages of fresh samples, each of as many as the one before asks for. Only the
+    last stage of a pixel counts: samples chosen by their own spread are biased.
     """
 
     name: ClassVar[str] = "monte_carlo"
-    usual: ClassVar[int] = 256
+    default_samples: ClassVar[int] = 256
     pixels: Any = None
     error: float | None = None
     albedo: float | None = None
-    adjoint: bool = False
+    adjoint: bool = False  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -191,192 +87,250 @@ class MonteCarlo(Sampler):
                 "adjoint=True estimates whole pictures; leave pixels= and error= out"
             )
 
-    def check(self, n: int) -> None:
-        """Refuse what does not fit S, (n, n)."""
+    @property
+    def max_samples(self) -> int:
+        """The most samples of a pixel in one stage."""
+        if self.samples is not None:
+            return self.samples
+        return self.default_samples if self.error is None else MAX_STAGE_SAMPLES
+
+    def check_size(self, n: int) -> None:
+        """Refuse options that do not fit S, (n, n)."""
         if self.pixels is not None:
             pixels = checks.real("pixels", self.pixels)
             if pixels.ndim != 1 or pixels.size == 0 or pixels.dtype.kind not in "iu":
                 raise InputError(
                     f"pixels is {pixels.shape} of {pixels.dtype}; it must be (P,) whole numbers"
                 )
-            worst = int(pixels.min() if pixels.min() < 0 else pixels.max())
-            if not 0 <= worst < n:
-                raise InputError(f"pixels holds {worst}; they must be in 0..{n - 1}")
+            for extreme in (int(pixels.min()), int(pixels.max())):
+                if not 0 <= extreme < n:
+                    raise InputError(f"pixels holds {extreme}; they must be in 0..{n - 1}")
         if self.adjoint:
-            checks.count("samples", self.samples or self.usual, most=((1 << 32) - 1) // n)
+            checks.count("samples", self.sample_count, most=MAX_SAMPLES // n)
 
     def _refusal(self, channels: Channels, tables: Tables) -> str:
         step = weights(channels[0].R, tables)
-        radius, q = step.radius, chance_to_go_on(step, self.albedo)
-        if has_variance(radius, q):
+        q = chance_to_go_on(step, self.albedo)
+        if has_variance(step.radius, q):
             return ""
-        lengths = "" if self.albedo is None else f" with albedo={self.albedo:g}"
+        walks_over_R = "walks over R"
+        if self.albedo is not None:
+            walks_over_R += f" with albedo={self.albedo:g}"
         return (
-            f"walks over R{lengths} have no finite variance: the second moments of their weights grow by "
-            f"{radius:.3g} a step, which must be below {min(q, 1.0):.3g}"
+            f"{walks_over_R} have no finite variance: the second moments of their weights "
+            f"grow by {step.radius:.3g} a step, which must be below {min(q, 1.0):.3g}"
         )
 
     def _estimate(
         self, channels: Channels, tables: Tables, sign: float, watch: Watch
     ) -> list[Solution]:
-        n, count, columns = len(channels[0].r), len(channels), channels[0].r.shape[1:]
+        n = len(channels[0].r)
+        columns = channels[0].r.shape[1:]
         step = weights(channels[0].R, tables)
         q = chance_to_go_on(step, self.albedo)
         lengths = Lengths.geometric(q, -sign, from_b=self.adjoint)
         walker = Walker(tables, lengths, self.seed, watch)
-        light = np.stack([c.r for c in channels], axis=-1).reshape(n, -1)  # (N, columns * channels)
-        pixels = np.arange(n) if self.pixels is None else np.asarray(self.pixels, np.int64)
-        score = lengths.scores()[0][0]  # what weights are multiplied by after the first step
-        square = step.mean_square.T * score**2  # (N, channels)
+        # (N, columns * channels)
+        light = np.stack([channel.r for channel in channels], axis=-1).reshape(n, -1)
+        square = _mean_square_after_first_step(step, lengths)
+        pixels = np.arange(n)
         if self.adjoint:
-            samples = n * (self.samples or self.usual)  # one column of the light after the other
-            x, error, spent = np.zeros(light.shape), np.zeros(light.shape), np.full(n, samples // n)
-            for c, column in enumerate(light.T):
-                walker.tables.append(walker.tables.device.upload(column))
-                sums, share = walker.columns(samples, stream=c), np.abs(column, dtype=np.float64)
-                unmet = np.sqrt(
-                    3.0 * share.sum() * (share @ square[:, 0])
-                )  # a walk weighs all of the light
-                x[:, c], error[:, c] = sums.mean, np.hypot(sums.standard_error, unmet / samples)
+            estimates = self._estimate_from_b(walker, light, square)
         else:
-            scores = np.sqrt(square[pixels][:, np.arange(light.shape[1]) % count])
-            unmet = 3.0**0.5 * scores * np.abs(light).max(axis=0)
-            units = np.stack([np.broadcast_to(c.unit, columns) for c in channels], axis=-1)
-            x, error, spent = self._in_stages(walker, light, pixels, unmet, units.ravel())
-        x, error = (np.moveaxis(a.reshape(len(pixels), *columns, count), -1, 0) for a in (x, error))
-        reason = f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
-        reason += f" ({spent.mean():.3g} samples a pixel, {spent.sum():.3g} in all)"
-        return [self._result(*of, pixels, reason) for of in zip(channels, x, error, strict=True)]
+            if self.pixels is not None:
+                pixels = np.asarray(self.pixels, np.int64)
+            estimates = self._estimate_in_stages(channels, walker, light, pixels, square)
 
-    def _in_stages(
+        shape = (len(pixels), *columns, len(channels))
+        means = np.moveaxis(estimates.mean.reshape(shape), -1, 0)
+        errors = np.moveaxis(estimates.standard_error.reshape(shape), -1, 0)
+        samples = estimates.samples
+        reason = (
+            f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g} "
+            f"({samples.mean():.3g} samples a pixel, {samples.sum():.3g} in all)"
+        )
+        solutions = []
+        for channel, mean, error in zip(channels, means, errors, strict=True):
+            solutions.append(self._solution(channel, mean, error, pixels, reason))
+        return solutions
+
+    def _estimate_from_b(
+        self, walker: Walker, light: np.ndarray, square: np.ndarray
+    ) -> PixelEstimates:
+        """Estimate by walks from b, one column of the light after the other."""
+        n = len(light)
+        samples = n * self.sample_count
+        mean = np.zeros(light.shape)
+        error = np.zeros(light.shape)
+        for c, column in enumerate(light.T):
+            walker.tables.append(walker.tables.device.upload(column))
+            sums = walker.columns(samples, stream=c)
+            share = np.abs(column, dtype=np.float64)
+            # A walk weighs all of the light.
+            unmet = np.sqrt(UNMET_CHANCE * share.sum() * (share @ square[:, 0]))
+            mean[:, c] = sums.mean
+            error[:, c] = np.hypot(sums.standard_error, unmet / samples)
+        return PixelEstimates(mean=mean, standard_error=error, samples=np.full(n, samples // n))
+
+    def _estimate_in_stages(
+        self,
+        channels: Channels,
+        walker: Walker,
+        light: np.ndarray,
+        pixels: np.ndarray,
+        square: np.ndarray,
+    ) -> PixelEstimates:
+        """Estimate by walks from the pixels, in as many stages as the error asks for."""
+        columns = channels[0].r.shape[1:]
+        channel_of_column = np.arange(light.shape[1]) % len(channels)
+        scores = np.sqrt(square[pixels][:, channel_of_column])
+        unmet = UNMET_CHANCE**0.5 * scores * np.abs(light).max(axis=0)
+        units = np.stack([np.broadcast_to(c.unit, columns) for c in channels], axis=-1)
+        most = self.max_samples
+        if self.error is None:
+            # One stage, after which any error will do.
+            error = np.inf
+            first = most
+        else:
+            error = self.error
+            first = min(FIRST_STAGE_SAMPLES, most)
+        target = error / units.ravel()
+        stages = _Stages(walker, light, pixels, unmet, target, first, most)
+        return stages.run()
+
+    def _solution(
+        self,
+        channel: SampledChannel,
+        mean: np.ndarray,
+        error: np.ndarray,
+        pixels: np.ndarray,
+        reason: str,
+    ) -> Solution:
+        """Return the solution of a channel from the mean of its walks, in units of the problem."""
+        x = channel.x[pixels] + channel.r[pixels] + mean
+        if self.gather:
+            x = x + channel.residual(x)
+            error = _gathered_error(channel, error)
+        missed = 0
+        if self.error is not None:
+            is_met = (error * channel.unit <= self.error).reshape(len(x), -1).all(axis=1)
+            missed = int(np.sum(~is_met))
+            reason += f"; {self._error_report(missed, len(x))}"
+        if self.pixels is not None:
+            return Solution(
+                x=x,
+                status=Status.SAMPLED,
+                iterations=1,
+                products=channel.products,
+                residuals=(np.nan,),
+                method=self.name,
+                reason=reason,
+                lowest=np.inf,
+                standard_error=error,
+            )
+        return channel.solution(
+            x,
+            standard_error=error,
+            iterations=1,
+            reason=reason,
+            advice=ADVICE,
+            met_error=missed == 0,
+        )
+
+    def _error_report(self, missed: int, pixels: int) -> str:
+        """Say how many pixels have missed the error that was asked for."""
+        goal = f"error={self.error:g}"
+        if not missed:
+            return f"{goal} was reached"
+        return f"{missed} of {pixels} pixels missed {goal} within {self.max_samples} samples"
+
+
+class _Stages:
+    """Stages of fresh samples, until each pixel has its target error.
+
+    The error of n samples is sqrt(spread^2 + (unmet / n)^2), where spread falls as 1 / sqrt(n).
+    Each stage after the first has the samples that squared errors of a / n + b / n^2 ask for, in
+    powers of two.
+    """
+
+    def __init__(
         self,
         walker: Walker,
         light: np.ndarray,
         pixels: np.ndarray,
         unmet: np.ndarray,
-        units: np.ndarray,
-    ) -> Estimate:
-        """Means, standard errors and samples of all stages; of n samples `unmet` / n is part of the errors.
+        target: np.ndarray,
+        first: int,
+        most: int,
+    ) -> None:
+        self.walker = walker
+        self.light = walker.tables.device.upload(light)
+        self.pixels = pixels
+        self.unmet = unmet
+        self.target = target
+        self.most = most
+        self.mean = np.zeros(unmet.shape)
+        self.spread = np.zeros(unmet.shape)
+        # Samples of the last stage of each pixel, and of all.
+        self.samples = np.full(len(pixels), first)
+        self.spent = np.zeros_like(self.samples)
 
-        Each after the first has the samples that squared errors of a / n + b / n^2 ask for, in
-        powers of two.
-        """
-        r, target = walker.tables.device.upload(light), (self.error or np.inf) / units
-        most = self.samples or (self.usual if self.error is None else _MOST)
-        x, spread, active = np.zeros(unmet.shape), np.zeros(unmet.shape), np.arange(len(pixels))
-        last = np.full(
-            len(pixels), most if self.error is None else min(_FIRST, most)
-        )  # samples of a stage
-        spent = np.zeros_like(last)
-        for stage in itertools.count():
-            for count in np.unique(last[active]):
-                here = active[last[active] == count]
-                sums = walker.rows(r, pixels[here], int(count), stage)
-                x[here], spread[here] = sums.mean, sums.standard_error
-            spent[active] += last[active]
-            error = np.hypot(spread, unmet / last[:, None])
-            met = np.all(error <= (target if stage else 0.0), axis=1)
-            active = np.flatnonzero((last < most) & ~met)
+    def run(self) -> PixelEstimates:
+        """Take stages until no pixel needs another one."""
+        active = np.arange(len(self.pixels))
+        stage = 0
+        while True:
+            self._sample(active, stage)
+            error = np.hypot(self.spread, self.unmet / self.samples[:, None])
+            active = self._unmet_pixels(error, stage)
             if active.size == 0:
-                return x, error, spent
-            with np.errstate(over="ignore", divide="ignore"):
-                a, b = (
-                    last[active, None] * (spread[active] / target) ** 2,
-                    (unmet[active] / target) ** 2,
-                )
-                needed = _SPARE / 2 * np.max(a + np.sqrt(a**2 + 4.0 * b), axis=1)
-            needed = np.clip(needed, last[active] * (2 if stage else 1), most)
-            last[active] = np.minimum(2.0 ** np.ceil(np.log2(needed)), most)
-        raise AssertionError
+                return PixelEstimates(mean=self.mean, standard_error=error, samples=self.spent)
+            # The first stage tells the spread; each later one has to have more samples.
+            least = self.samples[active] if stage == 0 else 2 * self.samples[active]
+            self.samples[active] = self._next_samples(active, least)
+            stage += 1
 
-    def _result(
-        self, channel: Channel, rest: np.ndarray, error: np.ndarray, pixels: np.ndarray, reason: str
-    ) -> Solution:
-        x = channel.x[pixels] + channel.r[pixels] + rest
-        if (
-            self.gather
-        ):  # errors of pixels are independent: their variances pass through the squares of R
-            x, known = x + channel.residual(x), np.all(np.isfinite(error))
-            error = (
-                np.sqrt(np.asarray(walks.squares(channel.R) @ error**2))
-                if known
-                else error + np.inf
-            )
-        missed = 0
-        if self.error is not None:
-            missed = np.sum(
-                ~np.all((error * channel.unit <= self.error).reshape(len(x), -1), axis=1)
-            )
-            goal, most = f"error={self.error:g}", self.samples or _MOST
-            missing = f"{missed} of {len(x)} pixels missed {goal} within {most} samples"
-            reason += f"; {missing if missed else f'{goal} was reached'}"
-        if self.pixels is not None:
-            facts = Status.SAMPLED, 1, channel.products, (np.nan,), 0.0, self.name, reason, np.inf
-            return Solution(x, *facts, standard_error=error)
-        return channel.picture(x, error, 1, reason, _ADVICE, not missed)
+    def _unmet_pixels(self, error: np.ndarray, stage: int) -> np.ndarray:
+        """Return the pixels that need another stage.
+
+        After the first one these are all but those without error, since it chose no samples.
+        """
+        limit = self.target if stage else 0.0
+        is_met = np.all(error <= limit, axis=1)
+        return np.flatnonzero((self.samples < self.most) & ~is_met)
+
+    def _sample(self, active: np.ndarray, stage: int) -> None:
+        """Take the samples of one stage, together for all pixels that need as many."""
+        needed = self.samples[active]
+        for count in np.unique(needed):
+            same = active[needed == count]
+            sums = self.walker.rows(self.light, self.pixels[same], int(count), stage)
+            self.mean[same] = sums.mean
+            self.spread[same] = sums.standard_error
+        self.spent[active] += needed
+
+    def _next_samples(self, active: np.ndarray, least: np.ndarray) -> np.ndarray:
+        """Return the samples n with a / n + b / n^2 <= 1, and some to spare."""
+        with np.errstate(over="ignore", divide="ignore"):
+            a = self.samples[active, None] * (self.spread[active] / self.target) ** 2
+            b = (self.unmet[active] / self.target) ** 2
+            root = np.max(a + np.sqrt(a**2 + 4.0 * b), axis=1)
+            needed = SPARE_SAMPLES / 2 * root
+        needed = np.clip(needed, least, self.most)
+        return np.minimum(2.0 ** np.ceil(np.log2(needed)), self.most)
 
 
-@dataclass(frozen=True)
-class Hybrid(Sampler):
-    """Jacobi with sampled products, as many as Jacobi takes to rtol."""
-
-    name: ClassVar[str] = "hybrid"
-    usual: ClassVar[int] = 32
-
-    def _refusal(self, channels: Channels, tables: Tables) -> str:
-        rho = _largest_radius(channels)
-        if not rho < 1.0:
-            return f"the spectral radius of R is {rho:.3g}; for method='hybrid', Jacobi, it must be below 1"
-        if weights(channels[0].R, tables).radius < 1.0:  # then any number of samples will do
-            return ""
-        samples, enough = (
-            self.samples or self.usual,
-            enough_samples([c.R for c in channels], tables),
-        )
-        if samples >= enough:
-            return ""
-        return f"samples is {samples}; the noise of products by this R may grow below samples={enough:g}"
-
-    def _estimate(
-        self, channels: Channels, tables: Tables, sign: float, watch: Watch
-    ) -> list[Solution]:
-        rho, rtol = _largest_radius(channels), min(c.rtol for c in channels)
-        required = (
-            math.ceil(math.log(min(max(rtol, 1e-6), 1.0)) / math.log(rho)) if rho > 0.0 else 1
-        )
-        count, samples = min(max(1, required), channels[0].maxiter), self.samples or self.usual
-        walker = Walker(tables, Lengths(np.array([-sign])), self.seed, watch)
-        r = np.stack([c.r.astype(np.float64) for c in channels], axis=-1)
-        l = start = r.reshape(len(r), -1)  # (N, columns * channels)
-        for k in range(count):
-            l = (
-                start
-                + walker.rows(tables.device.upload(l), np.arange(len(l)), samples, stream=k).mean
-            )
-        reason, advice = (
-            f"Jacobi, {samples} columns of each row drawn in each of {count} iterations",
-            _ADVICE,
-        )
-        if count < required:
-            advice = f"stopped at {count} of the {required} iterations that rtol asks for: raise maxiter="
-        estimates = []
-        for channel, rest in zip(channels, np.moveaxis(l.reshape(r.shape), -1, 0), strict=True):
-            x = channel.x + rest
-            x = x + channel.residual(x) if self.gather else x
-            estimates.append(channel.picture(x, None, count, reason, advice))
-        return estimates
+def _mean_square_after_first_step(step: Weights, lengths: Lengths) -> np.ndarray:
+    """Return the mean squares of scores of walks after their first step, (N, channels)."""
+    scores, _ = lengths.scores()
+    return step.mean_square.T * scores[0] ** 2
 
 
-def _largest_radius(channels: Channels) -> float:
-    """Of the spectra of R, kept with each."""
-    return max(
-        walks.cached(c.R, "radius", lambda R=c.R: theory.spectral_radius(R).value) for c in channels
-    )
+def _gathered_error(channel: SampledChannel, error: np.ndarray) -> np.ndarray:
+    """Return the errors after one exact product.
 
-
-def of_channel(channel: int, f: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """f(...) of one channel of several; its refusals say of which."""
-    try:
-        return f(*arguments, **options)
-    except (InputError, MemoryLimitError) as error:
-        raise type(error)(f"in channel {channel}: {error}") from None
+    Errors of pixels are independent: their variances pass through the squares of R.
+    """
+    if not np.all(np.isfinite(error)):
+        return error + np.inf
+    return np.sqrt(np.asarray(walks.squares(channel.R) @ error**2))

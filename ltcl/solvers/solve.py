@@ -1,85 +1,50 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`solve`: validate, scale right-hand sides, choose a method, run it, unscale.
+"""`solve`: check the request, run the method that is named or chosen, measure the time.
 
-A method is a frozen dataclass whose fields are its options, with `name`, and `iterate(system, x, r,
-monitor)` or, where it draws random numbers, `sample(channels, callback)`.
-
-Of S = I + W^T C W in an orthonormal basis W, S x = b is (I + C) a = W b with x = W^T a: two
-transforms in all. Where W has but some coefficients of such a basis, x = b + W^T (a - W b). `cg`
-with weights, diagonal in pixels alone, runs there.
-
-Where an exact S judges, a compressed S~ = S + E makes the steps of an iterative refinement,
-
-    x^(k+1) = x^(k) + S~^-1 (b - S x^(k))
-
-With solves to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step (Higham, 2nd ed., chapter 12).
+The methods are those of the tuples `METHODS` of their files. Each solves a `LinearProblem`
+(`ltcl.solvers.method`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import Array, Device, vectors
-from ltcl.errors import (
-    ConvergenceError,
-    InputError,
-    InputTypeError,
-    MemoryLimitError,
-    ToleranceError,
-)
-from ltcl.operators import Compressed, Dense, IdentityPlus, Operator, as_operator
-from ltcl.solvers import auto, krylov, stationary
-from ltcl.solvers.monte_carlo import Channel, Hybrid, MonteCarlo, of_channel
-from ltcl.solvers.precision import Direct, is_small, product
-from ltcl.solvers.result import Solution, Status, joined
-from ltcl.solvers.stopping import CLAIM, Monitor, Rule, System, relative, scale_rhs, unscale
+from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.operators import Operator
+from ltcl.solvers import chebyshev, krylov, relaxation, stationary
+from ltcl.solvers.auto import solve_automatically
+from ltcl.solvers.direct import Direct
+from ltcl.solvers.hybrid import Hybrid
+from ltcl.solvers.method import Method
+from ltcl.solvers.monte_carlo import MonteCarlo
+from ltcl.solvers.problem import LinearProblem, SolveSettings, check_square, naming_channel
+from ltcl.solvers.result import Solution, Status, join_channels
+from ltcl.solvers.sampling import Sampler
 
-ITERATIVE = {kind.name: kind for kind in (*stationary.METHODS, *krylov.METHODS)}
-SAMPLED = {kind.name: kind for kind in (MonteCarlo, Hybrid)}
+_ITERATIVE_METHODS = (
+    *stationary.METHODS,
+    *chebyshev.METHODS,
+    *relaxation.METHODS,
+    *krylov.METHODS,
+)
+ITERATIVE = {method.name: method for method in _ITERATIVE_METHODS}
+SAMPLED = {method.name: method for method in (MonteCarlo, Hybrid)}
 KINDS: dict[str, Any] = {**ITERATIVE, **SAMPLED, Direct.name: Direct}
 METHODS: tuple[str, ...] = (*KINDS, "auto")
-OPTIONS = {
-    name: [own.name for own in dataclasses.fields(kind) if own.init] for name, kind in KINDS.items()
-}
-
-_FLOAT32 = 2.0**-20  # relative residual, below which float32 products are left
-_LEAST, _MOST = (
-    1e-3,
-    0.1,
-)  # of the tolerance of a step: many short steps waste products by S, long ones by S~
-_HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
-_on_coefficients: weakref.WeakKeyDictionary[IdentityPlus, IdentityPlus] = (
-    weakref.WeakKeyDictionary()
-)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Problem:
-    """S x = b with b (N,) or (N, k) on the host, the start (None for zero) and `rule`, all in units `unit`.
+def _option_names(kind: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(kind) if field.init]
 
-    `required` is the relative residual that all columns have to reach; `method` is None of "auto".
-    """
 
-    S: Operator
-    b: np.ndarray
-    x0: np.ndarray | None
-    rule: Rule
-    unit: np.ndarray
-    required: float
-    method: Any
-    exact: Operator | None
-    with_residual: bool
-
-    def solution(self, method: Any, x: np.ndarray, *facts: Any, **more: Any) -> Solution:
-        """With x in the units of the caller; `facts` are the status, iterations, products and residuals."""
-        return Solution(unscale(x, self.unit), *facts, seconds=0.0, method=method.name, **more)
+# Names of the options of each method.
+OPTIONS = {name: _option_names(kind) for name, kind in KINDS.items()}
 
 
 def solve(
@@ -87,8 +52,8 @@ def solve(
     b: Any,
     method: str = "auto",
     *,
-    rtol: float = 1e-2,
-    atol: float = 0.0,
+    rtol: float = SolveSettings.rtol,
+    atol: float = SolveSettings.atol,
     maxiter: int | None = None,
     x0: Any = None,
     callback: Callable[[int, float], object] | None = None,
@@ -96,19 +61,19 @@ def solve(
     exact: Any = None,
     **options: Any,
 ) -> Solution:
-    """Solve S x = b with products by S only.
+    """Solve S x = b by products with S only.
 
     Parameters
     ----------
     S : (N, N) Operator, array, scipy.sparse matrix or LinearOperator
-        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call. Of a
-        T in colour those are three Operators, which "monte_carlo" and "hybrid" take together.
-    b : (N,) or (N, k), or (3, N) or (3, N, k) of three S
+        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call. For
+        a T in colour these are three Operators, which "monte_carlo" and "hybrid" take together.
+    b : (N,) or (N, k), or (3, N) or (3, N, k) for three S
         k right-hand sides are solved together, each to its own tolerance.
     method : str
     rtol, atol : float
-        Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column, judged by the numbers that were
-        given, those of a float64 array in float64.
+        Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column. The numbers that were
+        given decide, in float64 if the array is float64.
     maxiter : int, optional
         1000 when not given.
     x0 : like b, optional
@@ -116,20 +81,20 @@ def solve(
     callback : callable(iteration, relative residual), optional
         Called with every entry of `residuals`, and at each step of a method that samples, with NaN.
     throw : bool
-        Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that
-        sample, whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
+        Raise if the tolerance is not met; otherwise look at ``.converged``. The noise of methods
+        that sample is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
     exact : like S, optional
-        What a compressed S stands for, ``T.interreflection`` of the uncompressed T: S makes the
-        steps of an iterative refinement, and the residual is that of `exact`. Down to 1e-6 by
-        products in float32, and to about 1e-15 in float64 where the numbers of `exact` are at hand.
+        The operator that a compressed S stands for, ``T.interreflection`` of the uncompressed T. S
+        computes the steps of an iterative refinement, and `exact` the residual. Down to 1e-6 by
+        products in float32, and to about 1e-15 in float64 if the host has the numbers of `exact`.
     **options
-        Of the method, as in the table below.
+        Options of the method, as in the table below.
 
     Returns
     -------
     Solution
-        x is like b; of ``pixels=`` (P,) or (P, k), with an infinite `residual`, which nobody knows
-        then.
+        x is like b. With ``pixels=`` it is (P,) or (P, k), and the `residual` is infinite, since it
+        is unknown.
 
     Raises
     ------
@@ -137,19 +102,19 @@ def solve(
         Shapes that do not fit, NaN, a tolerance or option out of range, or below the error of a
         compressed S.
     ToleranceError
-        A tolerance below what float32 keeps of an S that is too large to factorize.
+        A tolerance below the precision of float32 for an S that is too large to factorize.
     ConvergenceError
         Divergence or ``maxiter``, with the best iterate in ``.solution``.
 
     Notes
     -----
-    "auto" factorizes small systems; else the row sums of S decide, or "gmres" is tried; at the
-    second solve, or where it fails, a survey of three products shows what takes the least time: see
-    ``.reason``. Below rtol = 1e-6 its choice takes the steps of a refinement in float64.
+    "auto" factorizes small systems; else the row sums of S decide, or "gmres" is tried. At the
+    second solve, or if that fails, a survey of three products shows what takes the least time: see
+    ``.reason``. Below rtol = 1e-6 its choice computes the steps of a refinement in float64.
     `ltcl.solvers.matrix_series` inverts S.
 
     ====================  =======================================================================
-    method                options: what they are; their defaults
+    method                options: meaning; defaults
     ====================  =======================================================================
     jacobi, neumann       none
     richardson            omega: damping, above 0; the best for the free bounds
@@ -177,13 +142,21 @@ def solve(
     >>> s.converged, s.x.round(1).tolist()
     (True, [1.0, 0.0])
     """
-    if "with_residual" in options:
-        raise InputTypeError("unknown option 'with_residual'; the options are those of the method")
-    options |= dict(rtol=rtol, atol=atol, maxiter=maxiter, x0=x0, callback=callback, exact=exact)  # noqa: C408
-    checks.one_of("method", method, METHODS)
+    settings = SolveSettings(
+        rtol=rtol,
+        atol=atol,
+        maxiter=SolveSettings.maxiter if maxiter is None else maxiter,
+        callback=callback,
+        throw=throw,
+    )
+    chosen = choose_method(method, options)
     if isinstance(S, (tuple, list)) and any(isinstance(channel, Operator) for channel in S):
-        return joined(_in_colour(S, b, method, **options))
-    return _solve(S, b, method, throw, **options)
+        if not isinstance(chosen, Sampler) or len(S) != 3:
+            raise InputTypeError(
+                f"S is {len(S)} operators, one per colour channel; it must be one: solve each"
+            )
+        return join_channels(_solve_together(S, b, chosen, settings, x0=x0, exact=exact))
+    return _solve_one(S, b, chosen, settings, x0=x0, exact=exact)
 
 
 def solve_each(
@@ -192,349 +165,139 @@ def solve_each(
     method: str = "auto",
     *,
     exact: Sequence[Operator | None] = (),
+    x0: Any = None,
+    rtol: float = SolveSettings.rtol,
+    atol: float = SolveSettings.atol,
+    maxiter: int | None = None,
+    callback: Callable[[int, float], object] | None = None,
+    throw: bool = True,
     with_residual: bool = False,
-    **settings: Any,
+    **options: Any,
 ) -> tuple[Solution, ...]:
-    """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
+    """Solve one system a colour channel; methods that sample take walks that all three share.
 
-    `settings` are those of `solve`, but for x0; `with_residual` asks for b - S x where it costs
-    little.
+    The arguments are those of `ltcl.solve`, with one `exact` a channel.
+
+    Parameters
+    ----------
+    systems : sequence of (N, N) Operator
+    sides : sequence of (N,) or (N, k)
+    with_residual : bool
+        Keep b - S x in `Solution.rest`, where it costs little.
+
+    Returns
+    -------
+    tuple of Solution
+
+    Examples
+    --------
+    >>> from ltcl.operators import as_operator
+    >>> solutions = solve_each([as_operator([[2.0]]), as_operator([[4.0]])], [[1.0], [1.0]])
+    >>> [solution.x.tolist() for solution in solutions]
+    [[0.5], [0.25]]
     """
-    exacts = exact or [None] * len(systems)
-    if len(systems) == 1 or method not in SAMPLED or any(E is not None for E in exacts):
-        checks.one_of("method", method, METHODS)
-        settings["with_residual"] = with_residual
-        each = zip(systems, sides, exacts, strict=True)
-        return tuple(_solve(S, b, method, exact=E, **settings) for S, b, E in each)
-    settings.pop("throw", None)  # noise is no failure
-    return _in_colour(systems, np.stack(sides), method, **settings)
+    settings = SolveSettings(
+        rtol=rtol,
+        atol=atol,
+        maxiter=SolveSettings.maxiter if maxiter is None else maxiter,
+        callback=callback,
+        throw=throw,
+        with_residual=with_residual,
+    )
+    chosen = choose_method(method, options)
+    exacts = list(exact)
+    if not exacts:
+        exacts = [None] * len(systems)
+    has_exact = any(operator is not None for operator in exacts)
+    if isinstance(chosen, Sampler) and len(systems) == 3 and not has_exact:
+        return _solve_together(systems, np.stack(sides), chosen, settings, x0=x0)
+    solutions = []
+    for S, b, channel_exact in zip(systems, sides, exacts, strict=True):
+        solutions.append(_solve_one(S, b, chosen, settings, x0=x0, exact=channel_exact))
+    return tuple(solutions)
 
 
-def _solve(S: Any, b: Any, method: str, throw: bool = True, **settings: Any) -> Solution:
-    """`solve` of one S."""
-    start = time.perf_counter()
-    with np.errstate(all="ignore"):  # what leaves its range ends the solve, with a status
-        problem = _validate(S, b, method, **settings)
-        solution = (
-            _automatic(problem) if problem.method is None else _attempt(problem.method, problem)
+def choose_method(name: str, options: dict[str, Any]) -> Method | None:
+    """Return the method with its options, checked; None for "auto", which has none."""
+    checks.one_of("method", name, METHODS)
+    for option in options:
+        owners = [owner for owner, names in OPTIONS.items() if option in names]
+        if not owners:
+            known = OPTIONS.get(name)
+            listed = "none"
+            if known:
+                listed = ", ".join(known)
+            raise InputTypeError(f"unknown option {option!r}; method {name!r} has {listed}")
+        if name not in owners:
+            several = " or ".join(map(repr, owners))
+            raise InputTypeError(
+                f"option {option!r} is one of method={several}, but method is {name!r}"
+            )
+    return KINDS[name](**options) if name in KINDS else None
+
+
+def _check_sampler(method: Method | None, rows: int, exact: Any) -> None:
+    """Refuse what does not fit a method that samples."""
+    if not isinstance(method, Sampler):
+        return
+    if exact is not None:
+        raise InputTypeError(
+            f"exact= corrects iterates, but method {method.name!r} samples; leave it out"
         )
+    method.check_size(rows)
+
+
+def _solve_one(
+    S: Any, b: Any, method: Method | None, settings: SolveSettings, *, x0: Any, exact: Any
+) -> Solution:
+    """Solve one system, and raise if it fails and the settings ask for that."""
+    start = time.perf_counter()
+    _check_sampler(method, check_square("S", S)[0], exact)
+    # Numbers that leave their range end the solve with a status.
+    with np.errstate(all="ignore"):
+        problem = LinearProblem.from_arrays(S, b, settings, x0=x0, exact=exact)
+        solution = solve_automatically(problem) if method is None else method.solve(problem)
     solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
-    if throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
+    if settings.throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
         raise ConvergenceError(str(solution), solution)
     return solution
 
 
-def _in_colour(
-    systems: Sequence[Operator], b: Any, method: str, *, x0: Any = None, **settings: Any
+def _solve_together(
+    systems: Sequence[Any],
+    b: Any,
+    method: Sampler,
+    settings: SolveSettings,
+    *,
+    x0: Any = None,
+    exact: Any = None,
 ) -> tuple[Solution, ...]:
-    """Three channels by samples that they share."""
-    start, n = time.perf_counter(), len(systems)
-    if method not in SAMPLED or n != 3:
-        raise InputTypeError(
-            f"S is {n} operators, one per colour channel; it must be one: solve each"
-        )
-    shapes = [_shape("S", S) for S in systems]
+    """Solve three channels by samples that they share; noise is no failure."""
+    start = time.perf_counter()
+    shapes = [check_square("S", S) for S in systems]
     if len(set(shapes)) > 1:
         raise InputError(f"S is operators of shapes {shapes}; all must be the same")
     rows = shapes[0][0]
-    sides = {"b": b} if x0 is None else {"b": b, "x0": x0}
-    for name, value in sides.items():
-        array = sides[name] = checks.real(name, value)
-        if array.ndim not in (2, 3) or array.shape[:2] != (3, rows):
-            allowed = f"(3, {rows}) or (3, {rows}, k)"
-            raise InputError(f"{name} has shape {array.shape}; of three S it must be {allowed}")
+    _check_sampler(method, rows, exact)
+    b = _check_three("b", b, rows)
+    starts: Any = [None] * len(systems)
+    if x0 is not None:
+        starts = _check_three("x0", x0, rows)
     problems = []
     with np.errstate(all="ignore"):
-        _validate(systems[0], np.zeros(rows), method, **settings)  # what all channels share
-        for c, S in enumerate(systems):
-            own = {name: array[c] for name, array in sides.items()}
-            problems.append(of_channel(c, _validate, S, method=method, **own, **settings))
-        solutions = _sample(problems[0].method, problems)
+        for number, S in enumerate(systems):
+            with naming_channel(number):
+                problem = LinearProblem.from_arrays(S, b[number], settings, x0=starts[number])
+            problems.append(problem)
+        solutions = method.solve_channels(problems)
     seconds = time.perf_counter() - start
     return tuple(dataclasses.replace(solution, seconds=seconds) for solution in solutions)
 
 
-def _validate(
-    S: Any,
-    b: Any,
-    method: str,
-    *,
-    rtol: float = 1e-2,
-    atol: float = 0.0,
-    maxiter: int | None = None,
-    x0: Any = None,
-    callback: Any = None,
-    exact: Any = None,
-    with_residual: bool = False,
-    **options: Any,
-) -> _Problem:
-    """Refuse bad input before anything is uploaded; b, x0 and atol in units of each column."""
-    n = _shape("S", S)[0]
-    b, unit = scale_rhs(b, n)
-    rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
-    atol = checks.number("atol", atol, least=0.0)
-    if rtol == 0.0 and atol == 0.0:
-        raise InputError("rtol is 0; it must be above 0 and below 1, or atol above 0")
-    if callback is not None and not callable(callback):
-        raise InputTypeError(
-            f"callback is {callback!r}; it must be callable(iteration, relative residual)"
-        )
-    maxiter = 1000 if maxiter is None else checks.count("maxiter", maxiter)
-    if x0 is not None:
-        x0 = checks.shape("x0", checks.finite("x0", checks.real("x0", x0)), b.shape)
-    for option in options:
-        owners = [name for name, own in OPTIONS.items() if option in own]
-        if not owners:
-            has = ", ".join(OPTIONS.get(method, ())) or "none"
-            raise InputTypeError(f"unknown option {option!r}; method {method!r} has {has}")
-        if method not in owners:
-            several = " or ".join(map(repr, owners))
-            raise InputTypeError(
-                f"option {option!r} is one of method={several}, but method is {method!r}"
-            )
-    chosen = KINDS[method](**options) if method in KINDS else None  # of "auto"
-    if exact is not None and method in SAMPLED:
-        raise InputTypeError(
-            f"exact= corrects iterates, but method {method!r} samples; leave it out"
-        )
-    if isinstance(chosen, MonteCarlo):
-        chosen.check(n)
-    rule = Rule(rtol, atol / unit if atol else 0.0, maxiter, callback)
-    required = rtol if np.any(b) else np.inf  # where all columns are dark
-    if np.any(b) and atol:
-        norms = np.atleast_1d(np.linalg.norm(b.astype(np.float64), axis=0))
-        lit = norms > 0.0
-        required = float(np.min(rule.target(norms)[lit] / norms[lit], initial=np.inf))
-    A = S if isinstance(S, Operator) else _operator(S)
-    if exact is not None:
-        exact = _exact_operator(exact, A)
-    elif required < A.solution_error:  # says less about the solution than S itself
-        also = f" and atol {atol:g}" if atol else ""
-        raise InputError(
-            f"rtol is {rtol:g}{also}; S is compressed and its solutions may be off by "
-            f"{checks.upwards(A.solution_error)}: ask for no less, or give exact=T, the uncompressed one"
-        )
-    x0 = (
-        None if x0 is None else np.where(np.any(b, axis=0), x0 / unit, 0.0)
-    )  # no light: x = 0 is exact
-    return _Problem(A, b, x0, rule, unit, required, chosen, exact, with_residual)
-
-
-def _operator(S: Any, device: Device | None = None) -> Operator:
-    """`as_operator`, which remembers the numbers of an array as they were before they became float32."""
-    A = as_operator(S, device)
-    if isinstance(A, Dense) and A is not S:
-        A.exact = np.asarray(S), np.ones(A.shape[1]), np.zeros(A.shape[0])
-    return A
-
-
-def _exact_operator(exact: Any, S: Operator) -> Operator:
-    """`exact` on the device of S, checked."""
-    if (shape := _shape("exact", exact)) != S.shape:
-        raise InputError(f"exact has shape {shape}; it must be that of S, {S.shape}")
-    E = _operator(exact, S.device)
-    if E.device is not S.device:
-        raise InputError(f"exact is on another device, {E.device}; it must be on {S.device}")
-    return E
-
-
-def _shape(name: str, S: Any) -> tuple[int, ...]:
-    """The shape of a square S before it becomes an operator on a device."""
-    if hasattr(type(S), "interreflection"):  # asked of the object, it would upload
-        raise InputTypeError(
-            f"{name} is a {type(S).__name__}; give its operator, T.interreflection"
-        )
-    own = getattr(S, "shape", None) or checks.real(name, S).shape
-    if len(own) != 2 or own[0] != own[1]:
-        raise InputError(f"{name} has shape {own}; it must be square, (N, N)")
-    return own
-
-
-def _automatic(problem: _Problem) -> Solution:
-    """The first method of the plan that converges, else the best iterate; all products are counted."""
-    attempts: list[Solution] = []
-    reasons: list[str] = []
-    failure: Exception | None = None
-    products, S = 0, problem.S
-    target = min(problem.required, 0.5)
-    if problem.exact is None and target < auto.PRECISE and S.shape[0] > auto.SMALL:
-        if product(S) is not None:
-            problem = dataclasses.replace(problem, exact=S)
-            reasons.append(
-                f"refined in float64, since rtol={target:g} is below what float32 products reach"
-            )
-        elif S.shape[0] > auto.LARGEST_DIRECT:
-            raise ToleranceError(
-                f"rtol is {target:g}, less than float32 products tell of S, whose numbers are on the device "
-                f"alone and whose N = {S.shape[0]} is too large to factorize; it must be at least 1e-06",
-                auto.PRECISE,
-            )
-    if problem.exact is not None:
-        target = _step_tolerance(S)
-    for method, why, surveyed in auto.plan(S, target, problem.b[0].size, problem.exact is not None):
-        reasons.append(why)
-        products += surveyed
-        try:
-            attempts.append(_attempt(method, problem))
-        except (MemoryLimitError, InputError) as error:  # no room, or no transpose
-            if not attempts and isinstance(error, InputError):
-                raise
-            failure = error
-            reasons.append(f"{method.name} failed: {error}")
-            continue
-        products += attempts[-1].products
-        if attempts[-1].converged:
-            break
-        reasons.append(f"{attempts[-1].method} ended {attempts[-1].status.name.lower()}")
-        if attempts[-1].residual < 1.0:  # the next goes on from there
-            problem = dataclasses.replace(problem, x0=attempts[-1].x / problem.unit)
-    if failure is not None and not attempts:
-        raise failure
-    best = (
-        attempts[-1]
-        if attempts[-1].converged
-        else min(attempts, key=lambda attempt: attempt.residual)
-    )
-    return dataclasses.replace(best, products=products, reason="; ".join(reasons))
-
-
-def _attempt(method: Any, problem: _Problem) -> Solution:
-    """One method, by itself."""
-    if method.name in SAMPLED:
-        return _sample(method, [problem])[0]
-    if isinstance(method, Direct) and problem.exact is None:
-        return _factorize(method, problem)
-    S, x0, rest = problem.S, problem.x0, None
-    if problem.exact is None:
-        guess, b = None if x0 is None else S.device.upload(x0), S.device.upload(problem.b)
-        x, monitor, r = _iterate(
-            method, S, b, guess, problem.rule, problem.b, problem.with_residual
-        )
-        x, rest = x.get(), r and unscale(r.get(), problem.unit)
-    else:
-        x, monitor = _refine(method, problem, problem.exact)
-    facts = monitor.status, monitor.iterations, monitor.system.products, tuple(monitor.residuals)
-    return problem.solution(method, x, *facts, lowest=monitor.lowest, rest=rest)
-
-
-def _iterate(
-    method: Any,
-    S: Operator,
-    b: Array,
-    guess: Array | None,
-    rule: Rule,
-    host: np.ndarray | None = None,
-    with_residual: bool = False,
-) -> tuple[Array, Monitor, Array | None]:
-    """x in pixels of S x = b by an iterative method, what watched it, and b - S x where that is asked for.
-
-    `host` is b before it became float32; `guess` is None for zero.
-    """
-    W, right = None, b
-    weighted = isinstance(method, krylov.CG) and method.inner(S) is not None
-    if (
-        isinstance(S, IdentityPlus)
-        and isinstance(S.R, Compressed)
-        and S.R.two_sided
-        and not weighted
-    ):
-        W, core = S.R.into, S.R.core
-        if S not in _on_coefficients:  # what is learnt of it serves all solves
-            inside = _on_coefficients[S] = IdentityPlus(core, S.sign)
-            inside.weights, inside._row_sums = (
-                S.weights,
-                S.row_sums(),
-            )  # in pixels these bound the spectrum
-        S = _on_coefficients[S]
-    if W is None:
-        norms = vectors.norms(b)
-    else:
-        right, guess, host = W.apply(b), guess and W.apply(guess), None
-        norms = vectors.norms(b, right)
-    system = System(S, right, norms[0], host, on_coefficients=W is not None)
-    if guess is None:  # whose residual is b and costs no product
-        x, r, first = vectors.fill(right.like(), 0.0), right.copy(), norms[-1]
-    else:
-        x, r = guess, right.like()
-        first = system.residual(x, r)
-    monitor = Monitor(system, rule)
-    if not monitor.check(x, r, first[None]):
-        method.iterate(system, x, r, monitor)
-    x = monitor.result(x)
-    rest = r if with_residual and monitor.status is Status.CONVERGED else None
-    if W is None:
-        return x, monitor, rest
-    rest = rest and W.apply_transpose(rest)
-    if W.orthonormal:
-        return W.apply_transpose(x), monitor, rest
-    return W.apply_transpose(vectors.axpby(1.0, x, -1.0, right, x.like()), add=b), monitor, rest
-
-
-def _refine(method: Any, problem: _Problem, exact: Operator) -> tuple[np.ndarray, Monitor]:
-    """Refine solutions of S~ x = b, in float64, until `exact` finds the residual required."""
-    S, b, rule = problem.S, problem.b, problem.rule
-    right = S.device.upload(b)
-    system = System(exact, right, vectors.norm(right), b)
-    system.fine = (is_small(exact) or problem.required < _FLOAT32) and system.times is not None
-    x, r, norms = np.zeros(b.shape), right.copy(), system.norms
-    if problem.x0 is not None:
-        x = problem.x0.astype(np.float64)
-        norms = system.residual(x, r)
-    monitor = Monitor(system, rule)
-    while not monitor.check(x, r, norms[None]):
-        if isinstance(method, Direct):
-            solved = method.solve(S, r.get())
-            step, failure = (x, Status.BREAKDOWN) if solved is None else (solved[0], None)
-        else:
-            missing = np.divide(problem.required, monitor.residuals[-1])  # infinite of 0
-            tolerance = min(max(_step_tolerance(S), _HALF * float(missing)), _MOST)
-            light, inner, _ = _iterate(method, S, r, None, Rule(tolerance, 0.0, rule.maxiter))
-            system.products += inner.system.products
-            step, failure = light.get(), None if inner.lowest <= _HALF else inner.status
-        if failure is not None:
-            monitor.status = failure
-            break
-        x = x + step
-        norms = system.residual(x, r)
-    x = monitor.result(x)
-    return (x if system.fine else x.astype(np.float32)), monitor
-
-
-def _step_tolerance(S: Operator) -> float:
-    """Relative residual of the solves with S~: no smaller than what S~ is worth."""
-    return min(max(S.solution_error, _LEAST), _MOST)
-
-
-def _factorize(method: Direct, problem: _Problem) -> Solution:
-    """Claimed where the residual is within the tolerance with all that rounding of float64 may hide."""
-    b, rule = problem.b.astype(np.float64), problem.rule
-    solved = method.solve(problem.S, b)
-    if solved is None:
-        status, residual = (Status.BREAKDOWN, 1.0) if np.any(b) else (Status.CONVERGED, 0.0)
-        return problem.solution(method, np.zeros(b.shape), status, 0, 0, (residual,))
-    x, left, hidden = solved
-    norms = np.linalg.norm(b, axis=0)
-    limit = rule.target(norms)
-    claimed = np.all(left <= limit) and np.all(left + hidden <= CLAIM * limit)
-    residuals = 1.0, relative(left, norms)
-    if rule.callback is not None:
-        for iteration, residual in enumerate(residuals):
-            rule.callback(iteration, residual)
-    status = Status.CONVERGED if claimed else Status.STAGNATED
-    least = None if claimed else relative(left + hidden, norms)
-    return problem.solution(method, x, status, 1, 0, residuals, least_rtol=least)
-
-
-def _sample(method: Any, problems: Sequence[_Problem]) -> list[Solution]:
-    """A method that samples, on colour channels of one size at once; one solution a channel."""
-    channels = [Channel(method.name, problem) for problem in problems]
-    solutions = []
-    for p, estimate in zip(
-        problems, method.sample(channels, problems[0].rule.callback), strict=True
-    ):
-        error = estimate.standard_error
-        error = None if error is None else unscale(error, p.unit)
-        solutions.append(
-            dataclasses.replace(estimate, x=unscale(estimate.x, p.unit), standard_error=error)
-        )
-    return solutions
+def _check_three(name: str, value: Any, rows: int) -> np.ndarray:
+    """Return pictures of three channels, (3, rows) or (3, rows, k)."""
+    array = checks.real(name, value)
+    if array.ndim not in (2, 3) or array.shape[:2] != (3, rows):
+        allowed = f"(3, {rows}) or (3, {rows}, k)"
+        raise InputError(f"{name} has shape {array.shape}; for three S it must be {allowed}")
+    return array

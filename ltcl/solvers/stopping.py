@@ -1,59 +1,86 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One stopping rule for every method, and the system it is asked about.
+"""The stopping rule of all methods, and the system that it judges.
 
-``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2) for each column of b. CONVERGED is claimed only of a residual
-within the tolerance with all that rounding may hide (`ltcl.solvers.precision`), computed anew where
-needed.
+``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2) for each column of b. CONVERGED is claimed only if
+a residual is within the tolerance after all that rounding may hide of it is added
+(`ltcl.solvers.precision`); it is recomputed from x where needed.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.errors import InputError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles
+from ltcl.operators import Operator
+from ltcl.operators.knowledge import Product
 from ltcl.solvers import precision
-from ltcl.solvers.result import Status
-from ltcl.theory import row_sum_range
+from ltcl.solvers.result import Solution, Status
 
-SLOTS = 8  # steps between two readings, at most
+# Most steps between two readings of residuals.
+SLOTS = 8
 
-# Residuals of Chebyshev swing: what counts is the start and the largest of a long window, not the
-# best.
-GROWTH = (
-    100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
-)
-_RISES = 20  # residuals in a row, each above the one before, up to more than the first
-_WINDOW = 100  # steps whose largest residual must be 1 % below that of as many steps before
-_PATIENCE = 25  # steps without a new best residual once they are near rounding
-_DRIFT = 2.0**-20  # relative residual, below which one kept by recursion in float32 may be far off
-CLAIM = 1.01  # times the tolerance: what a residual may reach with what rounding hides added
-_REFUSALS = 3  # claims in a row that could not be confirmed, none better than those before
-_BETTER = 0.99  # times a residual: less of it is progress
-_MOST, _NORMAL = float(np.finfo(np.float32).max), 2.0**-126  # of float32
-_LARGEST = 1e18  # Frobenius norm whose square stays in float32
-_LEAST = 2.0**-63  # entries of S below have squares that are 0 on the device
-_norms: weakref.WeakKeyDictionary[Operator, float] = weakref.WeakKeyDictionary()
+# A residual of so many times the first one is past all transient growth of a nearly self-adjoint
+# system. Residuals of Chebyshev swing, so that the first one counts here, not the best.
+GROWTH_LIMIT = 100.0
+
+# So many residuals in a row, each above the one before, are growth once they exceed the first one.
+MAX_RISES = 20
+
+# Residuals stagnate if the largest of so many is not 1 % below the largest of as many before.
+STAGNATION_WINDOW = 100
+
+# Residuals near rounding stagnate after so many steps without a new best one.
+PATIENCE = 25
+
+# A residual that falls by less than this factor makes no progress.
+PROGRESS_FACTOR = 0.99
+
+# A relative residual below this, kept by recursion in float32, may be far off.
+RECURSION_LIMIT = 2.0**-20
+
+# What a claimed residual may reach, in tolerances, with all that rounding hides added.
+CLAIM_LIMIT = 1.01
+
+# A solve stagnates after so many claims in a row that could not be confirmed.
+MAX_REFUSALS = 3
 
 
-@dataclass(eq=False)
-class System:
-    """S x = b on the device, counting products.
+@dataclass(frozen=True, kw_only=True)
+class StoppingRule:
+    """The tolerance of a solve; `atol` is one number or one per column."""
 
-    `norms` (k,) are what tolerances are relative to: those of the whole right-hand side. `host` is
-    b before it became float32. Of a `fine` system x is float64 on the host, residuals are computed
-    in float64, and r is rounded once. With `on_coefficients` x comes back to pixels in float32:
-    float64 proves nothing.
+    rtol: float
+    atol: float | np.ndarray = 0.0
+    maxiter: int
+    callback: Callable[[int, float], object] | None = None
+
+    def target(self, norms: np.ndarray) -> np.ndarray:
+        """Return the norms (k,) that residuals may have for right-hand sides of `norms`."""
+        return np.maximum(self.rtol * norms, self.atol)
+
+
+@dataclass(eq=False, kw_only=True)
+class CountedOperator:
+    """S x = b on the device, with a count of the products.
+
+    Attributes
+    ----------
+    S, b
+        The operator, and the right-hand side on the device.
+    norms : (k,) float64
+        Norms of the whole right-hand side, to which tolerances are relative.
+    host : like b, optional
+        b before it became float32.
+    on_coefficients : bool
+        x is converted to pixels in float32 at the end, so that float64 would prove nothing.
+    in_float64 : bool
+        x is float64 on the host; residuals are computed in float64, and r is rounded once.
     """
 
     S: Operator
@@ -61,59 +88,61 @@ class System:
     norms: np.ndarray
     host: np.ndarray | None = None
     on_coefficients: bool = False
-    fine: bool = False
+    in_float64: bool = False
     products: int = 0
 
     @functools.cached_property
-    def times(self) -> precision.Product | None:
-        """Products by S in float64, None where its numbers are not at hand on the host."""
-        return None if self.on_coefficients else precision.product(self.S)
+    def product_float64(self) -> Product | None:
+        """Products by S in float64; None if the host does not have its numbers."""
+        if self.on_coefficients:
+            return None
+        return self.S.product_float64()
 
     def residual(self, x: Any, r: Array) -> np.ndarray:
-        """r = b - S x, and its norms (k,)."""
+        """Compute r = b - S x by one product; return its norms (k,)."""
         self.products += 1
-        if self.fine:
+        if self.in_float64:
             return self.exact_residual(x, r)
-        x = x if isinstance(x, Array) else self.S.device.upload(x)
-        return vectors.norm(self.S.apply(x, r, scale=-1.0, add=self.b))
+        on_device = x if isinstance(x, Array) else self.S.device.upload(x)
+        return vectors.norm(self.S.apply(on_device, r, scale=-1.0, add=self.b))
 
     def exact_residual(self, x: Any, r: Array) -> np.ndarray:
-        """The same in float64, with b and S as they were given."""
-        assert self.times is not None  # noqa: S101 - asked for by the callers
-        b = np.asarray(self.b.get() if self.host is None else self.host, np.float64)
+        """Compute the same in float64, with b and S as they were given."""
+        product = self.product_float64
+        assert product is not None  # noqa: S101 - asked for by the callers
+        b = self.b.get() if self.host is None else self.host
+        b = np.asarray(b, np.float64)
         x = x.get() if isinstance(x, Array) else x
-        left = b - self.times(x.astype(np.float64).reshape(len(b), -1)).reshape(b.shape)
-        if np.all(np.abs(left) <= np.finfo(np.float32).max):
-            r.set(left)
-        return np.atleast_1d(np.linalg.norm(left, axis=0))
+        columns = x.astype(np.float64).reshape(len(b), -1)
+        residual = b - product(columns).reshape(b.shape)
+        if np.all(np.abs(residual) <= np.finfo(np.float32).max):
+            r.set(residual)
+        return np.atleast_1d(np.linalg.norm(residual, axis=0))
 
 
-@dataclass(frozen=True)
-class Rule:
-    """The tolerance of a solve; `atol` is one number or one per column."""
-
-    rtol: float
-    atol: float | np.ndarray
-    maxiter: int
-    callback: Callable[[int, float], object] | None = None
-
-    def target(self, norms: np.ndarray) -> np.ndarray:
-        """Norms (k,) that residuals may have where right-hand sides have `norms`."""
-        return np.maximum(self.rtol * norms, self.atol)
-
-
-@dataclass
+@dataclass(kw_only=True)
 class Monitor:
     """Watches a solve: decides when it ends, keeps the history and the best iterate.
 
-    A method asks `steps_ahead()` how many steps it may queue, and calls `check` after them; where
-    it has no next step, it sets `status`. `factor` is what a step shrinks its residual by in
-    theory, where it knows. After a check `norms` (k,) are those of the residual, and `unsolved` the
-    columns above the tolerance.
+    A method asks `steps_ahead()` how many steps it may queue, and calls `check` after them. A
+    method without a next step sets `status`.
+
+    Attributes
+    ----------
+    residuals : list of float
+        Largest relative residual over the columns, before the first step and after each.
+    best, lowest
+        The iterate with the smallest residual, and that residual.
+    factor : float
+        What a step reduces its residual by in theory, if the method knows.
+    norms : (k,) float64
+        Norms of the residual at the last check.
+    unsolved : (k,) bool
+        Columns whose residual is above the tolerance.
     """
 
-    system: System
-    rule: Rule
+    system: CountedOperator
+    rule: StoppingRule
     status: Status | None = None
     residuals: list[float] = field(default_factory=list)
     best: Any = None
@@ -122,225 +151,241 @@ class Monitor:
 
     def __post_init__(self) -> None:
         self.norms = self.system.norms
+        self.unsolved = np.ones(self.norms.shape, bool)
         self._scale = np.where(self.norms > 0, self.norms, 1.0)
         self._target = self.rule.target(self.norms)
-        self._trusted = np.maximum(self._target, _DRIFT * self.norms)
-        self.unsolved = np.ones(self.norms.shape, bool)
-        self._lowest_at = self._rises = self._refused = 0
-        self._steps, self._travelled = 0, 0.0  # since the residual was computed from x itself
-        self._unproven = math.inf
-        self._finite = True
+        self._recursion_limit = np.maximum(self._target, RECURSION_LIMIT * self.norms)
+        self._lowest_at = 0
+        self._rises = 0
+        self._refusals = 0
+        self._lowest_refused = math.inf
+        self._is_finite = True
+        self._restart_recursion()
 
     @property
     def iterations(self) -> int:
-        """Iterations done: the first residual is that of the start."""
+        """The number of iterations; the first residual belongs to the start."""
         return max(0, len(self.residuals) - 1)
 
     def steps_ahead(self) -> int:
-        """Steps to queue before residuals are read: half of those that the tolerance seems to take.
+        """Return the steps to queue before residuals are read: half of those that seem missing.
 
-        No more than were made so far: products made in vain cost more than readings.
+        They are at most as many as were made so far: a product in vain costs more than a reading.
         """
         done = self.iterations
         if done == 0:
             return 1
-        with np.errstate(all="ignore"):
-            recent = np.array(self.residuals[-SLOTS - 1 :])
-            factor = min(float(np.min(recent[1:] / recent[:-1])), self.factor)
-            goal = np.maximum(self._target, precision.EPS * self._scale)
-            digits = np.log(np.max(self.norms / goal, initial=1.0))
-            required = digits / -np.log(factor) if factor < 1.0 else math.inf
-        most = min(required, 2.0 * SLOTS - 1.0, 2.0 * (self.rule.maxiter - done) - 1.0)
-        return max(1, min(int((most + 1.0) / 2.0), done))
+        required = self._required_steps()
+        left = self.rule.maxiter - done
+        most = min(required, 2.0 * SLOTS - 1.0, 2.0 * left - 1.0)
+        half = int((most + 1.0) / 2.0)
+        return max(1, min(half, done))
 
     def check(self, x: Any, r: Array, norms: np.ndarray, travelled: Any = None) -> bool:
-        """Whether the solve ends with the iterate `x`, whose residual is `r`; sets `status` when it does.
+        """Return whether the solve ends with the iterate `x`, and set `status` if it does.
 
-        `norms` (m, k) are those of the residuals of the m steps since the last check, the newest
-        last. `travelled` is None where r was computed from x itself; of a residual by recursion,
-        computed anew into `r` before convergence is claimed where rounding could hide it, the way
-        (k,) of x, `inf` if unknown.
+        Parameters
+        ----------
+        x, r
+            The iterate and its residual.
+        norms : (m, k)
+            Norms of the residuals of the m steps since the last check, the newest last.
+        travelled : None or (k,)
+            None if r was computed from x itself. Else r was kept by recursion while x moved by this
+            length, `inf` if it is unknown. r is recomputed before convergence is claimed, if
+            rounding could hide the difference.
         """
-        *before, last = norms
+        *earlier, newest = norms
         if travelled is None:
-            self._steps, self._travelled = 0, 0.0
+            self._restart_recursion()
         else:
-            self._steps, self._travelled = self._steps + len(norms), self._travelled + travelled
-        self.norms, claimed = self._confirm(x, r, last)
-        troubles = [self._judge(norms) for norms in (*before, self.norms)]
+            self._recursion_steps += len(norms)
+            self._travelled = self._travelled + travelled
+
+        self.norms, is_solved = self._confirm(x, r, newest)
+        troubles = []
+        for step_norms in (*earlier, self.norms):
+            troubles.append(self._judge(step_norms))
         self.unsolved = self.above(self.norms)
-        if (
-            not claimed and not self.unsolved.any()
-        ):  # within the tolerance, but for what rounding may hide
+        if not is_solved and not self.unsolved.any():
+            # All columns are within the tolerance, but for what rounding may hide.
             self.unsolved = self.norms > 0.0
-        if (
-            self._finite and self.residuals[-1] <= self.lowest
-        ):  # equal: one column stuck, others improve
-            if self.residuals[-1] < self.lowest:
-                self.lowest, self._lowest_at = self.residuals[-1], self.iterations
-            self.best = x if claimed else x.copy()
-        if self._finite and claimed:
+
+        newest_residual = self.residuals[-1]
+        # An equal residual is a new best iterate, too: one column is stuck while others improve.
+        if self._is_finite and newest_residual <= self.lowest:
+            if newest_residual < self.lowest:
+                self.lowest = newest_residual
+                self._lowest_at = self.iterations
+            self.best = x if is_solved else x.copy()
+
+        if self._is_finite and is_solved:
             self.status = Status.CONVERGED
         else:
             self.status = next((trouble for trouble in troubles if trouble is not None), None)
         return self.status is not None
 
     def above(self, norms: np.ndarray) -> np.ndarray:
-        """The columns, (k,) bool, in which residuals of such norms are above the tolerance, or NaN."""
+        """Return the columns, (k,) bool, whose residual norms exceed the tolerance or are NaN."""
         return ~(norms <= self._target)
 
-    def due(self, norms: np.ndarray) -> bool:
-        """Whether a method that need not form its iterate after every step has to after this one.
+    def needs_iterate(self, norms: np.ndarray) -> bool:
+        """Return whether a method that forms its iterate only now and then has to after this step.
 
-        `norms` are what it knows of the residual without; where the answer is no, they are
-        recorded.
+        `norms` (k,) are what the method knows of the residual without the iterate; if the answer is
+        no, they are recorded.
         """
         if self.iterations + 1 >= self.rule.maxiter or not np.all(np.isfinite(norms)):
             return True
-        self._steps += 1
+        self._recursion_steps += 1
         self._record(norms)
         return False
 
     def resume(self, x: Array, r: Array) -> bool:
-        """Whether a solve that grew may go on, with another choice of its method, from its best iterate."""
-        if (
-            self.status is not Status.DIVERGED
-            or self.best is None
-            or self.iterations >= self.rule.maxiter
-        ):
+        """Go back to the best iterate of a diverged solve, to go on with other parameters.
+
+        Returns whether that is possible.
+        """
+        if self.status is not Status.DIVERGED:
             return False
-        self.status, self._rises, self._finite = None, 0, True
-        self._steps, self._travelled = 0, 0.0
+        if self.best is None or self.iterations >= self.rule.maxiter:
+            return False
+        self.status = None
+        self._rises = 0
+        self._is_finite = True
+        self._restart_recursion()
         self.norms = self.system.residual(x.copy_from(self.best), r)
         self.unsolved = self.above(self.norms)
         return True
 
     def result(self, x: Any) -> Any:
-        """The last iterate where it solves the system, else the best one."""
+        """Return the last iterate if it solves the system, else the best one."""
         return x if self.status is Status.CONVERGED or self.best is None else self.best
 
+    def solution(self, x: np.ndarray, method: str, residual: np.ndarray | None = None) -> Solution:
+        """Return the solution x by `method` with the history of this solve."""
+        assert self.status is not None  # noqa: S101 - a method returns when the solve has ended
+        return Solution(
+            x=x,
+            status=self.status,
+            iterations=self.iterations,
+            products=self.system.products,
+            residuals=tuple(self.residuals),
+            method=method,
+            lowest=self.lowest,
+            rest=residual,
+        )
+
+    def _restart_recursion(self) -> None:
+        """Count recursive steps, and the way of x, from a residual computed from x itself."""
+        self._recursion_steps = 0
+        self._travelled: Any = 0.0
+
+    def _required_steps(self) -> float:
+        """Return how many steps the tolerance seems to take, by the fastest of the last ones."""
+        with np.errstate(all="ignore"):
+            recent = np.array(self.residuals[-SLOTS - 1 :])
+            fastest = float(np.min(recent[1:] / recent[:-1]))
+            factor = min(fastest, self.factor)
+            goal = np.maximum(self._target, precision.EPS * self._scale)
+            # A factor of NaN tells nothing, either.
+            if not factor < 1.0:
+                return math.inf
+            digits = np.log(np.max(self.norms / goal, initial=1.0))
+            return digits / -np.log(factor)
+
     def _confirm(self, x: Any, r: Array, norms: np.ndarray) -> tuple[np.ndarray, bool]:
-        """The norms of the newest residual, as exact as need be, and whether they solve the system."""
-        system, seems_solved = self.system, np.all(norms <= self._target)
-        if not seems_solved and not (self._steps and np.all(norms <= self._trusted)):
+        """Return norms (k,) of the newest residual, as exact as needed, and whether x solves."""
+        system = self.system
+        seems_solved = bool(np.all(norms <= self._target))
+        seems_recursive = self._recursion_steps > 0 and np.all(norms <= self._recursion_limit)
+        if not seems_solved and not seems_recursive:
             return norms, False
-        if system.fine or self._is_proven(x, norms):
-            return norms, bool(seems_solved)
-        at_hand = precision.is_small(system.S) and system.times is not None
-        if self._steps and not (at_hand and seems_solved and np.all(np.isfinite(self._travelled))):
-            self._steps, self._travelled = 0, 0.0
+        if system.in_float64 or self._is_proven(x, norms):
+            return norms, seems_solved
+
+        # A residual by recursion is recomputed, unless float64 decides at once and at little cost.
+        is_cheap = system.S.has_cheap_float64_product and system.product_float64 is not None
+        decides_at_once = is_cheap and seems_solved and np.all(np.isfinite(self._travelled))
+        if self._recursion_steps and not decides_at_once:
+            self._restart_recursion()
             norms = system.residual(x, r)
             if self._is_proven(x, norms):
                 return norms, True
         if not seems_solved:
             return norms, False
-        if at_hand or (self._refused + 1 >= _REFUSALS and system.times is not None):
+
+        is_last_refusal = self._refusals + 1 >= MAX_REFUSALS
+        if is_cheap or (is_last_refusal and system.product_float64 is not None):
             norms = system.exact_residual(x, r)
-            self._steps, self._travelled = 0, 0.0
+            self._restart_recursion()
             if np.all(norms <= self._target):
                 return norms, True
-        worst = float(np.max(norms / self._scale))
-        self._refused = self._refused + 1 if worst > _BETTER * self._unproven else 1
-        self._unproven = min(worst, self._unproven)
+        self._refuse(norms)
         return norms, False
 
+    def _refuse(self, norms: np.ndarray) -> None:
+        """Count a claim that was not confirmed; one better than those before restarts the count."""
+        worst = float(np.max(norms / self._scale))
+        if worst > PROGRESS_FACTOR * self._lowest_refused:
+            self._refusals += 1
+        else:
+            self._refusals = 1
+        self._lowest_refused = min(worst, self._lowest_refused)
+
     def _is_proven(self, x: Any, norms: np.ndarray) -> bool:
-        """Whether norms are within the tolerance with all that rounding may hide of the residual of x."""
+        """Return whether norms are within the tolerance with all that rounding may hide added."""
         if not np.all(norms <= self._target):
             return False
-        norm, is_bound = norm_bound(self.system.S)
-        if self._steps and not is_bound:
+        norm = self.system.S.norm_bound()
+        if self._recursion_steps and not norm.is_bound:
             return False
         size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
-        hidden = precision.UNIT * norm * (self._steps + 1) * (size + self._travelled)
-        rounded = 0.5 * precision.EPS * self.system.norms  # of b
-        return bool(np.all(norms + hidden + rounded <= CLAIM * self._target))
+        way = size + self._travelled
+        hidden = precision.UNIT * norm.value * (self._recursion_steps + 1) * way
+        rounding_of_b = 0.5 * precision.EPS * self.system.norms
+        return bool(np.all(norms + hidden + rounding_of_b <= CLAIM_LIMIT * self._target))
 
     def _judge(self, norms: np.ndarray) -> Status | None:
-        """Record the norms of one iterate; what is wrong with it, if anything."""
+        """Record the norms of one iterate; return what is wrong with it, if anything."""
         self._record(norms)
-        first, residual = self.residuals[0], self.residuals[-1]
-        self._finite &= bool(np.isfinite(residual))  # what comes after an overflow is no iterate
-        grown = residual > GROWTH * first or (self._rises >= _RISES and residual > first)
-        if grown or not np.isfinite(residual):
+        first = self.residuals[0]
+        residual = self.residuals[-1]
+        # No iterate after an overflow is one, whatever its residual.
+        self._is_finite &= bool(np.isfinite(residual))
+        has_grown = residual > GROWTH_LIMIT * first
+        keeps_growing = self._rises >= MAX_RISES and residual > first
+        if has_grown or keeps_growing or not np.isfinite(residual):
             return Status.DIVERGED
-        before, recent = self.residuals[-2 * _WINDOW : -_WINDOW], self.residuals[-_WINDOW:]
-        stalled = len(before) == _WINDOW and max(recent) > _BETTER * max(before)
-        waited = self.iterations - self._lowest_at
-        if stalled or (waited >= _PATIENCE and self.lowest < _DRIFT) or self._refused >= _REFUSALS:
+        if self._has_stalled() or self._refusals >= MAX_REFUSALS:
             return Status.STAGNATED
-        return Status.MAXITER if self.iterations >= self.rule.maxiter else None
+        if self.iterations >= self.rule.maxiter:
+            return Status.MAXITER
+        return None
+
+    def _has_stalled(self) -> bool:
+        """Return whether residuals have stopped falling, at large or near rounding."""
+        earlier = self.residuals[-2 * STAGNATION_WINDOW : -STAGNATION_WINDOW]
+        recent = self.residuals[-STAGNATION_WINDOW:]
+        is_full = len(earlier) == STAGNATION_WINDOW
+        if is_full and max(recent) > PROGRESS_FACTOR * max(earlier):
+            return True
+        waited = self.iterations - self._lowest_at
+        return waited >= PATIENCE and self.lowest < RECURSION_LIMIT
 
     def _record(self, norms: np.ndarray) -> None:
+        """Append the largest relative residual, and call the callback."""
         residual = float(np.max(norms / self._scale, initial=0.0))
-        previous = self.residuals[-1] if self.residuals else np.inf
+        has_risen = bool(self.residuals) and residual > self.residuals[-1]
         self.residuals.append(residual)
         if self.rule.callback is not None:
             self.rule.callback(self.iterations, residual)
-        self._rises = self._rises + 1 if residual > previous else 0
-
-
-def scale_rhs(b: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """b, (n,) or (n, k), in units near the largest value of each column, float32 where it is so already.
-
-    The units come with it: powers of two, so that squares of any light stay in float32 and no digit
-    is lost.
-    """
-    b = checks.finite("b", checks.real("b", b))
-    if b.ndim not in (1, 2) or b.shape[0] != n or b.size == 0:
-        raise InputError(f"b has shape {b.shape}; it must be ({n},) or ({n}, k)")
-    whole = (
-        len(b) // 256 * 256
-    )  # 256 rows side by side: NumPy reduces an axis of few columns slowly
-    sizes = (
-        np.abs(b[:whole])
-        .reshape(256, -1)
-        .max(axis=0)
-        .reshape(-1, *b.shape[1:])
-        .max(axis=0, initial=0)
-    )
-    sizes = np.maximum(sizes, np.abs(b[whole:]).max(axis=0, initial=0)).astype(np.float64)
-    unit = np.exp2(np.floor(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
-    is_float32 = b.dtype == np.float32 and np.all(unit >= _NORMAL)
-    return b / (unit.astype(np.float32) if is_float32 else unit), unit
-
-
-def unscale(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """x times its unit: float32 where x is and where that holds all of it, else float64."""
-    if x.dtype == np.float32 and np.all(unit >= _NORMAL):
-        with np.errstate(all="ignore"):
-            result = x * unit.astype(np.float32)
-        sizes = np.abs(result)
-        if np.max(sizes) <= _MOST and not np.any(x[sizes < _NORMAL]):  # flushed, or may be
-            return result
-    return x * unit
-
-
-def relative(residuals: np.ndarray, norms: np.ndarray) -> float:
-    """The largest residual relative to its right-hand side; absolute of a dark one."""
-    return float(np.max(residuals / np.where(norms > 0.0, norms, 1.0), initial=0.0))
-
-
-def norm_bound(S: Operator) -> tuple[float, bool]:
-    """A bound on the 2-norm of |S|, entry by entry, and whether it is one, computed once in the life of S.
-
-    The Frobenius norm of the numbers, between isometric bases that of the core; of other operators
-    the largest row sum, a bound of symmetric S >= 0, an estimate else.
-    """
-    if isinstance(S, IdentityPlus):
-        norm, is_bound = norm_bound(S.R)
-        return 1.0 + norm, is_bound
-    if isinstance(S, Compressed) and all(W is None or W.isometric for W in (S.out, S.into)):
-        return norm_bound(S.core)
-    if not isinstance(S, Tiles | CSR | Dense):
-        least, _, most = row_sum_range(S)
-        return max(1.0, most, -least), False
-    if S not in _norms:
-        if isinstance(S, Tiles):
-            norm = S.frobenius
+        if has_risen:
+            self._rises += 1
         else:
-            values = [slab.arguments[-1] for slab in S.slabs if slab.arguments[-1].size]
-            flat = [dataclasses.replace(array, shape=(array.size,)) for array in values]
-            norm = math.sqrt(math.fsum(float(vectors.dot(array, array)[0]) for array in flat))
-        _norms[S] = 1.01 * norm + _LEAST * max(S.shape) if norm < _LARGEST else math.inf
-    return _norms[S], True
+            self._rises = 0
+
+
+def relative_residual(residual_norms: np.ndarray, norms: np.ndarray) -> float:
+    """Return the largest residual relative to its right-hand side; absolute where that is dark."""
+    return float(np.max(residual_norms / np.where(norms > 0.0, norms, 1.0), initial=0.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +14,6 @@ from ltcl.device import Array, vectors
 from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
 
-_ranges: weakref.WeakKeyDictionary[Operator, tuple[float, float, float]] = (
-    weakref.WeakKeyDictionary()
-)
 # Steps of the power iteration.
 MAX_STEPS = 200
 # Least value of a positive vector, to its largest: far above an underflow.
@@ -239,9 +235,4 @@ def row_sum_range(S: Operator) -> tuple[float, float, float]:
 
     The mean is the Rayleigh quotient of the even picture, in the inner product of `S.weights`.
     """
-    if S not in _ranges:
-        sums = S.row_sums()
-        with np.errstate(all="ignore"):  # sums that left float32 stay infinite
-            mean = np.average(sums.astype(np.float64), weights=S.weights)
-        _ranges[S] = float(np.min(sums)), float(mean), float(np.max(sums))
-    return _ranges[S]
+    return S.row_sum_range()

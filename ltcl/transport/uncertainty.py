@@ -35,7 +35,7 @@ import numpy as np
 
 from ltcl.operators import Operator
 from ltcl.solvers import Inverse
-from ltcl.solvers.bounded import least_squares
+from ltcl.solvers.host_krylov import least_squares
 from ltcl.transport import frames as layout
 from ltcl.transport.covariance import SOLVE_RTOL, EntryErrors, ratio
 from ltcl.transport.noise import Noise

@@ -20,10 +20,11 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition import Calibration, Project, Setup
-from ltcl.acquisition.agreement import CameraModel, find_deviation, sample
+from ltcl.acquisition.agreement import find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.rig import to_unit
-from ltcl.acquisition.rigs.folder import Shot, read_photograph
+from ltcl.acquisition.rigs.photographs import read_photograph
+from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.acquisition.session import calibration_folder
 from ltcl.errors import LtclError
 from ltcl.store import ArrayLog, BlockStore, load
@@ -201,8 +202,7 @@ class Scan(Scene):
         numbers, taken = zip(*sorted(self._samples[shot.pattern].items()), strict=True)
         seconds, samples = zip(*taken, strict=True)
         self._warnings.pop(shot.pattern, None)
-        sensor = CameraModel(c.response, c.noise, c.offset)
-        if len({*seconds}) > 1 and (found := find_deviation(samples, seconds, sensor)):
+        if len({*seconds}) > 1 and (found := find_deviation(samples, seconds, c.camera)):
             self._warnings[shot.pattern] = found.describe(numbers)
 
     def _finish(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,29 @@ from ltcl.acquisition import VirtualRig
 from ltcl.acquisition.radiometry import Response
 from tests.store.stores import at_line, interrupt, kill
 
-LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))  # of a camera with an offset of 0.4 %
-SETTINGS: dict[str, dict[str, Any]] = {  # rigs and settings, by strategy
+LINEAR_RESPONSE = Response(np.array([[-0.004 / 0.996, 1.0]]))
+"""Response of a linear camera with an offset of 0.4 %."""
+SETTINGS: dict[str, dict[str, Any]] = {
     "pixel": {"grid": (6, 8)},
     "hadamard": {"grid": (6, 6), "order": 15},
     "block": {"grid": (8, 8), "channels": 3, "block": 2},
     "adaptive": {"grid": (8, 8)},
 }
+"""Rigs and settings by strategy."""
 
 
 def scene(grid: tuple[int, int]) -> np.ndarray:
     """A T whose light falls off with the distance, float64; made without a device."""
     y, x = np.mgrid[: grid[0], : grid[1]].reshape(2, -1)
-    return 0.5 * np.eye(len(x)) + 0.004 * np.exp(-np.hypot(x[:, None] - x, y[:, None] - y) / 3)
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)
+    return 0.5 * np.eye(len(x)) + 0.004 * np.exp(-distance / 3)
 
 
 class Unplugged(VirtualRig):
-    """Gives `left` photographs, which it counts, then fails; `fault` changes them, by their codes."""
+    """A rig that gives `left` photographs, which it counts, then fails.
+
+    `fault` changes an image by its codes.
+    """
 
     keeps_photographs = False
 
@@ -46,11 +53,14 @@ class Unplugged(VirtualRig):
         grid: tuple[int, int],
         *,
         left: int = 1 << 30,
-        fault: Any = None,
+        fault: Callable[[Any, np.ndarray], np.ndarray] | None = None,
         **options: Any,
     ) -> None:
         super().__init__(T, grid, **{"bits": 12, "ambient": 0.01, **options})
-        self.left, self.counts, self.fault = left, [0], fault
+        self.left = left
+        self.fault = fault
+        # A list, in whose place a child process has memory that it shares.
+        self.counts: Any = [0]
 
     @property
     def count(self) -> int:
@@ -61,23 +71,31 @@ class Unplugged(VirtualRig):
             raise OSError("unplugged")
         self.counts[0] += 1
         image = super().photograph(codes, seconds)
-        return self.fault(codes, image) if self.fault else image
+        return image if self.fault is None else self.fault(codes, image)
 
 
 def set_up(strategy: str, left: int = 1 << 30) -> tuple[Unplugged, dict[str, Any]]:
     """The rig of a strategy, and the arguments of `acquire`."""
     settings = dict(SETTINGS[strategy])
-    grid, channels = settings.pop("grid"), settings.pop("channels", 1)
-    T = [scene(grid) * (1.0 - 0.2 * c) for c in range(channels)]
-    rig = Unplugged(T if channels == 3 else T[0], grid, left=left, response="linear")
-    common = {"geometry": "aligned", "response": LINE, "exposures": [0.5], "frames": 2}
-    return rig, {"strategy": strategy, **common, **settings}
+    grid = settings.pop("grid")
+    T: Any = scene(grid)
+    if settings.pop("channels", 1) == 3:
+        T = [T, 0.8 * T, 0.6 * T]
+    rig = Unplugged(T, grid, left=left, response="linear")
+    return rig, {
+        "strategy": strategy,
+        "geometry": "aligned",
+        "response": LINEAR_RESPONSE,
+        "exposures": [0.5],
+        "frames": 2,
+        **settings,
+    }
 
 
 def acquire_and_end(
     store: Path, strategy: str, line: int = 0, end: str = "SIGKILL"
 ) -> tuple[int, int, int]:
-    """Acquire in a process of its own, and end at a line of ltcl; its status, photographs and lines."""
+    """Acquire in a child process, which ends at a line of ltcl: status, photographs and lines."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["pytest", __name__])
     counts = context.RawArray("q", 2)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs that deviate from what is known of their light are named; noise and defects never are."""
+"""Photographs that deviate from known light are named; noise and defects never are."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -22,55 +23,71 @@ from .stopping import Unplugged
 
 random = np.random.default_rng(0)
 WHITE = np.ones((2, 2), np.float32)
-SENSOR = CameraModel(Response.identity(), NoiseModel(1000.0, 0.003, levels=256), 0.02)
+BLACK_LEVEL = 0.02
+READ_NOISE = 0.003
+# Number of the first photograph of every record here.
+FIRST = 11
+CAMERA = CameraModel(
+    response=Response.identity(),
+    noise=NoiseModel(1000.0, READ_NOISE, levels=256),
+    offset=BLACK_LEVEL,
+)
 
 
 def photograph(light: np.ndarray, seconds: float = 1.0, electrons: float = 1000.0) -> np.ndarray:
-    """Of `light` a second, by a linear camera of 8 bits."""
-    value = random.poisson(light * seconds * electrons) / electrons + random.normal(
-        0, 0.003, light.shape
-    )
-    return np.rint(np.clip(0.02 + value, 0, 1) * 255) / 255
+    """Photograph `light` a second with a linear camera of 8 bits."""
+    photons = random.poisson(light * seconds * electrons) / electrons
+    value = photons + random.normal(0, READ_NOISE, light.shape)
+    return np.rint(np.clip(BLACK_LEVEL + value, 0, 1) * 255) / 255
 
 
-def deviating(images: Any, seconds: Any, codes: Any = None, sensor: CameraModel = SENSOR) -> str:
-    """What a calibration says of photographs 11, 12, ..., of one pattern or of `codes`; "" if nothing."""
+def message(images: Any, seconds: Any, codes: Any = None, camera: CameraModel = CAMERA) -> str:
+    """Message of a record about photographs 11, 12, ..., or "" if nothing deviates.
+
+    They are of one pattern, or of `codes`.
+    """
+    if codes is None:
+        codes = [WHITE] * len(images)
     record = AgreementRecord()
-    for number, (image, t) in enumerate(zip(images, seconds, strict=True), 11):
-        record.add(WHITE if codes is None else codes[number - 11], t, image, number)
+    numbers = range(FIRST, FIRST + len(images))
+    for pattern, image, t, number in zip(codes, images, seconds, numbers, strict=True):
+        record.add(pattern, t, image, number)
     try:
-        record.check(sensor)
+        record.check(camera)
     except AcquisitionError as error:
         return str(error)
     return ""
 
 
-def numbers(text: str) -> set[int]:
+def named(text: str) -> set[int]:
+    """Numbers of the photographs that a message names."""
     return {int(number) for number in re.findall(r"photograph (\d+)", text)}
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (9, 13), (96, 130), (5, 6, 3)])
-@pytest.mark.parametrize("most", [0.02, 0.3, 1.5])
-def test_noise_deviates_from_nothing(shape: tuple[int, ...], most: float) -> None:
-    """Of scenes with a few bright points, saturated here and there, from 8 bits and few electrons."""
+@pytest.mark.parametrize("brightest", [0.02, 0.3, 1.5])
+def test_noise_deviates_from_nothing(shape: tuple[int, ...], brightest: float) -> None:
+    """Scenes have a few bright points, saturated here and there, and few electrons in 8 bits."""
     times = (0.5, 2.0, 8.0)
     for electrons in (400.0, 20000.0):
         for _ in range(25):
-            light = most * random.random(shape) ** random.choice([0.5, 1, 6])
+            exponent = random.choice([0.5, 1, 6])
+            light = brightest * random.random(shape) ** exponent
             images = [photograph(light, t, electrons) for t in times]
-            for noise in (ROUGH_NOISE, NoiseModel(electrons, 0.003, levels=256)):
-                assert not deviating(images, times, sensor=SENSOR._replace(noise=noise))
+            for noise in (ROUGH_NOISE, NoiseModel(electrons, READ_NOISE, levels=256)):
+                assert not message(images, times, camera=replace(CAMERA, noise=noise))
 
 
 def test_few_photons_deviate_from_nothing() -> None:
     """Dark pixels get no photon in most photographs, and hardly any other noise."""
-    sensor, times = (
-        CameraModel(Response.identity(), NoiseModel(100.0, 1e-4)),
-        (0.25, 1.0, 1.0, 1.0, 4.0),
-    )
+    camera = CameraModel(response=Response.identity(), noise=NoiseModel(100.0, 1e-4))
+    times = (0.25, 1.0, 1.0, 1.0, 4.0)
     for light in 0.2 * random.random((20, 32, 32)) ** 3:
-        images = [np.minimum(random.poisson(100.0 * light * t) / 100.0, 1.0) for t in times]
-        assert not deviating(images, times, sensor=sensor)
+        images = []
+        for t in times:
+            photons = random.poisson(100.0 * light * t)
+            images.append(np.minimum(photons / 100.0, 1.0))
+        assert not message(images, times, camera=camera)
 
 
 @pytest.mark.parametrize("by_hand", [False, True])
@@ -80,96 +97,115 @@ def test_few_photons_deviate_from_nothing() -> None:
 def test_a_clean_calibration_of_a_noisy_camera_agrees(
     gain: float, albedo: Any, by_hand: bool
 ) -> None:
-    """Its response has to be measured in that noise, which the camera clips at black."""
+    """The response has to be measured in that noise, which the camera clips at black."""
     T = ltcl.scenes.dihedral(8, albedo=albedo).transport()
     rig = Unplugged(T, T.grid, bits=12, gain=gain, response="srgb", ambient=0.01)
     rig.keeps_photographs = by_hand
-    measured = measure(Shots(rig), geometry="aligned").noise.electrons
-    assert measured == pytest.approx(gain, rel=0.1)
+    calibration = measure(Shots(rig), geometry="aligned")
+    assert calibration.noise.electrons == pytest.approx(gain, rel=0.1)
 
 
 def test_defects_and_a_moth_deviate_from_nothing() -> None:
-    images = [photograph(np.full((40, 40), 0.01), t) for t in (0.5, 2.0, 8.0)]
-    images[0][3, 3] = images[1][3, 3] = 1.0  # stuck in two
+    times = (0.5, 2.0, 8.0)
+    images = [photograph(np.full((40, 40), 0.01), t) for t in times]
+    for stuck in images[:2]:
+        stuck[3, 3] = 1.0
     images[1][10:12, 20] = 0.8
-    assert not deviating(images, (0.5, 2.0, 8.0))
+    assert not message(images, times)
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 2])
 @pytest.mark.parametrize("gain", [0.4, 2 ** (1 / 3), 2.0])
 def test_another_exposure_is_named(wrong: int, gain: float) -> None:
-    """A third of a stop, twice as much, less than half."""
-    light, times = 0.3 * random.random((16, 16)), (0.5, 1.0, 2.0)
-    images = [photograph(light * (gain if k == wrong else 1.0), t) for k, t in enumerate(times)]
-    assert 11 + wrong in numbers(deviating(images, times))
+    """The exposure is less than half, a third of a stop more, or twice as long."""
+    light = 0.3 * random.random((16, 16))
+    times = (0.5, 1.0, 2.0)
+    gains = np.ones(3)
+    gains[wrong] = gain
+    images = [photograph(light * g, t) for g, t in zip(gains, times, strict=True)]
+    assert FIRST + wrong in named(message(images, times))
 
 
-@pytest.mark.parametrize("gain", [1.0, 2 ** (1 / 3)])
-def test_an_exposure_that_dim_pixels_alone_show(gain: float) -> None:
-    """Of two, 64 times apart: what one shows well the other does not, or it is saturated."""
-    light, sensor = (
-        random.random((60, 60)) ** 4,
-        CameraModel(Response.identity(), NoiseModel(20000.0, 0.001)),
-    )
-    codes = [
-        x + random.normal(0, 0.001, x.shape) for x in (gain * light, np.minimum(64 * light, 1.0))
-    ]
-    assert numbers(deviating(codes, (1.0, 64.0), sensor=sensor)) == (
-        {11, 12} if gain > 1.0 else set()
-    )
+@pytest.mark.parametrize(("gain", "expected"), [(1.0, set()), (2 ** (1 / 3), {11, 12})])
+def test_an_exposure_that_dim_pixels_alone_show(gain: float, expected: set[int]) -> None:
+    """Exposures are 64 times apart: a pixel good in one is dim or saturated in the other."""
+    camera = CameraModel(response=Response.identity(), noise=NoiseModel(20000.0, 0.001))
+    light = random.random((60, 60)) ** 4
+    short = gain * light + random.normal(0, 0.001, light.shape)
+    long = np.minimum(64 * light, 1.0) + random.normal(0, 0.001, light.shape)
+    assert named(message([short, long], (1.0, 64.0), camera=camera)) == expected
 
 
-FAULTS: dict[str, tuple[Callable[[list[np.ndarray]], list[np.ndarray]], set[int], str]] = {
-    "exchanged": (
-        lambda images: [*images[:2], images[3], images[2], images[4]],
-        {13, 14},
-        "exchanged",
-    ),
-    "moved": (
-        lambda images: images[:3] + [np.roll(image, 2) for image in images[3:]],
-        {14},
-        "moved",
-    ),
-    "lamp": (
-        lambda images: [images[0], images[1] + 0.1, *images[2:]],
-        {12},
-        "another light was on",
-    ),
-    "short": (lambda images: [*images[:4], 0.5 * images[4] + 0.01], {15}, "0.5 times as bright"),
-}
+def exchange(images: list[np.ndarray]) -> list[np.ndarray]:
+    return [*images[:2], images[3], images[2], images[4]]
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_likely_causes(fault: str) -> None:
-    """Of five photographs, one or two of which are of twice the seconds."""
-    change, wrong, cause = FAULTS[fault]
-    times = (1.0, 1.0, 1.0, 2.0, 1.0 if fault == "exchanged" else 2.0)
+def move(images: list[np.ndarray]) -> list[np.ndarray]:
+    return images[:3] + [np.roll(image, 2) for image in images[3:]]
+
+
+def light_a_lamp(images: list[np.ndarray]) -> list[np.ndarray]:
+    return [images[0], images[1] + 0.1, *images[2:]]
+
+
+def shorten(images: list[np.ndarray]) -> list[np.ndarray]:
+    return [*images[:4], 0.5 * images[4] + BLACK_LEVEL / 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "last_seconds", "wrong", "cause"),
+    [
+        (exchange, 1.0, {13, 14}, "exchanged"),
+        (move, 2.0, {14}, "moved"),
+        (light_a_lamp, 2.0, {12}, "another light was on"),
+        (shorten, 2.0, {15}, "0.5 times as bright"),
+    ],
+)
+def test_likely_causes(
+    change: Callable[[list[np.ndarray]], list[np.ndarray]],
+    last_seconds: float,
+    wrong: set[int],
+    cause: str,
+) -> None:
+    """Five photographs, one or two of which have twice the seconds."""
+    times = (1.0, 1.0, 1.0, 2.0, last_seconds)
     light = 0.3 * random.random((20, 20))
-    text = deviating(change([photograph(light, t) for t in times]), times)
+    images = change([photograph(light, t) for t in times])
+    text = message(images, times)
     assert cause in text
-    assert wrong <= numbers(text)
-    assert len(numbers(text)) <= 3
+    assert wrong <= named(text)
+    assert len(named(text)) <= 3
 
 
-@pytest.mark.parametrize("first", [None, 14, 20, 25])
-def test_the_first_that_deviates_is_named(first: int | None) -> None:
-    """White and stripes with their inverses, twice; from one photograph on everything has moved."""
-    patterns = [
-        (np.arange(20) // width % 2 * np.ones((20, 1))).astype(np.float32) for width in (1, 2, 4, 8)
-    ]
-    codes = [np.ones((20, 20), np.float32), *(half for p in patterns for half in (p, 1 - p))] * 2
+def stripes_with_inverses() -> list[np.ndarray]:
+    """White, and stripes of four widths with their inverses."""
+    codes = [np.ones((20, 20), np.float32)]
+    for width in (1, 2, 4, 8):
+        line = np.arange(20) // width % 2
+        stripes = np.broadcast_to(line, (20, 20)).astype(np.float32)
+        codes += [stripes, 1 - stripes]
+    return codes
+
+
+@pytest.mark.parametrize("first", [14, 20, 25])
+def test_the_first_that_deviates_is_named(first: int) -> None:
+    """Everything has moved from one photograph on."""
+    codes = 2 * stripes_with_inverses()
     light = 0.5 * random.random((20, 20))
     images = [photograph(light * pattern) for pattern in codes]
-    moved = [np.roll(im, 5) if first and k >= first else im for k, im in enumerate(images, 11)]
-    text = deviating(moved, np.ones(len(codes)), codes)
-    assert bool(text) == (first is not None)
-    assert first is None or min(abs(number - first) for number in numbers(text)) <= 1
+    times = np.ones(len(codes))
+    assert not message(images, times, codes)
+    moved = [np.roll(image, 5) for image in images[first - FIRST :]]
+    numbers = named(message([*images[: first - FIRST], *moved], times, codes))
+    assert min(abs(number - first) for number in numbers) <= 1
 
 
 def test_a_pattern_and_its_inverse() -> None:
-    """Each photographed once: all of them add up to white."""
-    codes = [half for p in (random.random((4, 12, 12)) < 0.5).astype(float) for half in (p, 1 - p)]
+    """Each is photographed once, and all of them add up to white."""
+    codes = []
+    for pattern in (random.random((4, 12, 12)) < 0.5).astype(float):
+        codes += [pattern, 1 - pattern]
     images = [photograph(0.6 * pattern) for pattern in codes]
-    assert not deviating(images, np.ones(8), codes)
+    assert not message(images, np.ones(8), codes)
     images[4] = np.roll(images[4], 3)
-    assert numbers(deviating(images, np.ones(8), codes)) == {15, 16}
+    assert named(message(images, np.ones(8), codes)) == {15, 16}

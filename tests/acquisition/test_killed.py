@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""An acquisition that ends at any line of ltcl loses nothing committed; a flipped bit of it is noticed.
+"""An acquisition that ends at any line of ltcl loses nothing committed; a flipped bit is noticed.
 
 It ends by SIGKILL and by Ctrl-C. LTCL_KILLS=N in the environment takes N ends of each strategy.
 """
@@ -27,11 +27,16 @@ from .stopping import SETTINGS, acquire_and_end, set_up
 random = np.random.default_rng()
 KILLS = int(os.environ.get("LTCL_KILLS", "3"))
 STATUS = {"SIGKILL": -signal.SIGKILL, "Ctrl-C": 2}
-FINAL, HALF = ("pixel", "adaptive"), ("pixel, half done", "adaptive, half done")
+FINAL = ("pixel", "adaptive")
+HALF = ("pixel, half done", "adaptive, half done")
 
 
 def committed(path: Path) -> tuple[bool, bool, int]:
-    """Whether the calibration and the transport are; photographs of the one or batches of the other."""
+    """State of an acquisition: later states are larger.
+
+    Whether the calibration and the transport are committed; the number of photographs of the one,
+    or of batches of the other.
+    """
     if path.exists():
         store = BlockStore.open(path)
         store.verify()
@@ -48,38 +53,42 @@ def test_ended_and_resumed(tmp_path: Path, strategy: str) -> None:
     _, photographs, lines = acquire_and_end(whole, strategy)
     batch = max(16, BlockStore.open(whole).layout.block_rows + 2)
     for number in range(-(-KILLS // 3)):
-        path, count, before = tmp_path / str(number) / "T.zarr", 0, (False, False, 0)
+        path = tmp_path / str(number) / "T.zarr"
         path.parent.mkdir()
+        total = 0
+        before = (False, False, 0)
         for line in random.integers(1, lines, 3).tolist():
             end = str(random.choice(list(STATUS)))
-            status, more, _ = acquire_and_end(path, strategy, line, end)
-            assert status in (STATUS[end], 0), (line, end)  # what is resumed has fewer lines
-            count += more
+            status, taken, _ = acquire_and_end(path, strategy, line, end)
+            # A run that is resumed has fewer lines, and may come to its end.
+            assert status in (STATUS[end], 0), (line, end)
+            total += taken
             assert committed(path) >= before
             before = committed(path)
-        status, more, _ = acquire_and_end(path, strategy)
+        status, taken, _ = acquire_and_end(path, strategy)
         assert status == 0
-        assert photographs <= count + more <= photographs + 3 * (batch + 1)
+        assert photographs <= total + taken <= photographs + 3 * (batch + 1)
         assert contents(path) == contents(whole)
         assert os.listdir(path.parent) == ["T.zarr"]
 
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Stores of acquisitions that are done, and of such that were stopped in the middle of the scan."""
+    """Stores of finished acquisitions, and of others that were stopped in the scan."""
     paths = {kind: tmp_path_factory.mktemp("stores") / "T.zarr" for kind in FINAL + HALF}
     for kind in FINAL:
         rig, settings = set_up(kind)
         ltcl.acquire(rig, store=paths[kind], **settings)
+        half_done = paths[f"{kind}, half done"]
         rig, settings = set_up(kind, left=70)
         with pytest.raises(AcquisitionError, match="photograph 71: "):
-            ltcl.acquire(rig, store=paths[f"{kind}, half done"], **settings)
-        assert BlockStore.open(paths[f"{kind}, half done"]).written
+            ltcl.acquire(rig, store=half_done, **settings)
+        assert BlockStore.open(half_done).written
     return paths
 
 
 def flip(file: Path) -> bytes:
-    """Flip one bit; returns what was there."""
+    """Flip one bit; return the bytes before."""
     good = file.read_bytes()
     bad = bytearray(good)
     bad[int(random.integers(len(good)))] ^= 1 << int(random.integers(8))
@@ -89,7 +98,7 @@ def flip(file: Path) -> bytes:
 
 @pytest.mark.parametrize("kind", FINAL + HALF)
 def test_any_flipped_bit_is_detected(stores: dict[str, Path], tmp_path: Path, kind: str) -> None:
-    """Of each file once, by `verify`; of a transport by its report; of half a scan by who goes on."""
+    """`verify` notices one bit of each file, so does a report, or a run that goes on."""
     path = Path(shutil.copytree(stores[kind], tmp_path / "T.zarr"))
     files = sorted(file for file in path.rglob("*") if file.is_file())
     for file in files:
@@ -121,3 +130,5 @@ def test_a_state_that_makes_no_sense(
     rig, settings = set_up("pixel")
     with pytest.raises(LtclError, match=r"T\.zarr"):
         ltcl.acquire(rig, store=path, **settings)
+    with pytest.raises(FileError, match=r"T\.zarr"):
+        ltcl.acquisition.finalize(path)

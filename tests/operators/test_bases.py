@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Wavelets, pyramids, subsets of coefficients and the support of a core: twins, PyWavelets, launches."""
+"""Wavelets, pyramids, subsets of coefficients and the support of a core."""
 
 from __future__ import annotations
 
@@ -41,27 +41,26 @@ def some(n: int, share: int = 3) -> np.ndarray:
 @pytest.mark.parametrize("name", ["haar", "db4", "pyramid"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
-    for module in (pyramid, wavelets):  # pixels of the levels that one launch does
-        monkeypatch.setattr(module, "SMALL_LEVEL_PIXELS", small)
-    monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 5, 11))  # launches of every width, and pieces
+    monkeypatch.setattr(pyramid, "SMALL_LEVEL_PIXELS", small)
+    monkeypatch.setattr(wavelets, "SMALL_LEVEL_PIXELS", small)
+    # Launches of every width, and pieces.
+    monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 5, 11))
     if name == "pyramid":
         W = Pyramid(shaped, grid)
         matrix = reference.pyramid_gather(np.eye(W.shape[1]).reshape(*grid, -1))
         transposed = reference.pyramid_spread(grid)
     else:
         W = Wavelet(shaped, grid, name)
-        matrix, transposed = (
-            twin(grid, W.levels, wavelets.filters(name))
-            for twin in (reference.wavelet_split, reference.wavelet_join)
-        )
+        filters = wavelets.filters(name)
+        matrix = reference.wavelet_split(grid, W.levels, filters)
+        transposed = reference.wavelet_join(grid, W.levels, filters)
     helpers.meets_twin(W, matrix)
     helpers.meets_twin(W.T, transposed)
 
 
 @pytest.mark.parametrize("share", [1, 3])
-@pytest.mark.parametrize(
-    "grid", [(1, 1), (9, 8), (20000, 1)]
-)  # the last has more pixels than items
+# The last grid has more pixels than items.
+@pytest.mark.parametrize("grid", [(1, 1), (9, 8), (20000, 1)])
 def test_subsets_meet_their_twin(shaped, grid, share):
     n = grid[0] * grid[1]
     places = some(n, share)
@@ -72,14 +71,14 @@ def test_subsets_meet_their_twin(shaped, grid, share):
     if n < 100:
         helpers.meets_twin(P.T, reference.ordered_gather(places, np.eye(n)).T)
     assert P.nbytes == 4 * (len(places) + n)
-    assert (P.isometric, P.orthonormal) == (True, len(places) == n)
+    assert P.isometric
+    assert P.orthonormal == (len(places) == n)
 
 
 @pytest.mark.parametrize("name", [*NAMES, "db38", "sym20"])
 @pytest.mark.parametrize("grid", [(8, 8), (16, 2), (12, 20), (128, 256)])
-@pytest.mark.filterwarnings(
-    "ignore:Level value of"
-)  # sides shorter than the filter are wanted here
+# Sides are shorter than the filter on purpose.
+@pytest.mark.filterwarnings("ignore:Level value of")
 def test_coefficients_are_those_of_pywavelets_where_sides_halve_evenly(device, grid, name):
     levels = min(side & -side for side in grid).bit_length() - 1
     x = gallery.vectors(grid[0] * grid[1], None)
@@ -94,7 +93,8 @@ def test_coefficients_are_those_of_pywavelets_where_sides_halve_evenly(device, g
 @pytest.mark.parametrize("grid", [*GRIDS, (37, 40)])
 def test_wavelets_are_orthonormal_and_keep_constants_compact(device, grid, name):
     """A value goes through two passes of a few products a level: some 50 units of the norm."""
-    W, n = Wavelet(device, grid, name), grid[0] * grid[1]
+    W = Wavelet(device, grid, name)
+    n = grid[0] * grid[1]
     error = 50 * reference.UNIT * (1 + W.levels)
     dense = W.to_dense()
     np.testing.assert_allclose(dense @ dense.T, np.eye(n), rtol=0, atol=2 * error)
@@ -115,7 +115,8 @@ def test_a_picture_takes_four_launches(device, kind):
 
 @pytest.mark.parametrize("grid", [(20000, 1), (1, 40000)])
 def test_long_lines_need_more_than_an_item_has(device, grid):
-    W, x = Wavelet(device, grid, "haar"), gallery.vectors(grid[0] * grid[1], None)
+    W = Wavelet(device, grid, "haar")
+    x = gallery.vectors(grid[0] * grid[1], None)
     a = helpers.product(W, x)
     assert a[0] == pytest.approx(x.sum(dtype=np.float64) / np.sqrt(x.size), abs=1e-4)
     np.testing.assert_allclose(helpers.product(W.T, a), x, rtol=0, atol=1e-5)
@@ -151,26 +152,39 @@ def test_small_work_groups_will_do_in_the_shape_of_a_gpu():
     subprocess.run([sys.executable, "-c", SMALL_GROUPS], env=environment, check=True, timeout=120)
 
 
-@pytest.mark.parametrize(
-    ("entries", "places"),
-    [
-        ([(7, 1), (2, 2), (7, 3)], [1, 2, 3, 7]),
-        ([(7, 1), (2, 2), (7, 3), (0, 0)], range(8)),  # five of eight: the whole basis
-        ([], [0]),
-    ],
-)
-def test_a_core_is_restricted_to_rows_and_columns_in_use(device, entries, places):
+# Entries of a core, and the coefficients in use; five of eight give the whole basis.
+SUPPORTS = [
+    ([(7, 1), (2, 2), (7, 3)], [1, 2, 3, 7]),
+    ([(7, 1), (2, 2), (7, 3), (0, 0)], range(8)),
+    ([], [0]),
+]
+
+
+@pytest.mark.parametrize(("entries", "places"), SUPPORTS)
+@pytest.mark.parametrize("kind", ["wavelet", "order", "wavelet and order"])
+def test_a_core_is_restricted_to_rows_and_columns_in_use(device, kind, entries, places):
     rows, columns = np.array(entries).reshape(-1, 2).T
     whole = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(8, 8))
     haar = Wavelet(device, (2, 4), "haar")
-    for W in (haar, *(SubsetBasis(device, (2, 4), some(8, 1), of=of) for of in (None, haar))):
-        core, V = restrict_to_support(whole, W)
-        np.testing.assert_array_equal(V.to_dense(), W.to_dense()[places])
-        assert (V.grid, V.isometric, V.orthonormal) == ((2, 4), True, len(places) == 8)
-        restricted, before = (Compressed(CSR(device, C), B, B) for C, B in ((core, V), (whole, W)))
-        np.testing.assert_allclose(restricted.to_dense(), before.to_dense(), atol=1e-6)
-    P = Pyramid(device, (1, 4))
-    assert not restrict_to_support(np.eye(7) * (np.arange(7) < 2), P)[1].isometric
+    bases = {
+        "wavelet": haar,
+        "order": SubsetBasis(device, (2, 4), some(8, 1)),
+        "wavelet and order": SubsetBasis(device, (2, 4), some(8, 1), of=haar),
+    }
+    W = bases[kind]
+    core, V = restrict_to_support(whole, W)
+    np.testing.assert_array_equal(V.to_dense(), W.to_dense()[places])
+    assert V.grid == (2, 4)
+    assert V.isometric
+    assert V.orthonormal == (len(places) == 8)
+    before = Compressed(CSR(device, whole), W, W)
+    restricted = Compressed(CSR(device, core), V, V)
+    np.testing.assert_allclose(restricted.to_dense(), before.to_dense(), atol=1e-6)
+
+
+def test_a_part_of_a_pyramid_is_not_isometric(device):
+    core = np.eye(7) * (np.arange(7) < 2)
+    assert not restrict_to_support(core, Pyramid(device, (1, 4)))[1].isometric
 
 
 @pytest.mark.parametrize("grid", [(1, 1), (1, 7), (5, 8), (45, 91)])
@@ -178,10 +192,12 @@ def test_a_core_is_restricted_to_rows_and_columns_in_use(device, entries, places
 def test_a_multiresolution_order_goes_from_coarse_to_fine(grid, levels):
     order = multiresolution_order(grid, levels)
     np.testing.assert_array_equal(np.sort(order), np.arange(grid[0] * grid[1]))
-    level = np.zeros(grid, int)  # of each coefficient, 0 the finest
+    # The level of each coefficient, 0 for the finest.
+    level = np.zeros(grid, int)
     h, w = grid
     for split in range(1, levels + 1):
         if max(h, w) > 1:
-            h, w = -(-h // 2), -(-w // 2)
+            h = -(-h // 2)
+            w = -(-w // 2)
             level[:h, :w] = split
     assert np.all(np.diff(level.ravel()[order]) <= 0)

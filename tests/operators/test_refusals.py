@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What no operator is made of: each argument with the value that is refused."""
+"""Arguments that constructors of operators refuse."""
 
 from __future__ import annotations
 
@@ -38,16 +38,18 @@ NO_WAVELETS = ("bior2.2", "rbio1.3", "dmey", "db99", "morl", "", None, 2)
 
 
 def test_what_is_no_operator_is_refused(device, small_device):
-    W, tall = Given(device, rotation(N)), Given(device, gallery.signed(N + 1, N))
-    core, skew = Dense(device, np.eye(N)), Given(device, gallery.signed(N, N))
+    W = Given(device, rotation(N))
+    tall = Given(device, gallery.signed(N + 1, N))
+    skew = Given(device, gallery.signed(N, N))
+    core = Dense(device, np.eye(N))
     dropped = Dense(device, np.eye(N))
     dropped.error = 0.1
     assert Compressed(dropped, skew, skew, 0.3).error == 0.3
-    a, b = (Dense(device, gallery.signed(3, columns)) for columns in (3, 2))
+    a = Dense(device, gallery.signed(3, 3))
+    b = Dense(device, gallery.signed(3, 2))
     host = Host(device, helpers.Plain(EYE))
-    wide = CSR(
-        device, scipy.sparse.csr_array((np.ones(1), ([0], [1 << 22])), shape=(1, (1 << 22) + 1))
-    )
+    one_entry = (np.ones(1), ([0], [1 << 22]))
+    wide = CSR(device, scipy.sparse.csr_array(one_entry, shape=(1, (1 << 22) + 1)))
     beyond = gallery.sparse(9, 9)
     beyond.indices[0] = 9
     helpers.refused(
@@ -84,13 +86,8 @@ def test_what_is_no_operator_is_refused(device, small_device):
         ("into .*device", Compressed, core, W, Given(small_device, np.eye(N))),
         ("error is -1.0", Compressed, core, W, W, -1.0),
         ("error is nan", Compressed, core, W, W, np.nan),
-        (
-            "error is None",
-            Compressed,
-            dropped,
-            skew,
-            skew,
-        ),  # that of coefficients is none of pixels
+        # An error of coefficients is none of pixels.
+        ("error is None", Compressed, dropped, skew, skew),
         (r"diagonal .*\(2,\)", partial(Compressed, core, W, W, diagonal=np.ones(2))),
         (f"diagonal has {N} NaN", partial(Compressed, core, W, W, diagonal=np.full(N, np.nan))),
         ("blocks", Coupled, [[a] * 3] * 2),

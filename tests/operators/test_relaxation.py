@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sweeps and steps over rows meet their twins as launched on CPUs and GPUs, whatever block and slabs."""
+"""Sweeps and steps over rows meet their twins, as launched on CPUs and GPUs."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ MATRICES = {
     "below only": np.tril(gallery.signed(33, 33, 6), -1) / 9,
     "above only": np.triu(gallery.signed(33, 33, 7), 1) / 9,
 }
-METHODS = {"sor": 1.3, "block_gauss_seidel": None}  # omega
-SHAPES = {"cpu": 1, "gpu7": 7, "gpu256": 256}  # items of a work-group
+# Their omega.
+METHODS = {"sor": 1.3, "block_gauss_seidel": None}
+# Items of a work-group.
+SHAPES = {"cpu": 1, "gpu7": 7, "gpu256": 256}
 
 
 @pytest.fixture(scope="module", params=SHAPES)
@@ -40,24 +42,25 @@ def launch(request, device) -> tuple[Device, int]:
     return launched_as(device, request.param[:3]), SHAPES[request.param]
 
 
-def matrix_of(launch: tuple[Device, int], form: str, name: str) -> tuple[CSR | Dense, np.ndarray]:
+def matrix_of(device: Device, form: str, name: str) -> tuple[CSR | Dense, np.ndarray]:
     """R on the device, some in slabs, and I - R."""
-    M, device = MATRICES[name], launch[0]
-    device.max_allocation = SMALL if "slabs" in name else device.description.max_allocation
+    M = MATRICES[name]
+    is_cut = "slabs" in name
+    device.max_allocation = SMALL if is_cut else device.description.max_allocation
     R = helpers.FORMATS[form](device, M)
-    assert (len(R.slabs) > 1) == ("slabs" in name)
+    assert (len(R.slabs) > 1) == is_cut
     return R, np.eye(len(M)) - M.astype(np.float64)
 
 
 def sweeps_of(relax: Relaxation, k: int | None) -> tuple[Sweeps, np.ndarray, np.ndarray]:
     """Sweeps that start with NaN wherever nothing is read."""
-    n, device = relax.rows.M.shape[0], relax.rows.M.device
-    x, b = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
-    sweeps = Sweeps(
-        relax, device.upload(x), device.upload(b), device.upload(np.full_like(x, np.nan))
-    )
+    x = gallery.vectors(relax.n, k, 1)
+    b = gallery.vectors(relax.n, k, 2)
+    garbage = np.full_like(x, np.nan)
+    upload = relax.device.upload
+    sweeps = Sweeps(relax, upload(x), upload(b), upload(garbage))
     for array in (sweeps.before, sweeps.s, sweeps.carry):
-        array.set(np.full_like(x, np.nan))
+        array.set(garbage)
     return sweeps, x, b
 
 
@@ -66,25 +69,38 @@ def sweeps_of(relax: Relaxation, k: int | None) -> tuple[Sweeps, np.ndarray, np.
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_sweeps_meet_their_twins(launch, form, method, name, k):
-    """Blocks of 1 to all rows; what a sweep leaves behind is what the next one tells the residual from."""
-    (A, S), omega = matrix_of(launch, form, name), METHODS[method]
-    for block in (1, 5, 16) if "slabs" in name else (1, 7, None):  # inverses fit in one buffer
-        relax = relaxation(IdentityPlus(A, -1), method, block, omega)
+    """Blocks of 1 to all rows; a sweep leaves behind what the next one tells the residual from."""
+    device, group = launch
+    A, S = matrix_of(device, form, name)
+    # Inverses fit in one buffer.
+    blocks = (1, 5, 16) if "slabs" in name else (1, 7, None)
+    for block in blocks:
+        relax = relaxation(IdentityPlus(A, -1), method, block, METHODS[method])
         if form == "csr" and len(A.slabs) == 1:
             windows = reference.relax_windows(
                 MATRICES[name], relax.block, relax.panel, inverses=relax.inverses
             )
             np.testing.assert_array_equal(relax.windows[0].get(), windows)
-        sweeps, y, b = sweeps_of(relax, k)
-        sweeps.group, carry = launch[1], np.full_like(y, np.nan)
-        for sweep in range(3):
-            before, how = y, (relax.block, omega, y, b, carry)
-            y, r, carry = reference.relax_strips(S, *how, in_place=not relax.inverses)
-            sweeps.sweep()
-            arrays = [(sweeps.x, y), (sweeps.before, before), (sweeps.carry, carry), (sweeps.r, r)]
-            arrays += [(sweeps.r, b - S @ before)] if sweep else []
-            for array, expected in arrays:
-                np.testing.assert_allclose(array.get(), expected, rtol=0, atol=1e-5)
+        check_sweeps(relax, S, k, group)
+
+
+def check_sweeps(relax: Relaxation, S: np.ndarray, k: int | None, group: int) -> None:
+    """Assert that three sweeps are those of S in float64."""
+    sweeps, y, b = sweeps_of(relax, k)
+    sweeps.group = group
+    carry = np.full_like(y, np.nan)
+    for sweep in range(3):
+        before = y
+        y, r, carry = reference.relax_strips(
+            S, relax.block, relax.omega, y, b, carry, in_place=not relax.inverses
+        )
+        sweeps.sweep()
+        np.testing.assert_allclose(sweeps.x.get(), y, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(sweeps.before.get(), before, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(sweeps.carry.get(), carry, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(sweeps.r.get(), r, rtol=0, atol=1e-5)
+        if sweep > 0:
+            np.testing.assert_allclose(sweeps.r.get(), b - S @ before, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("form", helpers.ROWS)
@@ -93,19 +109,21 @@ def test_many_strips_on_many_threads_repeat_to_the_bit(device, form):
     M = np.random.default_rng(1).random((800, 800), np.float32) / 800
     if form == "csr":
         M[M > 0.2 / 800] = 0
-    relax, found = relaxation(IdentityPlus(helpers.FORMATS[form](device, M)), "sor", 2, 1.0), []
-    _, x, b = sweeps_of(relax, None)  # the same each time
+    relax = relaxation(IdentityPlus(helpers.FORMATS[form](device, M)), "sor", 2, 1.0)
+    # The same each time.
+    _, x, b = sweeps_of(relax, None)
+    iterates = []
     for _ in range(5):
         sweeps, _, _ = sweeps_of(relax, None)
         for _ in range(4):
             sweeps.sweep()
-        found.append(sweeps.x.get())
+        iterates.append(sweeps.x.get())
     S = np.eye(800) + M.astype(np.float64)
     for _ in range(4):
         x = scipy.linalg.solve_triangular(S, b - np.triu(S, 1) @ x, lower=True)
-    np.testing.assert_allclose(found[0], x, rtol=0, atol=1e-5)
-    for other in found[1:]:
-        helpers.same_bits(found[0], other)
+    np.testing.assert_allclose(iterates[0], x, rtol=0, atol=1e-5)
+    for other in iterates[1:]:
+        helpers.same_bits(iterates[0], other)
 
 
 @pytest.mark.parametrize("k", [1, 3])
@@ -113,14 +131,19 @@ def test_many_strips_on_many_threads_repeat_to_the_bit(device, form):
 @pytest.mark.parametrize("name", ["1x1", "53", "empty rows", "runs", "53 in slabs"])
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_steps_meet_their_twin(launch, form, name, parts, k):
-    R, S = matrix_of(launch, form, name)
-    n, parts = len(S), min(parts, len(S))
-    x, r = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
-    steps = Steps(IdentityPlus(R, -1), "southwell", R.device.upload(x), R.device.upload(r), parts)
-    steps.group = launch[1]
+    device, group = launch
+    R, S = matrix_of(device, form, name)
+    n = len(S)
+    parts = min(parts, n)
+    x = gallery.vectors(n, k, 1)
+    r = gallery.vectors(n, k, 2)
+    system = IdentityPlus(R, -1)
+    steps = Steps(system, "southwell", device.upload(x), device.upload(r), parts)
+    steps.group = group
     for picks in (True, True, False, True, False):
         steps.step(picks=picks)
-        x, r = reference.southwell_step(S, parts, x, r) if picks else (x, r)
+        if picks:
+            x, r = reference.southwell_step(S, parts, x, r)
     np.testing.assert_allclose(steps.x.get(), x, rtol=0, atol=1e-5)
     np.testing.assert_allclose(steps.r.get(), r, rtol=0, atol=1e-5)
 

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Operators as plain arrays: the same bits come back, and nothing that arrays say is believed."""
+"""Operators as plain arrays: the same bits come back, and arrays are checked."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import (
     CSR,
+    Basis,
     Compressed,
     Dense,
     IdentityPlus,
@@ -30,76 +33,95 @@ NNZ = gallery.sparse(N, N).nnz
 SYSTEMS = ("core", "rows", "two-sided", "chained", "subset", "nested", "pixels", "pyramid", "two")
 
 
-def _systems(device, core: Any = "csr") -> dict[str, IdentityPlus]:
-    """Every kind of operator and basis that can be kept."""
-    W, order = Wavelet(device, GRID, "db2"), np.random.default_rng(0).permutation(N)
+def core_between(device: Device, form: str, out: Any, into: Any, **options: Any) -> Compressed:
+    """A random core of a format between two bases."""
+    if into is not None:
+        n = into.shape[0]
+    elif out is not None:
+        n = out.shape[0]
+    else:
+        n = N
+    core = helpers.FORMATS[form](device, gallery.sparse(n, n))
+    return Compressed(core, out, into, **options)
+
+
+def make_system(device: Device, name: str, form: str = "csr") -> IdentityPlus:
+    """A system of each kind of operator and basis that can be kept."""
+    order = np.random.default_rng(0).permutation(N)
+    W = Wavelet(device, GRID, "db2")
     C = SubsetBasis(device, GRID, order, of=Wavelet(device, GRID, "haar", 1))
-    V, D = (SubsetBasis(device, GRID, order[:11], of=of) for of in (W, C))
-    Q, P = SubsetBasis(device, GRID, order[:11]), Pyramid(device, GRID)
+    between = partial(core_between, device, form)
+    if name == "core":
+        return IdentityPlus(between(None, None).core)
+    if name == "rows":
+        return IdentityPlus(between(None, W), -1)
+    if name == "two-sided":
+        return IdentityPlus(between(W, W, error=0.25), solution_error=0.5)
+    if name == "chained":
+        return IdentityPlus(between(C, C), weights=np.arange(1.0, N + 1))
+    if name == "subset":
+        some = SubsetBasis(device, GRID, order[:11], of=W)
+        return IdentityPlus(between(some, some, error=0.1), solution_error=0.2)
+    if name == "nested":
+        some = SubsetBasis(device, GRID, order[:11], of=C)
+        return IdentityPlus(between(some, some, error=0.1))
+    if name == "pixels":
+        some = SubsetBasis(device, GRID, order[:11])
+        return IdentityPlus(between(some, some, error=0.1))
+    if name == "pyramid":
+        P = Pyramid(device, GRID)
+        return IdentityPlus(between(P, P, error=0.1, diagonal=np.arange(N)))
+    return IdentityPlus(between(W, C), solution_error=np.inf)
 
-    def kept(out: Any, into: Any, **options: Any) -> Compressed:
-        n = next((W.shape[0] for W in (into, out) if W is not None), N)
-        return Compressed(helpers.FORMATS[core](device, gallery.sparse(n, n)), out, into, **options)
 
-    return {
-        "core": IdentityPlus(kept(None, None).core),
-        "rows": IdentityPlus(kept(None, W), -1),
-        "two-sided": IdentityPlus(kept(W, W, error=0.25), solution_error=0.5),
-        "chained": IdentityPlus(kept(C, C), weights=np.arange(1.0, N + 1)),
-        "subset": IdentityPlus(kept(V, V, error=0.1), solution_error=0.2),
-        "nested": IdentityPlus(kept(D, D, error=0.1)),
-        "pixels": IdentityPlus(kept(Q, Q, error=0.1)),
-        "pyramid": IdentityPlus(kept(P, P, error=0.1, diagonal=np.arange(N))),
-        "two": IdentityPlus(kept(W, C), solution_error=np.inf),
-    }
-
-
-@pytest.mark.parametrize("core", helpers.FORMATS)
+@pytest.mark.parametrize("form", helpers.FORMATS)
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_the_same_bits_come_back(device, name, core):
-    a = _systems(device, core)[name]
+def test_the_same_bits_come_back(device, name, form):
+    a = make_system(device, name, form)
     arrays = stored.to_arrays([a])
     assert all(array.dtype.kind in "fiuU" for array in arrays.values())
     (b,) = stored.from_arrays(device, arrays)
-    assert (a.shape, a.sign, a.error, a.solution_error) == (
-        b.shape,
-        b.sign,
-        b.error,
-        b.solution_error,
-    )
-    assert a.nbytes == b.nbytes
+    for fact in ("shape", "sign", "error", "solution_error", "nbytes"):
+        assert getattr(a, fact) == getattr(b, fact)
     np.testing.assert_array_equal(a.weights, b.weights)
-    for x in (gallery.vectors(N, None), gallery.vectors(N, 3)):
-        on_device = device.upload(x)
-        helpers.same_bits(b.apply(on_device).get(), a.apply(on_device).get())
-        helpers.same_bits(b.apply_transpose(on_device).get(), a.apply_transpose(on_device).get())
+    for k in (None, 3):
+        x = device.upload(gallery.vectors(N, k))
+        helpers.same_bits(b.apply(x).get(), a.apply(x).get())
+        helpers.same_bits(b.apply_transpose(x).get(), a.apply_transpose(x).get())
     if isinstance(a.R, Compressed) and isinstance(b.R, Compressed):
         assert b.R.two_sided == a.R.two_sided
         assert (b.R.known_diagonal is None) == (a.R.known_diagonal is None)
-        for old, new in ((a.R.out, b.R.out), (a.R.into, b.R.into)):
-            if old is not None and new is not None:
-                assert type(old) is type(new)
-                assert (old.name, old.grid, old.orthonormal) == (
-                    new.name,
-                    new.grid,
-                    new.orthonormal,
-                )
+        check_basis(a.R.out, b.R.out)
+        check_basis(a.R.into, b.R.into)
 
 
-def test_what_channels_share_is_kept_and_made_once(device):
+def check_basis(before: Basis | None, after: Basis | None) -> None:
+    """Assert that a basis has come back."""
+    assert type(before) is type(after)
+    if before is not None and after is not None:
+        assert before.name == after.name
+        assert before.grid == after.grid
+        assert before.orthonormal == after.orthonormal
+
+
+def test_bases_and_patterns_of_channels_are_kept_and_made_once(device):
     W = Wavelet(device, GRID, "db2")
     matrix = gallery.sparse(N, N)
-    others = [CSR(device, matrix * scale) for scale in (1, 2, 3)]
-    arrays = stored.to_arrays([IdentityPlus(Compressed(core, W, W)) for core in others])
-    assert sum(name.startswith("basis_") and name.endswith(".name") for name in arrays) == 1
-    found = [S.R for S in stored.from_arrays(device, arrays)]
-    assert len({R.into for R in found if isinstance(R, Compressed)}) == 1
-    assert (
-        len(
-            {R.core.pattern for R in found if isinstance(R, Compressed) and isinstance(R.core, CSR)}
-        )
-        == 1
-    )
+    systems = []
+    for scale in (1, 2, 3):
+        core = CSR(device, matrix * scale)
+        systems.append(IdentityPlus(Compressed(core, W, W)))
+    arrays = stored.to_arrays(systems)
+    assert "basis_0.name" in arrays
+    assert "basis_1.name" not in arrays
+    bases = set()
+    patterns = set()
+    for S in stored.from_arrays(device, arrays):
+        R: Any = S.R
+        bases.add(R.into)
+        patterns.add(R.core.pattern)
+    assert len(bases) == 1
+    assert len(patterns) == 1
 
 
 def test_other_operators_cannot_be_kept(device):
@@ -162,7 +184,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_arrays_are_refused_in_one_line(device, name):
     changes, part = BAD[name]
-    arrays = stored.to_arrays([_systems(device)["two-sided"]]) | changes
+    arrays = stored.to_arrays([make_system(device, "two-sided")]) | changes
     arrays = {key: value for key, value in arrays.items() if value is not None}
     with pytest.raises((InputError, InputTypeError), match=part) as caught:
         stored.from_arrays(device, arrays)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sparse matrices in tiles: what is stored and lost, and what is refused."""
+"""Sparse matrices in tiles: packing, rounding, refusals."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ def decoded(A: Tiles) -> np.ndarray:
     if A.precision == "int8":
         bits = stored["scales"].astype(np.int64)
         values = np.ldexp(values * (8 + bits % 8)[:, None], (bits // 8 - 15 - 3)[:, None])
-    columns, unit = stored["starts"].astype(np.int64), float(stored["unit"])
-    return reference.tile_matvec(stored["pointers"], columns, values * unit, np.eye(A.shape[1]))
+    columns = stored["starts"].astype(np.int64)
+    numbers = values * float(stored["unit"])
+    return reference.tile_matvec(stored["pointers"], columns, numbers, np.eye(A.shape[1]))
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -35,7 +36,8 @@ def decoded(A: Tiles) -> np.ndarray:
 def test_every_kind_and_its_transpose_is_what_it_stands_for(
     device, monkeypatch, name, width, precision
 ):
-    monkeypatch.setattr(helpers, "COLUMNS", (3,))  # others are in test_rows.py
+    # Others are in test_rows.py.
+    monkeypatch.setattr(helpers, "COLUMNS", (3,))
     A = Tiles(device, gallery.SPARSE[name], width, precision)
     assert A.matrix().dtype == np.float64
     helpers.meets_twin(A, decoded(A))
@@ -56,9 +58,8 @@ def test_values_are_rounded_to_nearest(name, width):
     np.testing.assert_array_equal(np.abs(half - exact) <= step / 2, True)
     np.testing.assert_array_equal(np.mod(half, step), 0)
     packed = pack(gallery.SPARSE[name], width, "int8")
-    step = (
-        np.abs(exact).max(axis=1, keepdims=True) / 127 * 1.125
-    )  # of 3 bits of fraction, rounded up
+    # Scales have 3 bits of fraction, rounded up.
+    step = np.abs(exact).max(axis=1, keepdims=True) / 127 * 1.125
     assert np.all(np.abs(packed.decoded() - exact) <= step / 2)
     assert np.abs(packed.codes).max(initial=0) <= 127
 
@@ -68,9 +69,11 @@ def test_values_are_rounded_to_nearest(name, width):
 def test_sizes_of_float32_neither_overflow_nor_vanish(device, exponent, precision):
     a = np.ldexp(1 - 2.0**-24, exponent + 1) if exponent > -126 else np.ldexp(1.0, exponent)
     A = Tiles(device, scipy.sparse.csr_array([[a, a / 2]]), 1, precision)
-    least = 2.0**-119 if precision == "int8" else 2.0**-149  # below, a row has no scale in float32
-    assert np.allclose(A.to_dense(), [[a, a / 2]], rtol=0.01, atol=least)
-    if exponent > -100:  # devices may flush what is smaller
+    # Smaller numbers have no scale in float32.
+    smallest_number = 2.0**-119 if precision == "int8" else 2.0**-149
+    assert np.allclose(A.to_dense(), [[a, a / 2]], rtol=0.01, atol=smallest_number)
+    # Devices may flush smaller numbers.
+    if exponent > -100:
         assert A @ np.array([0.5, 0.0]) == pytest.approx([a / 2], rel=0.01)
 
 
@@ -82,17 +85,18 @@ def test_what_is_lost_is_known(device, name, precision):
     lost = given.toarray() - A.to_dense()
     assert A.quantisation == pytest.approx(np.linalg.norm(lost), rel=1e-12)
     spectral = np.linalg.norm(lost, 2)
-    bound = min(
-        np.linalg.norm(lost), np.sqrt(np.linalg.norm(lost, 1) * np.linalg.norm(lost, np.inf))
-    )
-    assert spectral * (1 - 1e-12) <= A.error == pytest.approx(bound, rel=1e-12)
+    product_bound = np.sqrt(np.linalg.norm(lost, 1) * np.linalg.norm(lost, np.inf))
+    bound = min(np.linalg.norm(lost), product_bound)
+    assert spectral * (1 - 1e-12) <= A.error
+    assert A.error == pytest.approx(bound, rel=1e-12)
     assert A.T.error == A.error
 
 
 def test_tiles_are_the_fewest():
     zeros = scipy.sparse.csr_array(np.ones((2, 40)))
     zeros.data[1:] = 0
-    assert len(pack(zeros, 8).columns) == 1  # stored zeros claim none
+    # Stored zeros claim no tile.
+    assert len(pack(zeros, 8).columns) == 1
     rng = np.random.default_rng(5)
     for columns, width in itertools.product((1, 7, 8, 17, 23), WIDTHS):
         pattern = scipy.sparse.csr_array((rng.random((40, columns)) < 0.3).astype(np.float32))
@@ -107,10 +111,11 @@ def _fewest(places: list[int], width: int) -> int:
     """Least number of stretches that cover the places, by trying every first stretch."""
     if not places:
         return 0
-    firsts = range(places[0] - width + 1, places[0] + 1)
-    return 1 + min(
-        _fewest([p for p in places if p >= first + width], width) for first in firsts[-2:]
-    )
+    counts = []
+    for first in (places[0] - 1, places[0]):
+        left = [place for place in places if place >= first + width]
+        counts.append(_fewest(left, width))
+    return 1 + min(counts)
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -146,7 +151,7 @@ def test_column_indices_of_wide_matrices_are_long(device, monkeypatch, columns, 
         ("unit", lambda a: a * np.nan),
         ("difference", lambda a: a + np.inf),
         ("layout", lambda a: a * [4, 1, 1, 1]),
-        # Formats that older files have.
+        # Layouts and numbers that no kernel reads.
         ("layout", lambda a: np.array([16, 1, 1, 0])),
         ("layout", lambda a: np.array([8, 1, 2, 0])),
         ("precision", lambda a: np.array("bfloat16")),
@@ -160,14 +165,15 @@ def test_stored_arrays_that_do_not_fit_are_refused(device, name, spoil):
 
 def test_the_smallest_that_is_good_enough_is_named(device):
     runs = gallery.SPARSE["stretches"]
-    scattered = scipy.sparse.csr_array(
-        np.where(np.arange(53 * 530).reshape(53, -1) % 31 == 0, 0.3, 0.0)
-    )
+    is_filled = np.arange(53 * 530).reshape(53, -1) % 31 == 0
+    scattered = scipy.sparse.csr_array(np.where(is_filled, 0.3, 0.0))
     for matrix, tolerance in itertools.product((runs, scattered), (0.1, 0.003, 3e-4, 0)):
         norm = scipy.sparse.linalg.norm(matrix.astype(np.float64))
-        kinds = itertools.product(WIDTHS, PRECISIONS)
-        made = [Tiles(device, matrix, width, precision) for width, precision in kinds]
-        good = [A for A in made if A.quantisation <= tolerance * norm or A.precision == "float32"]
-        assert smallest(matrix, tolerance).nbytes == min(A.packed.nbytes for A in good)
+        sizes = []
+        for width, precision in itertools.product(WIDTHS, PRECISIONS):
+            A = Tiles(device, matrix, width, precision)
+            if A.quantisation <= tolerance * norm or precision == "float32":
+                sizes.append(A.packed.nbytes)
+        assert smallest(matrix, tolerance).nbytes == min(sizes)
     assert smallest(scattered, 0.1).width == 1
     assert smallest(runs, 0.1).width > 1

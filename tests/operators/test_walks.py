@@ -67,9 +67,11 @@ SIGNS = (1.0, 1.0, -1.0)
 
 
 def tables_of(device, name: str) -> Tables:
-    Rs = [
-        helpers.FORMATS["dense" if c == 1 else "csr"](device, R) for c, R in enumerate(SCENES[name])
-    ]
+    """Tables of one channel, or linked tables of three, of which the second is dense."""
+    Rs = []
+    for channel, R in enumerate(SCENES[name]):
+        form = "dense" if channel == 1 else "csr"
+        Rs.append(helpers.FORMATS[form](device, R))
     return linked(Rs, SIGNS) if len(Rs) == 3 else tables(*Rs)
 
 
@@ -77,11 +79,10 @@ def drawn(made: Tables, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Column with sign, and chance, of what an alias table draws."""
     start, _, count, _ = made.records.get()[row].tolist()
     entries = made.entries.get()[start : start + count].tolist()
-    own, threshold = (
-        [e >> 23 & 0x7FFFFF for e in entries],
-        np.array([e >> 46 for e in entries]) / 2**18,
-    )
-    targets = np.array([*own, *(e & 0x7FFFFF for e in entries)], np.int64)
+    own = [entry >> 23 & 0x7FFFFF for entry in entries]
+    aliases = [entry & 0x7FFFFF for entry in entries]
+    threshold = np.array([entry >> 46 for entry in entries]) / 2**18
+    targets = np.array([*own, *aliases], np.int64)
     return targets, np.concatenate([threshold, 1 - threshold]) / max(count, 1)
 
 
@@ -105,11 +106,13 @@ def test_tables_draw_like_the_twin(device, name, form):
 
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_tables_of_slabs_and_of_columns(device, small_device, form):
-    A, b = gallery.sparse(37, 37, 0.4).toarray(), gallery.vectors(37, None, 5)
+    A = gallery.sparse(37, 37, 0.4).toarray()
+    b = gallery.vectors(37, None, 5)
     small_device.max_allocation = 2000
-    cut, whole, transposed = (
-        helpers.FORMATS[form](at, M) for at, M in ((small_device, A), (device, A), (device, A.T))
-    )
+    make = helpers.FORMATS[form]
+    cut = make(small_device, A)
+    whole = make(device, A)
+    transposed = make(device, A.T)
     small_device.max_allocation = 1 << 16
     assert len(cut.slabs) > 1
     np.testing.assert_array_equal(squares(cut).to_dense(), np.square(A))
@@ -132,9 +135,10 @@ def test_a_shared_step_is_the_row_of_every_channel_in_the_mean(device, name):
         targets, chances = drawn(made, row)
         entries = links[made.records.get()[row, 0] + (targets >> 1)]
         for sign, R, bits in zip(SIGNS, SCENES[name], entries.T[1:], strict=True):
-            wanted = sign * R[row].astype(np.float64)
-            found = np.bincount(entries[:, 0], chances * bits.view(np.float32), len(wanted))
-            assert np.abs(found - wanted).sum() <= 2**-17 * 3 * np.abs(wanted).sum()
+            expected = sign * R[row].astype(np.float64)
+            weights = chances * bits.view(np.float32)
+            step = np.bincount(entries[:, 0], weights, len(expected))
+            assert np.abs(step - expected).sum() <= 2**-17 * 3 * np.abs(expected).sum()
 
 
 def test_tables_are_made_once_and_live_with_their_matrices(device):
@@ -145,7 +149,8 @@ def test_tables_are_made_once_and_live_with_their_matrices(device):
     assert made is not linked([M, *others[1:]], SIGNS)
     alive = weakref.ref(M)
     del M, made
-    assert alive() is None  # and with it its tables, at once
+    # Its tables are freed with it, at once.
+    assert alive() is None
 
 
 def test_tables_beyond_the_device_are_refused(small_device):
@@ -159,9 +164,8 @@ def test_tables_beyond_the_device_are_refused(small_device):
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_R_is_what_S_has_beside_the_identity(device, form):
     R = gallery.sparse(53, 53, 0.4).toarray()
-    M, S = (
-        helpers.FORMATS[form](device, matrix) for matrix in (R, np.eye(53, dtype=np.float32) + R)
-    )
+    M = helpers.FORMATS[form](device, R)
+    S = helpers.FORMATS[form](device, np.eye(53, dtype=np.float32) + R)
     for sign in (1.0, -1.0):
         assert rows_of_R(IdentityPlus(M, sign), "monte_carlo") == (M, sign)
     made, sign = rows_of_R(S, "monte_carlo")
@@ -179,44 +183,53 @@ def same(found: Sums, total: np.ndarray, squared: np.ndarray) -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_sums_are_those_of_the_twin_to_the_bit(shaped, name, k):
     """k right-hand sides of each channel, one column a channel in turn; five of three take two launches."""
-    made, lengths = tables_of(shaped, name), Lengths.geometric(0.6, -1.0)
-    b, pixels = gallery.vectors(made.shape[0], k * made.channels), np.arange(made.shape[0])[::-1]
+    made = tables_of(shaped, name)
+    lengths = Lengths.geometric(0.6, -1.0)
+    b = gallery.vectors(made.shape[0], k * made.channels)
+    pixels = np.arange(made.shape[0])[::-1]
     found = Walker(made, lengths, SEED).rows(shaped.upload(b), pixels, 70, stream=3)
     assert found.total.shape == b.shape
     arrays = made.records.get(), made.entries.get(), made.channels, made.links and made.links.get()
     chunks = reference.walk_rows(arrays, lengths.steps(), b, pixels, np.arange(70), SEED, 3, CHUNK)
-    same(found, *np.moveaxis(np.add.accumulate(chunks.astype(np.float64), axis=1)[:, -1], -1, 0))
+    sums = np.add.accumulate(chunks.astype(np.float64), axis=1)[:, -1]
+    same(found, *np.moveaxis(sums, -1, 0))
 
 
-@pytest.mark.parametrize("copies", [1, 9])  # few items with a few walks each, or many with many
+# Few items with a few walks each, or many with many.
+@pytest.mark.parametrize("copies", [1, 9])
 @pytest.mark.parametrize("units", [1, 5, 1 << 18])
 @pytest.mark.parametrize("name", ["positive", "alike"])
 def test_no_bit_depends_on_how_it_is_launched(device, shaped, monkeypatch, name, units, copies):
-    b, pixels, lengths = gallery.vectors(29, 9), np.arange(29), Lengths.geometric(0.7, -1.0)
-    wanted = Walker(tables_of(device, name), lengths, SEED).rows(device.upload(b), pixels, 200)
-    monkeypatch.setattr("ltcl.operators.walks._UNITS", units)
-    walker, b = Walker(tables_of(shaped, name), lengths, SEED), shaped.upload(b)
+    b = gallery.vectors(29, 9)
+    pixels = np.arange(29)
+    lengths = Lengths.geometric(0.7, -1.0)
+    walker = Walker(tables_of(device, name), lengths, SEED)
+    expected = walker.rows(device.upload(b), pixels, 200)
+    monkeypatch.setattr("ltcl.operators.walks.MAX_LAUNCH_CHUNKS", units)
+    walker = Walker(tables_of(shaped, name), lengths, SEED)
     many = np.tile(pixels, copies)
-    same(walker.rows(b, many, 200), wanted.total[many], wanted.squares[many])
-    some = walker.rows(b, np.array([28, 3]), 200)  # one pixel does not see another
-    same(some, wanted.total[[28, 3]], wanted.squares[[28, 3]])
+    sums = walker.rows(shaped.upload(b), many, 200)
+    same(sums, expected.total[many], expected.squares[many])
+    # One pixel does not see another.
+    some = np.array([28, 3])
+    sums = walker.rows(shaped.upload(b), some, 200)
+    same(sums, expected.total[some], expected.squares[some])
 
 
 @pytest.mark.parametrize("records", [100, 1 << 22])
 @pytest.mark.parametrize("samples", [1000, 40_000])
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_walks_from_b_are_those_of_the_twin(shaped, monkeypatch, form, samples, records):
-    monkeypatch.setattr("ltcl.operators.walks._RECORDS", max(records, samples // 10))
-    b, made = (
-        gallery.vectors(53, None),
-        tables_of_columns(helpers.FORMATS[form](shaped, EMPTY_ROWS)),
-    )
+    monkeypatch.setattr("ltcl.operators.walks.MAX_LAUNCH_SAMPLES", max(records, samples // 10))
+    b = gallery.vectors(53, None)
+    made = tables_of_columns(helpers.FORMATS[form](shaped, EMPTY_ROWS))
     lengths = Lengths.geometric(0.6, -1.0, from_b=True)
     made.append(shaped.upload(b))
     found = Walker(made, lengths, SEED).columns(samples)
     arrays = made.records.get(), made.entries.get(), 1, None
     ends, scores = reference.walk_columns(arrays, lengths.steps(), 53, np.arange(samples), SEED)
-    scores, ends = scores.astype(np.float64), np.where(scores == 0, 0, ends)
+    ends = np.where(scores == 0, 0, ends)
+    scores = scores.astype(np.float64)
     np.testing.assert_allclose(found.total, np.bincount(ends, scores, 53), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(found.squares, np.bincount(ends, scores**2, 53), rtol=1e-12)
 
@@ -254,14 +267,20 @@ def ring(device, n: int) -> CSR:
 
 @pytest.mark.parametrize("m", [0.1, 0.3, 0.45])
 def test_lengths_are_those_of_eq_24(device, m):
-    """On a ring that no walk gets around: how many get to each place, whose scores are all alike."""
-    n, samples, q = 192, 100_000, m / (1 - m)
+    """No walk gets around the ring: all scores of a place are alike and count its visitors."""
+    n = 192
+    samples = 100_000
+    q = m / (1 - m)
     walker = Walker(tables(ring(device, n)), Lengths.geometric(q, -1.0), SEED)
     sums = walker.rows(device.upload(np.eye(n)), np.array([0]), samples)
     k = np.arange(1, n)
-    expected = samples * q ** (k - 1)  # eq. 24, added up from k on
-    k, expected = k[expected > 10], expected[expected > 10]
-    total, squares = sums.total[0, k], sums.squares[0, k]
+    # eq. 24, added up from k on.
+    expected = samples * q ** (k - 1)
+    is_likely = expected > 10
+    k = k[is_likely]
+    expected = expected[is_likely]
+    total = sums.total[0, k]
+    squares = sums.squares[0, k]
     deviation = np.sqrt(expected * (1 - expected / samples))
     assert np.all(np.abs(total**2 / squares - expected) <= 5 * deviation + 1e-6 * samples)
     np.testing.assert_allclose(squares / total, (-1.0) ** k * samples / expected, rtol=1e-5)
@@ -270,10 +289,12 @@ def test_lengths_are_those_of_eq_24(device, m):
 @pytest.mark.parametrize("go_on", [1.0, 0.999999])
 def test_no_walk_is_longer_than_its_table_of_steps(shaped, go_on):
     """All that reach the last of three steps end there: one more would read behind the table."""
-    c, b = np.array([2.0, -3.0, 5.0]), np.arange(1.0, 8.0)
+    c = np.array([2.0, -3.0, 5.0])
+    b = np.arange(1.0, 8.0)
     walker = Walker(tables(ring(shaped, 7)), Lengths(c, go_on), SEED)
-    found = walker.rows(shaped.upload(b), np.arange(7), 64).mean
-    np.testing.assert_allclose(found, sum(c[k] * np.roll(b, -k - 1) for k in range(3)), rtol=1e-5)
+    mean = walker.rows(shaped.upload(b), np.arange(7), 64).mean
+    expected = sum(c[k] * np.roll(b, -k - 1) for k in range(3))
+    np.testing.assert_allclose(mean, expected, rtol=1e-5)
 
 
 def test_rounding_does_not_grow_with_the_samples(device):
@@ -286,10 +307,12 @@ def test_rounding_does_not_grow_with_the_samples(device):
 
 def test_every_device_draws_the_same_bits(device):
     """Oclgrind, where it is installed, has no prefetch and no fast loads of a vector."""
-    wanted = None
+    lengths = Lengths.geometric(0.6, -1.0)
+    results = []
     for description in ltcl.list_devices():
         other = ltcl.open_device(description.index)
-        walker = Walker(tables_of(other, "signs, empty rows"), Lengths.geometric(0.6, -1.0), SEED)
-        found = walker.rows(other.upload(gallery.vectors(53, 2)), np.arange(53), 70)
-        wanted = wanted or found
-        same(found, wanted.total, wanted.squares)
+        walker = Walker(tables_of(other, "signs, empty rows"), lengths, SEED)
+        b = other.upload(gallery.vectors(53, 2))
+        results.append(walker.rows(b, np.arange(53), 70))
+    for sums in results:
+        same(sums, results[0].total, results[0].squares)

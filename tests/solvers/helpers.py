@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Methods and systems that the tables of this folder run over, and the two ways in which a solve can fail."""
+"""Methods and systems of the tables of this folder, and the two ways in which a solve can fail."""
 
 from __future__ import annotations
 
@@ -18,39 +18,41 @@ from ltcl.errors import ConvergenceError, InputError
 from ltcl.operators import CSR, Compressed, IdentityPlus
 from ltcl.solvers import METHODS as ALL
 from ltcl.solvers import Solution, Status
-from ltcl.solvers.krylov import STATE, Columns  # noqa: F401 - of the tests of kernels
 from tests.bases import Given, rotation, stands_for, two_sided
 from tests.problems import Scene, enclosure
 
 SAMPLED = ("monte_carlo", "hybrid")
-METHODS = tuple(method for method in ALL if method not in SAMPLED)  # those that keep a tolerance
+# Methods that keep a tolerance.
+METHODS = tuple(method for method in ALL if method not in SAMPLED)
 ITERATIVE = tuple(method for method in METHODS if method not in ("direct", "auto"))
-READS_ROWS = (
-    "gauss_seidel",
-    "sor",
-    "block_gauss_seidel",
-    "southwell",
-)  # refuse entries that cannot be read
-N, SOME = 43, 19  # pixels of compressed systems, and coefficients where not all are there
+# Methods that refuse an operator without rows.
+READS_ROWS = ("gauss_seidel", "sor", "block_gauss_seidel", "southwell")
+# pixels of compressed systems, and coefficients where not all are there
+N = 43
+SOME = 19
 CLOSED = enclosure(N, 0.4)  # self-adjoint in the plain inner product, and so on coefficients
 
 
 def by_products(n: int, act: Callable[[np.ndarray], Any], **more: Any) -> LinearOperator:
-    """S, (n, n), of which only products are known, and by its transpose none, but for `more`."""
+    """S, (n, n), known by products alone, without its transpose; `more` is given to SciPy."""
     parts: dict[str, Any] = {"shape": (n, n), "matvec": act, "matmat": act, "dtype": np.float64}
     return LinearOperator(**parts | more)
 
 
+def slow_cases(*values: Any) -> list[Any]:
+    """Parameters of a table that run in CI alone."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+
+
 def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
-    """Options with which a method takes steps even where N is small: one block of all rows solves at once."""
+    """Options for a small N, of which one block of all rows would be solved at once."""
     return {"block": block} if method == "block_gauss_seidel" else {}
 
 
 def force_groups(monkeypatch: Any, device: Device, group: int) -> None:
     """Let all kernels run with work-groups of one size, as far as the device allows it."""
-    monkeypatch.setattr(
-        device, "reductions", {}
-    )  # what was planned for other groups does not fit these
+    # What was planned for other groups does not fit these.
+    monkeypatch.setattr(device, "reductions", {})
     real = Kernel.group
 
     def forced(kernel: Kernel, wanted: Any) -> Any:
@@ -71,7 +73,7 @@ def refused(
 
 
 def failed(S: Any, b: Any, method: str = "auto", **options: Any) -> Solution:
-    """The best iterate of a solve that has to fail; the same comes back where nothing is to be thrown."""
+    """The best iterate of a solve that has to fail."""
     with pytest.raises(ConvergenceError) as caught:
         ltcl.solve(S, b, method, **options)
     s = caught.value.solution
@@ -92,9 +94,8 @@ def compressed(
 
 def subset(device: Device, sign: float = 1.0) -> tuple[IdentityPlus, np.ndarray]:
     """S = I + sign V^T C V with 19 of 43 coefficients, and its float64 matrix."""
-    V = Given(
-        device, rotation(N, 6)[:SOME]
-    )  # row sums are near the spectrum, as free bounds suppose
+    # Row sums are near the spectrum, as free bounds suppose.
+    V = Given(device, rotation(N, 6)[:SOME])
     scene = enclosure(SOME, 0.4)
     R = Compressed(CSR(device, scipy.sparse.csr_array(scene.R if sign > 0 else scene.A)), V, V)
     return IdentityPlus(R, sign), np.eye(N) + sign * stands_for(R)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What `solve` and `matrix_series` refuse: bad input, options out of range, S of which no step exists."""
+"""`solve` and `matrix_series` refuse bad input, options out of range, and S without a step."""
 
 from __future__ import annotations
 
@@ -134,21 +134,21 @@ def product_of(result: Callable[[np.ndarray], Any]) -> LinearOperator:
     return by_products(2, lambda x: result(np.array([[2.0, 0.5], [0.5, 1.0]]) @ x))
 
 
-HALF, BLUE = (
-    IdentityPlus(as_operator(np.eye(3) / 2)),
-    np.pad(np.full((1, 3), np.nan), ((2, 0), (0, 0))),
-)
+HALF = IdentityPlus(as_operator(np.eye(3) / 2))
+BLUE = np.pad(np.full((1, 3), np.nan), ((2, 0), (0, 0)))
 ROWLESS = IdentityPlus(as_operator(aslinearoperator(np.eye(3) / 2)))
 PAIR = np.eye(5)  # has an inverse, its second block of two has none
 PAIR[2:4, 2:4] = [[1.0, 2.0], [2.0, 4.0]]
 PAIR[2, 4] = PAIR[4, 2] = 1.0
 HUGE = IdentityPlus(as_operator(np.outer([0.0, 0.0, 1.0], [2e38] * 3)))
-ONE, MC = np.ones(3), "monte_carlo"
+ONE = np.ones(3)
+HOLE = np.diag([1.0, 1.0, 0.0])
+MC = "monte_carlo"
 Row = tuple[Any, Any, str, dict[str, Any], type[LtclError], str]
 NO_STEPS: list[Row] = [
-    *((S, np.ones(5), "block_gauss_seidel", {"block": 2}, InputError, "'block_gauss_seidel'.* 2 to 3 .*block")
+    *((S, np.ones(5), "block_gauss_seidel", {"block": 2}, InputError, "block_gauss.* 2 to 3 .*block")
       for S in (PAIR, scipy.sparse.csr_array(PAIR))),
-    *((form(np.diag([1.0, 1.0, 0.0])), ONE, method, {}, InputError, rf"'{method}'.*diagonal.* 1 row.* row 2")
+    *((form(HOLE), ONE, method, {}, InputError, rf"'{method}'.*diagonal.* 1 row.* row 2")
       for form in (np.asarray, scipy.sparse.csr_array) for method in ("gauss_seidel", "southwell")),
     *((HUGE, ONE, method, {}, InputError, "R.*row 2.*float32") for method in SAMPLED),
     *((ROWLESS, ONE, method, {}, InputError, f"{method}.*Host") for method in SAMPLED),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Least squares within bounds: as `scipy.optimize.lsq_linear` finds them, and no certificate that lies."""
+"""Least squares within bounds against `scipy.optimize.lsq_linear`, and certificates that hold."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ import ltcl
 from ltcl.operators import Dense, IdentityPlus, Operator
 from ltcl.solvers import Bounded, Status
 from ltcl.solvers.bounded import minimise
+from ltcl.solvers.column_reductions import ColumnReductions
 from tests import gallery, reference
 from tests.problems import enclosure, lambertian
-from tests.solvers.helpers import Columns, force_groups
+from tests.solvers.helpers import force_groups
 
 random = np.random.default_rng(60)
 SHAPES = [(1, 1), (1, 5), (53, 5), (257, 3), (5_001, 1)]
@@ -28,7 +29,8 @@ def within(
     A: np.ndarray | Operator, b: np.ndarray, lower: Any, upper: Any, x0: Any = 0.0, **options: Any
 ) -> Bounded:
     """`minimise` with bounds and a start that may be of all pixels alike."""
-    n, S = A.shape[1], Dense(ltcl.open_device(), A) if isinstance(A, np.ndarray) else A
+    n = A.shape[1]
+    S = Dense(ltcl.open_device(), A) if isinstance(A, np.ndarray) else A
     lower, upper = (np.broadcast_to(bound, n).astype(float) for bound in (lower, upper))
     return minimise(
         S, b, lower, upper, np.broadcast_to(x0, (n, b.shape[1])).astype(float), **options
@@ -62,24 +64,31 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     x = lower[:, None] + (upper - lower)[:, None] * random.random((rows, k)).astype(np.float32)
     x = np.where(random.random((rows, k)) < 0.3, lower[:, None], np.minimum(x, upper[:, None]))
     q, g, d, h, r, Ad, w = (gallery.vectors(rows, k, seed) for seed in range(7, 14))
-    q[random.random((rows, k)) < 0.1], w = 0, np.square(w)
+    q[random.random((rows, k)) < 0.1] = 0
+    w = np.square(w)
     Q, G, D, H, R, Y, W, X, L, U = (
         device.upload(part) for part in (q, g, d, h, r, Ad, w, x, lower, upper)
     )
-    columns = Columns(X, *NAMES)
-    slices, tolerance = columns.slices, reference.gamma(rows / 64 + 40) * 8 * rows
+    columns = ColumnReductions(X, *NAMES)
+    slices = columns.slices
+    tolerance = reference.gamma(rows / 64 + 40) * 8 * rows
     start = np.zeros((4 + 3 * slices, k))
     start[:3] = np.linspace(0.2, 1.0, k), np.linspace(0.5, 1.0, k), np.linspace(0.3, 0.9, k)
-    numbers, rest = device.upload(start), device.upload(np.zeros(k), np.int32)
-    sums, squares = columns.sums(3), columns.sums(1)
+    numbers = device.upload(start)
+    rest = device.upload(np.zeros(k), np.int32)
+    sums = columns.sums(3)
+    squares = columns.sums(1)
 
-    columns.bind("bounded_look", 0, L, U, X, Q, G, H, numbers)()
+    box = {"lower": L, "upper": U, "x": X, "numbers": numbers}
+    columns.bind("bounded_look", restart=0, q=Q, g=G, h=H, **box)()
     new = np.stack([(-q - g) / start[2], -q])
     gap, zh = reference.bounded_look(lower, upper, x, new[1], new[0])
     looks = numbers.get()[4 : 4 + 2 * slices].reshape(slices, 2, k).sum(axis=0)
     np.testing.assert_allclose(looks, [gap, zh], rtol=0, atol=4 * tolerance)
 
-    columns.bind("bounded_direction", slices, rest, numbers, L, U, X, G, D, sums, extra=2)()
+    columns.bind(
+        "bounded_direction", extra=2, slices=slices, resting=rest, g=G, d=D, sums=sums, **box
+    )()
     step, (gd, dd, share) = reference.bounded_direction(
         start[0], -looks[1] / start[1], lower, upper, x, new[1], d
     )
@@ -88,17 +97,32 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     np.testing.assert_allclose(found[:, :2].sum(axis=0), [gd, dd], rtol=1e-3, atol=tolerance)
     np.testing.assert_allclose(found[:, 2].max(axis=0), share, rtol=1e-3)
 
-    columns.bind("vector_dots", 0, 0, 1, W, Y, Y, Y, squares)()
+    columns.bind(
+        "vector_dots", first=0, pairs=0, weighted=1, weights=W, a=Y, b=Y, c=Y, partials=squares
+    )()
     (curvature,) = reference.vector_dots([(Ad, Ad)], w)
     np.testing.assert_allclose(squares.get().sum(axis=0), curvature, rtol=1e-4)
 
     V = R.like()
     columns.bind(
-        "bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4
+        "bounded_move",
+        extra=4,
+        height=rows,
+        slices=slices,
+        weighted=1,
+        sums=sums,
+        curvatures=squares,
+        d=D,
+        w=W,
+        Ad=Y,
+        r=R,
+        u=V,
+        **box,
     )()
     with np.errstate(divide="ignore", invalid="ignore"):
         length = np.where(gd < 0, np.fmin(-gd / curvature, np.fmax(1 / share, 1)), 0.0)
-    moved, left = reference.bounded_move(length, lower, upper, step, x), r - length * Ad
+    moved = reference.bounded_move(length, lower, upper, step, x)
+    left = r - length * Ad
     np.testing.assert_allclose(numbers.get()[2], length, rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(X.get(), moved, rtol=0, atol=1e-3)
     np.testing.assert_allclose(R.get(), left, rtol=0, atol=1e-3 * (1 + length.max()))
@@ -115,8 +139,10 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     "seed", [0, 79]
 )  # of the second, lengths and steps once took turns for ever
 def test_it_finds_the_least_squares(rho, weighted, bright, seed):
-    S, random = lambertian(60, rho, seed=3).S.astype(np.float32), np.random.default_rng(seed)
-    lower, upper = np.zeros(60), random.uniform(0.3, 0.9, 60)
+    S = lambertian(60, rho, seed=3).S.astype(np.float32)
+    random = np.random.default_rng(seed)
+    lower = np.zeros(60)
+    upper = random.uniform(0.3, 0.9, 60)
     lower[5] = upper[5] = 0.0  # a masked pixel
     b = bright * (S @ np.clip(random.uniform(-0.5, 1.2, (60, 3)), -0.3, 1.0))
     w = random.uniform(0.0, 2.0, (60, 3)) if weighted else np.ones((60, 3))
@@ -143,7 +169,7 @@ def test_it_finds_the_least_squares(rho, weighted, bright, seed):
     scale=st.sampled_from([1e-12, 1.0, 1e9]),
 )
 def test_never_above_the_start_and_never_certified_too_low(seed, shape, k, scale):
-    """Of any matrix: each certificate holds, at whatever step the solve is cut off."""
+    """Each certificate holds for any matrix, at whatever step the solve is cut off."""
     rng = np.random.default_rng(seed)
     A = rng.normal(size=shape).astype(np.float32)
     b = scale * rng.normal(size=(shape[0], k))
@@ -163,7 +189,7 @@ def test_never_above_the_start_and_never_certified_too_low(seed, shape, k, scale
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_bent_direction_starts_conjugacy_anew(seed):
-    """Without, some of these take ten times as many steps, or none of all that are allowed helps."""
+    """Otherwise some of these take ten times as many steps, or do not converge."""
     S = enclosure(60, 0.8, seed=seed).S.astype(np.float32)
     b = S @ np.random.default_rng(seed).uniform(-1, 2, (60, 1))
     assert within(S, b, 0, 1, 0.5, rtol=1e-4, maxiter=40).converged
@@ -184,7 +210,8 @@ def test_a_bound_that_means_none_hides_nothing(far):
     """The certificate is worth little then, the answer is not."""
     S = lambertian(30, 2.0).S.astype(np.float32)
     b = S @ random.uniform(-0.5, 1.0, (30, 1))
-    s, best = within(S, b, 0, far, rtol=1e-4), errors(S, exact(S, b, 0, 10), b)
+    s = within(S, b, 0, far, rtol=1e-4)
+    best = errors(S, exact(S, b, 0, 10), b)
     assert (errors(S, s.x, b) <= best * (1 + 1e-4)).all()
     assert (s.least <= best * (1 + 1e-6)).all()
 
@@ -198,7 +225,8 @@ def test_black_is_reached_by_the_darkest_light():
 
 
 def test_what_ends_a_solve():
-    S, seen = lambertian(40, 4.0).S.astype(np.float32), []
+    S = lambertian(40, 4.0).S.astype(np.float32)
+    seen = []
     b = S @ random.uniform(-1, 2, (40, 1))
     s = within(S, b, 0, 1, rtol=1e-4, maxiter=3, callback=lambda i, gap: seen.append(gap))
     assert (s.status, s.iterations, len(seen)) == (Status.MAXITER, 3, 4)
@@ -211,10 +239,11 @@ def test_what_ends_a_solve():
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_column_that_float32_has_lost_is_not_certified(device, seed):
-    """S = T F^-1 with F far above T: of x = F p, rounding of (I + R) x hides more than the residual."""
+    """S = T F^-1 with F far above T: for x = F p, rounding of S x hides more than the residual."""
     rng = np.random.default_rng(seed)
     T = rng.uniform(0.0, 0.3, (2, 2)) + np.diag(rng.uniform(0.2, 1.0, 2))
-    F, b = np.diagonal(T) * (1e6, 1e-6), rng.uniform(0.0, 1.0, (2, 1))
+    F = np.diagonal(T) * (1e6, 1e-6)
+    b = rng.uniform(0.0, 1.0, (2, 1))
     s = within(IdentityPlus(Dense(device, T / F - np.eye(2))), b, 0, F, 0.5 * F[:, None], rtol=1e-3)
     assert (s.least <= errors(T, exact(T, b, 0, 1), b) + 1e-6).all()
     assert (errors(T, s.x / F[:, None], b) <= s.least + s.gap * np.linalg.norm(b) + 1e-6).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Solves on coefficients of a compressed S; refinement, where it makes the steps and the exact S judges."""
+"""Solves on coefficients of a compressed S, and refinement judged by the exact S."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ rng = np.random.default_rng(5)
 
 
 def transforms(monkeypatch, W):
-    """Those that are made from here on, one entry each."""
-    made, original = [], W._product
-    monkeypatch.setattr(W, "_product", lambda *arguments: made.append(original(*arguments)))
+    """The list of transforms from here on, one entry each."""
+    made = []
+    original = W._queue_product
+    monkeypatch.setattr(W, "_queue_product", lambda *arguments: made.append(original(*arguments)))
     return made
 
 
@@ -77,7 +78,7 @@ def test_residuals_are_relative_to_the_whole_of_b(device, method):
 
 
 def test_cg_keeps_its_inner_product(device, monkeypatch):
-    """diag(w) in pixels is W diag(w) W^T in coefficients: no diagonal, so cg stays in pixels there."""
+    """diag(w) in pixels is not diagonal in coefficients, W diag(w) W^T: cg stays in pixels."""
     S, truth = compressed(device, SKEW, keep=1.0, weights=SKEW.weights)
     b = rng.uniform(0.0, 1.0, (N, 3))
     made = transforms(monkeypatch, S.R.into)  # pyright: ignore[reportAttributeAccessIssue]
@@ -86,6 +87,15 @@ def test_cg_keeps_its_inner_product(device, monkeypatch):
     assert residual(truth, s.x, b) <= 1e-5 * (1 + 5e-2)
     dense = IdentityPlus(Dense(device, truth - np.eye(N)), weights=SKEW.weights)
     assert s.iterations == ltcl.solve(dense, b, "cg", rtol=1e-5).iterations
+
+
+@pytest.mark.parametrize("method", ["chebyshev", "gmres"])
+def test_a_compressed_operator_without_identity_stays_in_pixels(device, method):
+    """W^T C W is singular if W leaves coefficients out; their light is not claimed as solved."""
+    S, _ = subset(device)
+    b = rng.uniform(0.5, 1.0, N)
+    s = ltcl.solve(S.R, b, method, rtol=1e-2, throw=False)
+    assert not s.converged
 
 
 def ordered_wavelet(device, grid):
@@ -126,14 +136,16 @@ def test_auto_plans_in_pixels_and_runs_on_coefficients(device, basis, kind, colu
 def test_products_of_both_are_counted(device):
     made: list[np.ndarray] = []
     exact = by_products(N, lambda x: made.append(x) or EXACT @ x)
-    S, b = compressed(device)[0], rng.uniform(0.0, 1.0, (N, 2))
+    S = compressed(device)[0]
+    b = rng.uniform(0.0, 1.0, (N, 2))
     s = ltcl.solve(S, b, "chebyshev", rtol=1e-5, exact=exact)
     assert len(made) == s.iterations  # the start costs none
     assert s.products >= 2 * s.iterations
 
 
 def test_a_start_and_units_are_kept(device):
-    (S, _), b = compressed(device), rng.uniform(0.5, 1.0, (N, 2)) * (1e-30, 1e30)
+    (S, _) = compressed(device)
+    b = rng.uniform(0.5, 1.0, (N, 2)) * (1e-30, 1e30)
     x = np.linalg.solve(EXACT, b)
     s = ltcl.solve(S, b, "gmres", rtol=1e-5, exact=EXACT, x0=x)
     assert s.iterations == 0
@@ -179,7 +191,8 @@ def test_below_float32_it_refines_in_float64(device, kind, rtol):
 )
 @pytest.mark.parametrize("method", ["gmres", "auto"])
 def test_below_what_rounding_leaves_it_stagnates(device, make, rtol, most, method):
-    S, b = compressed(device)[0], rng.uniform(0.0, 1.0, N)
+    S = compressed(device)[0]
+    b = rng.uniform(0.0, 1.0, N)
     s = ltcl.solve(S, b, method, rtol=rtol, exact=make(device), throw=False)
     assert s.status is Status.STAGNATED
     assert s.residual < most

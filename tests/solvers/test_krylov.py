@@ -12,14 +12,16 @@ import pytest
 import scipy.linalg
 
 import ltcl
-from ltcl.device import Array
+from ltcl.device import Array, vectors
 from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
 from ltcl.solvers.bounded import minimise
+from ltcl.solvers.column_reductions import ColumnReductions
+from ltcl.solvers.krylov_state import STATE_ROWS
 from tests import gallery, reference
 from tests.bases import rotation
 from tests.problems import enclosure, lambertian, residual
-from tests.solvers.helpers import STATE, Columns, force_groups
+from tests.solvers.helpers import force_groups
 
 random = np.random.default_rng(71)
 
@@ -43,7 +45,8 @@ def test_columns_do_not_know_of_each_other(device, method, options):
 @pytest.mark.parametrize("method", ["cg", "bicgstab"])
 def test_a_broken_column_leaves_the_others_their_solution(device, method):
     first = np.zeros((1, 1)) if method == "cg" else [[0.0, 1.0], [-1.0, 0.0]]
-    S, n = scipy.linalg.block_diag(first, np.diag([1.0, 2.0, 4.0])), len(first)
+    S = scipy.linalg.block_diag(first, np.diag([1.0, 2.0, 4.0]))
+    n = len(first)
     b = np.stack([np.append(np.zeros(n), np.ones(3)), np.append(np.ones(n), np.zeros(3))], axis=1)
     s = ltcl.solve(as_operator(S, device), b, method, rtol=1e-5, throw=False)
     assert s.status is (Status.INDEFINITE if method == "cg" else Status.NO_STEP)
@@ -59,7 +62,7 @@ def krylov_basis(S: np.ndarray, b: np.ndarray, k: int) -> np.ndarray:
 
 
 def least_energy(S: np.ndarray, b: np.ndarray, k: int, weights: np.ndarray) -> np.ndarray:
-    """The iterate of CG: its error is orthogonal to the space in <x, S y> with weights (Saad, 6.7)."""
+    """The iterate of CG: its error is orthogonal to the space in <x, S y> (Saad, section 6.7)."""
     V = krylov_basis(S, b, k)
     left = V.T * weights
     return V @ np.linalg.solve(left @ S @ V, left @ b)
@@ -73,9 +76,12 @@ def least_residual(S: np.ndarray, b: np.ndarray, k: int, _: np.ndarray) -> np.nd
 
 def van_der_vorst(S: np.ndarray, b: np.ndarray, k: int, _: np.ndarray) -> np.ndarray:
     """BiCGStab from 0 with r_0* = b."""
-    x, r, p = np.zeros_like(b), b.copy(), b.copy()
+    x = np.zeros_like(b)
+    r = b.copy()
+    p = b.copy()
     for _step in range(k):
-        rho, v = r @ b, S @ p
+        rho = r @ b
+        v = S @ p
         alpha = rho / (v @ b)
         s = r - alpha * v
         t = S @ s
@@ -95,16 +101,18 @@ TEXTBOOKS: dict[str, tuple[Callable[..., np.ndarray], int]] = {  # products of a
 
 @pytest.mark.parametrize("steps", [1, 2, 4])
 @pytest.mark.parametrize(("method", "rho", "skew"), [
-    ("cg", 0.8, 0.0), ("cg", 4.0, 0.0), ("gmres", 4.0, 0.0), ("gmres", 0.5, 1 / 8), ("bicgstab", 4.0, 0.0),
-    ("bicgstab", 4.0, 0.1),
+    ("cg", 0.8, 0.0), ("cg", 4.0, 0.0), ("gmres", 4.0, 0.0), ("gmres", 0.5, 1 / 8),
+    ("bicgstab", 4.0, 0.0), ("bicgstab", 4.0, 0.1),
 ])  # fmt: skip
 def test_iterates_are_those_of_the_textbook(device, method, rho, skew, steps):
     random = np.random.default_rng(
         1
     )  # residuals fall at every step: the best iterate is the last one
     scene = lambertian(40, rho, 29)
-    S, b = scene.S + skew * random.normal(size=(40, 40)), random.normal(size=(40, 2))
-    weights, (iterate, products) = scene.weights, TEXTBOOKS[method]
+    S = scene.S + skew * random.normal(size=(40, 40))
+    b = random.normal(size=(40, 2))
+    weights = scene.weights
+    (iterate, products) = TEXTBOOKS[method]
     options: dict[str, Any] = {"weights": 2.0**200 * weights} if method == "cg" else {}
     s = ltcl.solve(
         as_operator(S, device), b, method, maxiter=steps, rtol=1e-6, throw=False, **options
@@ -121,7 +129,8 @@ def test_a_transport_brings_its_weights(device):
     scene = ltcl.scenes.box(6, sides=5, albedo=(0.1, 0.9, 0.3, 0.95, 0.6))
     T = scene.transport(device=device)
     (S,) = T.systems
-    dense, n = S.to_dense(), T.shape[1]
+    dense = S.to_dense()
+    n = T.shape[1]
     b = dense @ random.uniform(size=n)
     s = ltcl.solve(S, b, "cg", rtol=1e-4)
     assert residual(dense, s.x, b) <= 1e-4 * (1 + 1e-2)
@@ -173,9 +182,14 @@ def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k
     launches, waits, options = STEPS[method]
     Q = rotation(200)
     S = IdentityPlus(Dense(device, (Q * np.logspace(0, 3, 200)) @ Q.T - np.eye(200)))
-    b, weights = random.normal(size=(200, k)), random.uniform(0.5, 1.5, (200, k))
-    waited, taken, counts = [], [], []
-    read, write, empty = Array.get, Array.set, type(device).empty
+    b = random.normal(size=(200, k))
+    weights = random.uniform(0.5, 1.5, (200, k))
+    waited = []
+    taken = []
+    counts = []
+    read = Array.get
+    write = Array.set
+    empty = type(device).empty
     monkeypatch.setattr(Array, "get", lambda array: waited.append(array) or read(array))
     monkeypatch.setattr(
         Array, "set", lambda array, values: waited.append(array) or write(array, values)
@@ -215,11 +229,14 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     V = np.stack([gallery.vectors(rows, k, seed) for seed in range(6)])
     w, u, weights = (gallery.vectors(rows, k, seed) for seed in range(6, 9))
     on_device = device.upload(np.concatenate([V.reshape(6, -1), np.zeros((1, rows * k))]))
-    W, U, weighing = device.upload(w), device.upload(u), device.upload(weights)
-    columns = Columns(W, "vector_dots", "krylov_subtract")
+    W = device.upload(w)
+    U = device.upload(u)
+    weighing = device.upload(weights)
+    columns = ColumnReductions(W, "vector_dots", "krylov_subtract")
     tolerance = reference.gamma(rows + 40) * rows * 30
     sums = columns.sums(7)
-    columns.bind("vector_dots", 0, 0, 0, W, on_device, W, W, sums, across=7)()
+    plain = {"first": 0, "weighted": 0, "weights": W}
+    columns.bind("vector_dots", across=7, pairs=0, a=on_device, b=W, c=W, partials=sums, **plain)()
     found = sums.get().reshape(columns.slices, 7, k).sum(axis=0)
     np.testing.assert_allclose(
         found,
@@ -229,7 +246,18 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     )
 
     pairs = columns.sums(2)
-    columns.bind("vector_dots", 0, 0b1010_0100, 1, weighing, W, U, U, pairs, across=2)()
+    columns.bind(
+        "vector_dots",
+        across=2,
+        first=0,
+        pairs=vectors.dot_pairs("ab", "cc"),
+        weighted=1,
+        weights=weighing,
+        a=W,
+        b=U,
+        c=U,
+        partials=pairs,
+    )()
     found = pairs.get().reshape(columns.slices, 2, k).sum(axis=0)
     wanted = reference.vector_dots([(w, u), (u, u)], weights)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance)
@@ -238,11 +266,21 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     small = np.linspace(-1e-3, 1e-3, 7 * k).reshape(7, k).astype(np.float32)
     small[6] = 4.0  # <w, w>
     for again, finish in ((0, 0), (1, 1)):
-        out, arguments = (
-            W.like(),
-            (6, 1, again, finish, device.upload(small), before, h, on_device, W),
-        )
-        columns.bind("krylov_subtract", *arguments, out, extra=8)()
+        out = W.like()
+        columns.bind(
+            "krylov_subtract",
+            extra=8,
+            count=6,
+            slices=1,
+            second_pass=again,
+            unit_length=finish,
+            partials=device.upload(small),
+            first_pass=before,
+            h=h,
+            V=on_device,
+            w=W,
+            out=out,
+        )()
         wanted = reference.krylov_subtract(V, w, small[:6], small[6] if finish else None)
         np.testing.assert_allclose(out.get(), wanted, rtol=0, atol=1e-5)
         np.testing.assert_allclose(
@@ -259,8 +297,12 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
 def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     force_groups(monkeypatch, device, group)
     vectors = [gallery.vectors(rows, k, seed) for seed in range(7)]
-    columns = Columns(device.upload(vectors[0]), "krylov_cg", "krylov_half", "krylov_bicgstab")
-    slices, rest, ones = columns.slices, np.arange(k) % 3 == 1, np.ones(k)
+    columns = ColumnReductions(
+        device.upload(vectors[0]), "krylov_cg", "krylov_half", "krylov_bicgstab"
+    )
+    slices = columns.slices
+    rest = np.arange(k) % 3 == 1
+    ones = np.ones(k)
     close: dict[str, Any] = {"rtol": 1e-5, "atol": 1e-4}
 
     def summed(*totals: float) -> tuple[np.ndarray, Array]:
@@ -279,12 +321,22 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
         return numbers.set(values)
 
     def squares(numbers: Array) -> np.ndarray:
-        return numbers.get()[STATE : STATE + slices].sum(axis=0)
+        return numbers.get()[STATE_ROWS : STATE_ROWS + slices].sum(axis=0)
 
     sums, partials = summed(0.9, 1.3)
-    numbers, arrays = state(_0=2.0, _1=0.7), [device.upload(v) for v in vectors[:5]]
+    numbers = state(_0=2.0, _1=0.7)
+    arrays = [device.upload(v) for v in vectors[:5]]
     resting = device.upload(rest, np.int32)
-    columns.bind("krylov_cg", slices, 0, 0, resting, partials, numbers, *arrays, extra=2)()
+    shared = {"slices": slices, "iteration": 0, "state": numbers}
+    columns.bind(
+        "krylov_cg",
+        extra=2,
+        restart=0,
+        resting=resting,
+        partials=partials,
+        **dict(zip("wpqxr", arrays, strict=True)),
+        **shared,
+    )()
     alpha, *wanted = reference.krylov_cg(sums, 2.0 * ones, 0.7 * ones, ~rest, *vectors[:5])
     for array, new in zip(arrays[1:], wanted, strict=True):
         np.testing.assert_allclose(array.get(), new, **close)
@@ -297,12 +349,13 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     R, V, H, T, P, X, G = (device.upload(u) for u in vectors)
     (sigma, _), two = summed(1.7, 2.0)
     numbers = state(_0=1.2, _9=3.0, _10=2.0)
-    columns.bind("krylov_half", slices, 0, two, numbers, R, V, H, extra=2)()
+    shared |= {"state": numbers, "r": R, "v": V, "half_way": H}
+    columns.bind("krylov_half", extra=2, partials=two, **shared)()
     half = reference.krylov_half(1.2 * ones, sigma, r, v)
     np.testing.assert_allclose(H.get(), half, **close)
     five, partials = summed(0.8, 1.1, 1.5, 0.6, 2.5)
-    arguments = (slices, 0, partials, numbers, two, G, H, T, V, P, X, R)
-    columns.bind("krylov_bicgstab", *arguments, extra=5)()
+    more = {"partials": partials, "next_partials": two, "g": G, "t": T, "p": P, "x": X}
+    columns.bind("krylov_bicgstab", extra=5, **more, **shared)()
     rho, *wanted = reference.krylov_bicgstab(five[:4], 1.2 * ones, 1.2 / sigma, half, t, v, p, x)
     np.testing.assert_allclose(numbers.get()[4], rho, rtol=1e-5)
     for array, new in zip((X, R, P), wanted, strict=True):

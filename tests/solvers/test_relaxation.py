@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Relaxation is that of the textbook, row by row and block by block, and converges where Jacobi does not."""
+"""Relaxation is the textbook's, by rows and by blocks, and converges where Jacobi does not."""
 
 from __future__ import annotations
 
@@ -35,9 +35,11 @@ random = np.random.default_rng(3)
 @pytest.mark.parametrize("name", OPTIONS)
 @FORMS
 def test_k_iterations_are_k_sweeps(device, form, name, dual, sweeps):
-    (method, options), (matrix, sign) = OPTIONS[name], DUALS[dual]
+    (method, options) = OPTIONS[name]
+    (matrix, sign) = DUALS[dual]
     b = random.uniform(0.0, 1.0, (SCENE.n, 5))
-    x0, S = random.normal(size=b.shape), np.eye(SCENE.n) + sign * matrix
+    x0 = random.normal(size=b.shape)
+    S = np.eye(SCENE.n) + sign * matrix
     A = IdentityPlus(as_operator(form(matrix), device), sign)
     s = ltcl.solve(
         A, b, method, **options, x0=x0, rtol=1e-7, atol=1e-30, maxiter=sweeps, throw=False
@@ -61,7 +63,8 @@ def test_k_iterations_are_k_sweeps(device, form, name, dual, sweeps):
 )
 def test_they_converge_where_jacobi_diverges(device, make, rho):
     scene = make(rho)
-    S, b = IdentityPlus(Dense(device, scene.R)), scene.S @ random.uniform(0.0, 1.0, scene.n)
+    S = IdentityPlus(Dense(device, scene.R))
+    b = scene.S @ random.uniform(0.0, 1.0, scene.n)
     assert ltcl.solve(S, b, "jacobi", throw=False).status is Status.DIVERGED
     table: list[tuple[str, dict[str, Any]]] = [*OPTIONS.values(), ("southwell", {"rows": 1})]
     for method, options in table:
@@ -92,9 +95,11 @@ def test_what_one_sweep_solves(device, form):
 @pytest.mark.parametrize("dual", DUALS)
 def test_one_row_a_step_is_the_textbook_of_southwell(device, dual):
     matrix, sign = DUALS[dual]
-    S, b = np.eye(SCENE.n) + sign * matrix, random.uniform(0.0, 1.0, (SCENE.n, 2))
+    S = np.eye(SCENE.n) + sign * matrix
+    b = random.uniform(0.0, 1.0, (SCENE.n, 2))
     s = ltcl.solve(S, b, "southwell", rows=1, maxiter=2, rtol=1e-6, throw=False)
-    x, r = np.zeros_like(b), b
+    x = np.zeros_like(b)
+    r = b
     for _ in range(2 * SCENE.n):
         x, r = reference.southwell_step(S, 1, x, r)
     np.testing.assert_allclose(s.x, x, rtol=0, atol=1e-5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`solve`: every method on every operator, compressed and refined ones too, in any units of light."""
+"""`solve`: every method on every operator, compressed and refined ones, in any unit of light."""
 
 from __future__ import annotations
 
@@ -77,7 +77,8 @@ def test_every_method_on_every_operator(device, method, name, columns):
     """S^-1 removes all bounces and (I - A)^-1 adds them: the same call (eq. 4 and 7)."""
     make, slack = SYSTEMS[name]
     A, S, options = make(device)
-    options, b = {"rtol": 1e-4} | options, random.uniform(0.0, 1.0, (N, *columns))
+    options = {"rtol": 1e-4} | options
+    b = random.uniform(0.0, 1.0, (N, *columns))
     if method in READS_ROWS and "host" in name:
         refused(f"'{method}'.*Host", A, b, method)
         return
@@ -101,11 +102,9 @@ def test_every_method_on_every_operator(device, method, name, columns):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e25])
 def test_units_of_light_do_not_matter(device, method, scale):
-    """Squares of these values leave float32; each column keeps its own tolerance, and a dark one is dark."""
-    S, b = (
-        as_operator(SCENE.S, device),
-        random.uniform(0.5, 1.0, (N, 4)) * (1.0, 1e-5, 1e5, 0.0) * scale,
-    )
+    """Squares of these values leave float32; each column keeps its own tolerance."""
+    S = as_operator(SCENE.S, device)
+    b = random.uniform(0.5, 1.0, (N, 4)) * (1.0, 1e-5, 1e5, 0.0) * scale
     s = ltcl.solve(S, b, method, rtol=1e-4)
     assert residual(SCENE.S, s.x.astype(np.float64) / scale, b / scale) <= 1e-4 * (1 + 1e-3)
     assert not s.x[:, 3].any()
@@ -125,7 +124,7 @@ def test_light_beyond_float32_is_not_lost(device, method, size):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_without_light_x_is_0_and_takes_no_iteration(device, method):
-    """Of any start, whose residual underflows, and of a singular S."""
+    """It holds for any start, whose residual underflows, and for a singular S."""
     s = ltcl.solve(as_operator(SCENE.S, device), np.zeros((N, 2)), method)
     assert s.converged
     assert not s.x.any()

@@ -30,7 +30,7 @@ random = np.random.default_rng(3)
 )
 @PLAIN
 def test_k_steps_are_k_terms(device, method, options, matrix, sign, terms):
-    """Of I - R + R^2 - ... (eq. 10) on S = I + R, and of I + A + A^2 + ... (eq. 4) on I - A."""
+    """The series are I - R + R^2 - ... (eq. 10) and, on I - A, I + A + A^2 + ... (eq. 4)."""
     b = random.uniform(0.0, 1.0, (SCENE.n, 2))
     S = IdentityPlus(Dense(device, matrix), sign)
     s = ltcl.solve(S, b, method, rtol=1e-6, maxiter=terms, throw=False, **options)
@@ -64,9 +64,10 @@ def test_past_radius_one_it_diverges_with_its_best_iterate(device, method, optio
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("method", ["richardson", "chebyshev"])
 def test_a_closed_room_takes_no_more_products_than_the_bound(device, method, seed, rho, rtol):
-    """S is symmetric with spectrum in [1 / (1 + m), 1 + rho], so the bound on the residual is strict."""
+    """S is symmetric with spectrum in [1 / (1 + m), 1 + rho], so that the bound is strict."""
     scene = enclosure(40, rho / (1 + rho), seed)
-    S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=(scene.n, 3))
+    S = IdentityPlus(Dense(device, scene.R))
+    b = random.normal(size=(scene.n, 3))
     s = ltcl.solve(S, b, method, rtol=rtol)
     assert residual(scene.S, s.x, b) <= rtol * (1 + 1e-3)
     foreseen = theory.chebyshev_products if method == "chebyshev" else theory.richardson_products
@@ -79,7 +80,7 @@ def test_a_closed_room_takes_no_more_products_than_the_bound(device, method, see
 @pytest.mark.parametrize("rho", [50.0, 200.0])
 @pytest.mark.parametrize("seed", range(8))
 def test_residuals_that_swing_are_not_taken_for_trouble(device, seed, rho, rtol):
-    """Up to an albedo of 0.995; a residual close to 0 by chance is neither a floor nor a start of growth."""
+    """A residual close to 0 by chance is neither a floor nor a start of growth."""
     scene = lambertian(60, rho, seed, density=0.3)
     S = IdentityPlus(Dense(device, scene.R))
     b = scene.S @ random.uniform(0.0, 1.0, scene.n)
@@ -90,7 +91,8 @@ def test_residuals_that_swing_are_not_taken_for_trouble(device, seed, rho, rtol)
 
 def test_true_bounds_help(device):
     scene = enclosure(30, 0.9)
-    S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=scene.n)
+    S = IdentityPlus(Dense(device, scene.R))
+    b = random.normal(size=scene.n)
     spectrum = np.linalg.eigvalsh(scene.S)
     b -= b.mean()  # nothing of the dominant eigenvector, whose eigenvalue is ten times the next
     free = ltcl.solve(S, b, "chebyshev", rtol=1e-3)
@@ -105,7 +107,8 @@ def test_true_bounds_help(device):
 def test_a_few_arnoldi_steps_lose_no_products(device, arnoldi, rho, rtol):
     """They solve as well as they measure."""
     scene = lambertian(60, rho, 9, density=0.3)
-    S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(size=(60, 2))
+    S = IdentityPlus(Dense(device, scene.R))
+    b = random.uniform(size=(60, 2))
     free = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=0)
     refined = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=arnoldi)
     assert residual(scene.S, refined.x, b) <= rtol * (1 + 1e-2)
@@ -154,7 +157,8 @@ def test_every_method_passes_both_ways(device, method, dual, albedo, sides, boun
     """Chebyshev by at most half as many products again as with the true spectrum, and two to learn
     by; wrong bounds are repaired, and not slower than plain damping by far."""
     S, (least, most) = room(albedo, dual, sides)
-    options, A = {} if bounds is None else {"spectrum": bounds}, as_operator(S, device)
+    options = {} if bounds is None else {"spectrum": bounds}
+    A = as_operator(S, device)
     budget = (
         theory.richardson_products(least, 2.0 * most, 1e-3) + 3
     )  # the slowest, to a tenth of rtol

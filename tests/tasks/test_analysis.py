@@ -97,7 +97,14 @@ def test_every_iterative_method_has_an_entry(device):
 
 def test_a_solution_is_reported_without_its_vector():
     one = Solution(
-        np.ones(4), Status.MAXITER, 2, 3, (1.0, 0.5, float("inf")), 0.1, "jacobi", "because"
+        x=np.ones(4),
+        status=Status.MAXITER,
+        iterations=2,
+        products=3,
+        residuals=(1.0, 0.5, float("inf")),
+        seconds=0.1,
+        method="jacobi",
+        reason="because",
     )
     (facts,) = report.solution(one)
     assert (facts["method"], facts["status"], facts["products"]) == ("jacobi", "maxiter", 3)

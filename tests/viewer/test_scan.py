@@ -25,7 +25,7 @@ import pytest
 import ltcl
 from ltcl import errors, images
 from ltcl.acquisition import FolderRig, Project, rigs
-from ltcl.acquisition.agreement import ROUGH_NOISE
+from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.radiometry import Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
@@ -115,9 +115,7 @@ def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
     valid = SimpleNamespace(valid=np.ones(6))
     known: Any = {
         "exposures": (0.1, 0.4),
-        "response": Response.identity(),
-        "noise": ROUGH_NOISE,
-        "offset": 0.0,
+        "camera": CameraModel(response=Response.identity()),
     }
     known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
     scan._calibration = cast(Any, SimpleNamespace(**known))

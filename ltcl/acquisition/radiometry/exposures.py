@@ -200,7 +200,7 @@ def _check_order(stack: ExposureStack, order: np.ndarray) -> None:
 
 
 def _is_brighter(short: np.ndarray, long: np.ndarray, ratio: float, rounding: float) -> bool:
-    """Whether codes (pixels, channels) may have `ratio` times the exposure of others."""
+    """True if codes (pixels, channels) may have `ratio` times the exposure of others."""
     is_clear = np.maximum(short, long) < ORDER_TEST.clipped_code
     rise = (long - short)[is_clear]
     if ratio == 1.0 or rise.size < 2:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scanning T: which pixels are lit when (`columns`, `adaptive`), and T from their `pictures`.
+"""Scanning T: the order in which pixels are lit, and T from the pictures.
 
-plan, report: what a scan takes, what came of it
+columns, adaptive    strategies: batches of columns, or cells that are divided where needed
+pictures             pictures of patterns on the pixels of the scan
+plan, report         photographs, time and errors before a scan; its result after it
 """
 
 from __future__ import annotations

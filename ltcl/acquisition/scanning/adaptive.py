@@ -6,9 +6,9 @@ under white than `threshold` asks for its four children; the light of other cell
 spread evenly over the cell, so that row sums are those of white: T = C W with W the sums over cells
 (`ltcl.operators.Pyramid`).
 
-Cells at which no camera pixel is active twice are lit together (`colour`), a child of each at a
-time. What camera pixels see of the other lit cells is known, and subtracted: C so far, times W
-times the pattern. Then the four children e_k, of variances v_k, must add up to the parent e, of
+Cells at which no camera pixel is active twice are lit together (`colour_cells`), a child of each at
+a time. The light of the other lit cells at a camera pixel is known, and subtracted: C so far, times
+W times the pattern. Then the four children e_k, of variances v_k, must add up to the parent e, of
 variance v:
 
     e_k - v_k r / V,    r = sum_k e_k - e,    V = sum_k v_k + v
@@ -19,21 +19,32 @@ are not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from itertools import islice
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.scanning.columns import all_but_one
-from ltcl.acquisition.scanning.pictures import UNKNOWN, Log, Seen
+from ltcl.acquisition.scanning.pictures import (
+    KNOWN_VARIANCE,
+    UNKNOWN,
+    Picture,
+    ScanCamera,
+    ScanGrid,
+)
+from ltcl.errors import AcquisitionError
+from ltcl.store import BlockStore, CompressedRecord
 from ltcl.transport import first_bounce
 
-AT_ONCE = 16  # patterns of a batch
-_SUBTRACTED = 0.1  # relative error of what is subtracted for other lit cells
+BATCH_SIZE = 16
+"""Patterns of a batch."""
+# Relative error of the light of other lit cells, which is subtracted.
+SUBTRACTION_ERROR = 0.1
 
 
 @dataclass(frozen=True)
@@ -52,31 +63,49 @@ class Cells:
     @cached_property
     def levels(self) -> tuple[Blocks, ...]:
         """Each level as blocks of pixels."""
-        side = max(self.grid)
-        count = (side - 1).bit_length() + 1
-        return tuple(Blocks(self.grid, min(1 << level, side)) for level in range(count))
+        longest = max(self.grid)
+        count = (longest - 1).bit_length() + 1
+        return tuple(Blocks(self.grid, min(1 << level, longest)) for level in range(count))
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
         """The number of the first cell of each level; and of all cells at the end."""
-        return (0, *np.cumsum([level.grid[0] * level.grid[1] for level in self.levels]).tolist())
+        sizes = [level.grid[0] * level.grid[1] for level in self.levels]
+        return (0, *np.cumsum(sizes).tolist())
+
+    @property
+    def count(self) -> int:
+        """Number of cells of all levels."""
+        return self.offsets[-1]
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels, the cells of level 0."""
+        return self.offsets[1]
 
     @cached_property
     def W(self) -> scipy.sparse.csr_array:
         """Sums over the cells of all levels, (cells, N) float64."""
-        numbers = np.split(np.arange(self.offsets[-1]), self.offsets[1:-1])
-        cells = [
-            b.enlarged(level.reshape(b.grid)) for b, level in zip(self.levels, numbers, strict=True)
-        ]
-        pixels = np.tile(np.arange(self.offsets[1]), len(cells))
+        numbers = np.split(np.arange(self.count), self.offsets[1:-1])
+        cells = []
+        for blocks, level in zip(self.levels, numbers, strict=True):
+            cells.append(blocks.enlarged(level.reshape(blocks.grid)))
+        pixels = np.tile(np.arange(self.pixels), len(cells))
         return scipy.sparse.csr_array((np.ones(len(pixels)), (np.ravel(cells), pixels)))
+
+    @cached_property
+    def areas(self) -> np.ndarray:
+        """Pixels of each cell, (cells,)."""
+        return np.asarray(self.W.sum(axis=1))
 
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
         """(4, n) cells of `level` - 1: upper left, upper right, lower left, lower right; or -1."""
         row, column = np.divmod(cells, self.levels[level].grid[1])
         h, w = self.levels[level - 1].grid
-        r, c = 2 * row + np.array([[0], [0], [1], [1]]), 2 * column + np.array([[0], [1], [0], [1]])
-        return np.where((r < h) & (c < w), r * w + c, -1)
+        child_row = 2 * row + np.array([[0], [0], [1], [1]])
+        child_column = 2 * column + np.array([[0], [1], [0], [1]])
+        exists = (child_row < h) & (child_column < w)
+        return np.where(exists, child_row * w + child_column, -1)
 
     def pattern(self, level: int, cells: np.ndarray) -> np.ndarray:
         """(h, w) float32, 1 on the pixels of some cells of a level."""
@@ -85,10 +114,16 @@ class Cells:
         return self.levels[level].enlarged(lit)
 
 
-class Entries(NamedTuple):
-    """Light of cells at camera pixels, (entries,), by cell; energy and variance are (channels, entries).
+@dataclass(frozen=True, kw_only=True)
+class Entries:
+    """Light of cells at camera pixels.
 
-    Energy is that of all pixels of the cell together.
+    Attributes
+    ----------
+    cell, pixel : (entries,)
+        Numbers of cells, in which the entries are sorted, and of camera pixels.
+    energy, variance : (channels, entries)
+        Light of all pixels of the cell together, and its variance.
     """
 
     cell: np.ndarray
@@ -96,167 +131,365 @@ class Entries(NamedTuple):
     energy: np.ndarray
     variance: np.ndarray
 
-    def where(self, mask: np.ndarray) -> Entries:
-        """Some of them."""
-        return Entries(*(values[..., mask] for values in self))
+    def select(self, mask: np.ndarray) -> Entries:
+        """Select entries by a mask (entries,)."""
+        return Entries(
+            cell=self.cell[mask],
+            pixel=self.pixel[mask],
+            energy=self.energy[:, mask],
+            variance=self.variance[:, mask],
+        )
 
 
-class Core(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Core:
     """C as far as it is measured: the light of one pixel of a cell, by camera pixel and cell."""
 
     cells: Cells
     entries: list[Entries]
 
     def add(self, level: int, entries: Entries) -> None:
-        """Entries that stay at a level."""
+        """Add entries that stay at a level."""
         cell = self.cells.offsets[level] + entries.cell
-        area = self.cells.W.sum(axis=1)[cell]
+        area = self.cells.areas[cell]
         self.entries.append(
-            Entries(cell, entries.pixel, entries.energy / area, entries.variance / area**2)
-        )
-
-    def matrices(self, values: str = "energy") -> list[scipy.sparse.csr_array]:
-        """C of each channel, or its "variance": (M, cells), all of one pattern."""
-        row, column = (
-            np.concatenate([getattr(e, name) for e in self.entries]) for name in ("pixel", "cell")
-        )
-        data = np.concatenate([getattr(entries, values) for entries in self.entries], axis=1)
-        return [
-            scipy.sparse.csr_array((x, (row, column)), shape=self.cells.W.T.shape) for x in data
-        ]
-
-    def variances(self, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
-        """Rows, columns, light, and variances of pixels whose sums over cells are right."""
-        C, V = self.matrices()[channel], self.matrices("variance")[channel]
-        area, v = np.asarray(self.cells.W.sum(axis=1)), np.asarray(V.data)
-        V.data = np.where(v < 1e-3 * UNKNOWN, v * area[V.indices], 0.0)
-        for start in range(0, self.cells.offsets[1], AT_ONCE):
-            light, variance = (
-                (A[start : start + AT_ONCE] @ self.cells.W).toarray() for A in (C, V)
+            Entries(
+                cell=cell,
+                pixel=entries.pixel,
+                energy=entries.energy / area,
+                variance=entries.variance / area**2,
             )
-            i, j = np.nonzero(variance)
-            yield i + start, j, light[i, j], variance[i, j]
+        )
+
+    def matrices(self) -> list[scipy.sparse.csr_array]:
+        """C of each channel, (M, cells), all of one pattern."""
+        return self._assemble([entries.energy for entries in self.entries])
+
+    def variances(self) -> list[scipy.sparse.csr_array]:
+        """Variances of the entries of C, in the same pattern."""
+        return self._assemble([entries.variance for entries in self.entries])
+
+    def _assemble(self, values: list[np.ndarray]) -> list[scipy.sparse.csr_array]:
+        row = np.concatenate([entries.pixel for entries in self.entries])
+        column = np.concatenate([entries.cell for entries in self.entries])
+        shape = self.cells.pixels, self.cells.count
+        matrices = []
+        for data in np.concatenate(values, axis=1):
+            matrices.append(scipy.sparse.csr_array((data, (row, column)), shape=shape))
+        return matrices
+
+    def known_entries(self, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
+        """Rows, columns, light, and variances of pixels, which have the right sums over cells."""
+        C = self.matrices()[channel]
+        V = self.variances()[channel]
+        variance = np.asarray(V.data)
+        by_cell = variance * self.cells.areas[V.indices]
+        V.data = np.where(variance < KNOWN_VARIANCE, by_cell, 0.0)
+        for start in range(0, self.cells.pixels, BATCH_SIZE):
+            rows = slice(start, start + BATCH_SIZE)
+            light = (C[rows] @ self.cells.W).toarray()
+            light_variance = (V[rows] @ self.cells.W).toarray()
+            i, j = np.nonzero(light_variance)
+            yield i + start, j, light[i, j], light_variance[i, j]
 
 
 def most_patterns(cells: Cells) -> int:
-    """Patterns that no scan goes beyond, in whole batches: every cell on its own."""
-    batches = -(-np.diff(cells.offsets)[:-1] // AT_ONCE)
-    return AT_ONCE * max(int(batches.sum()), 1)
+    """Number of patterns that no scan exceeds, in whole batches: every cell on its own."""
+    batches = -(-np.diff(cells.offsets)[:-1] // BATCH_SIZE)
+    return BATCH_SIZE * max(int(batches.sum()), 1)
 
 
-def scan(pictures: Seen, log: Log, threshold: float, sigmas: float) -> Core:
+def scan(grid: ScanGrid, log: PictureLog, threshold: float, sigmas: float) -> Core:
     """Measure the core of T, the white picture of the calibration being its root.
 
     Cells are divided whose energy is above `threshold` times white, and above `sigmas` standard
-    deviations. `log` may have pictures of an earlier run.
+    deviations. `log` takes the pictures, or has those of an earlier run.
     """
-    cells, white = Cells(pictures.grid), pictures.white
-    pixels, seen = np.arange(len(pictures.seen)), np.flatnonzero(pictures.seen)
-    zeros = np.zeros((pictures.channels, len(pixels)))
-    core = Core(
-        cells, [Entries(pixels, pixels, zeros, zeros)]
-    )  # the diagonal is in the pattern of C
-    value, variance = (values[:, seen].astype(np.float64) for values in white)
-    active = Entries(np.zeros(len(seen), np.int64), seen, value, variance)
-    least = threshold * np.maximum(white.value, 0.0)
-    for level in range(len(cells.levels) - 1, 0, -1):
-        bright = active.energy > least[:, active.pixel]
-        clear = active.energy**2 > sigmas**2 * active.variance
-        divided = np.any(bright & clear, axis=0) | (level == len(cells.levels) - 1)
-        core.add(level, active.where(~divided))
-        active = _divide(core, level, active.where(divided), pictures, log)
+    white = grid.white
+    cells = Cells(grid.grid)
+    top = len(cells.levels) - 1
+    core = Core(cells=cells, entries=[_diagonal(grid)])
+    active = _root(grid)
+    smallest = threshold * np.maximum(white.value, 0.0)
+    for level in range(top, 0, -1):
+        is_bright = active.energy > smallest[:, active.pixel]
+        is_clear = active.energy**2 > sigmas**2 * active.variance
+        is_divided = np.any(is_bright & is_clear, axis=0) | (level == top)
+        core.add(level, active.select(~is_divided))
+        division = _Division(core, level, active.select(is_divided))
+        active = division.run(grid, log)
     core.add(0, active)
     return core
 
 
-def _divide(core: Core, level: int, parents: Entries, pictures: Seen, log: Log) -> Entries:
-    """The entries of the children of all parents, by cell."""
-    cells, matrices = core.cells, core.matrices()
-    numbers, starts, parent = np.unique(parents.cell, return_index=True, return_inverse=True)
-    children = cells.children(level, numbers)
-    # The only child of a cell at the rim is the cell: it was photographed as that.
-    single = np.count_nonzero(children >= 0, axis=0) == 1
-    colours = np.where(
-        single, -1, colour(np.append(starts, len(parent)), parents.pixel, len(pictures.seen))
-    )
-    groups = []  # cells that are lit together: which child, of which parents
-    for number in range(int(colours.max(initial=-1)) + 1):
-        for k in range(4):
-            members = np.flatnonzero((colours == number) & (children[k] >= 0))
-            groups += [(k, members)] if len(members) else []
-    log.announce(cells.pattern(level - 1, children[k, members]) for k, members in groups)
-    cell = children[:, parent]
-    energy = np.zeros((4, *parents.energy.shape))
-    variance = energy + np.where(cell >= 0, UNKNOWN, 0.0)[:, None]  # where no photograph follows
-    for first in range(0, len(groups), AT_ONCE):
-        batch = groups[first : first + AT_ONCE]
-        patterns = [cells.pattern(level - 1, children[k, members]) for k, members in batch]
-        for (k, members), pattern, picture in zip(batch, patterns, log.take(patterns), strict=True):
-            entries = np.flatnonzero(np.isin(parent, members))
-            pixels, sums = parents.pixel[entries], cells.W @ pattern.ravel()
-            known = np.stack([(C @ sums)[pixels] for C in matrices])
-            energy[k][:, entries] = picture.value[:, pixels] - known
-            noise = picture.variance[:, pixels] + pictures.ambient[:, pixels]
-            variance[k][:, entries] = noise + (_SUBTRACTED * known) ** 2
-    others = all_but_one(variance) + parents.variance
-    total = np.maximum(variance + others, 1e-300)
-    energy -= variance / total * (energy.sum(axis=0) - parents.energy)
-    variance *= others / total
-    k, entry = np.nonzero(cell >= 0)
-    order = np.argsort(cell[k, entry], kind="stable")
-    k, entry = k[order], entry[order]
+def _diagonal(grid: ScanGrid) -> Entries:
+    """Entries of 0 on the diagonal, which so is in the pattern of C."""
+    pixels = np.arange(len(grid.seen))
+    zeros = np.zeros((grid.channels, len(pixels)))
+    return Entries(cell=pixels, pixel=pixels, energy=zeros, variance=zeros)
+
+
+def _root(grid: ScanGrid) -> Entries:
+    """White as the energy of the one cell of the highest level, at pixels that are seen."""
+    seen = np.flatnonzero(grid.seen)
     return Entries(
-        cell[k, entry], parents.pixel[entry], energy[k, :, entry].T, variance[k, :, entry].T
+        cell=np.zeros(len(seen), np.int64),
+        pixel=seen,
+        energy=grid.white.value[:, seen].astype(np.float64),
+        variance=grid.white.variance[:, seen].astype(np.float64),
     )
 
 
-def arrays(
+class _Division:
+    """The division of cells of one level into their children.
+
+    `numbers` are the divided cells, `parent` the place of each entry's cell in them; `children`
+    (4, cells) are their numbers, or -1.
+    """
+
+    def __init__(self, core: Core, level: int, parents: Entries) -> None:
+        self.cells = core.cells
+        self.matrices = core.matrices()
+        self.child_level = level - 1
+        self.parents = parents
+        numbers, starts, parent = np.unique(parents.cell, return_index=True, return_inverse=True)
+        self.numbers = numbers
+        self.starts = np.append(starts, len(parent))
+        self.parent = parent
+        self.children = core.cells.children(level, numbers)
+
+    def run(self, grid: ScanGrid, log: PictureLog) -> Entries:
+        """Photograph the children, and return their entries, by cell."""
+        groups = self._groups(len(grid.seen))
+        log.announce(self._pattern(child, members) for child, members in groups)
+        cell = self.children[:, self.parent]
+        energy = np.zeros((4, *self.parents.energy.shape))
+        # The light is unknown unless a photograph follows.
+        variance = energy + np.where(cell >= 0, UNKNOWN, 0.0)[:, None]
+        for first in range(0, len(groups), BATCH_SIZE):
+            batch = groups[first : first + BATCH_SIZE]
+            patterns = [self._pattern(child, members) for child, members in batch]
+            pictures = log.take(patterns)
+            for (child, members), pattern, picture in zip(batch, patterns, pictures, strict=True):
+                entries = np.flatnonzero(np.isin(self.parent, members))
+                pixels = self.parents.pixel[entries]
+                known = self._known_light(pattern, pixels)
+                noise = picture.variance[:, pixels] + grid.ambient[:, pixels]
+                energy[child][:, entries] = picture.value[:, pixels] - known
+                variance[child][:, entries] = noise + (SUBTRACTION_ERROR * known) ** 2
+        self._add_up(energy, variance)
+        return self._sorted_entries(cell, energy, variance)
+
+    def _groups(self, camera_pixels: int) -> list[tuple[int, np.ndarray]]:
+        """Cells that are lit together: which child (0 to 3), and of which parents."""
+        # The only child of a cell at the rim is the cell: it was photographed as that.
+        is_single = np.count_nonzero(self.children >= 0, axis=0) == 1
+        colours = colour_cells(self.starts, self.parents.pixel, camera_pixels)
+        colours = np.where(is_single, -1, colours)
+        groups = []
+        for number in range(int(colours.max(initial=-1)) + 1):
+            for child in range(4):
+                members = np.flatnonzero((colours == number) & (self.children[child] >= 0))
+                if len(members):
+                    groups.append((child, members))
+        return groups
+
+    def _pattern(self, child: int, members: np.ndarray) -> np.ndarray:
+        """Pattern (h, w) of one child of each of some parents."""
+        return self.cells.pattern(self.child_level, self.children[child, members])
+
+    def _known_light(self, pattern: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """Light that stays at cells so far, under a pattern at camera pixels, (channels, n)."""
+        sums = self.cells.W @ pattern.ravel()
+        return np.stack([(C @ sums)[pixels] for C in self.matrices])
+
+    def _add_up(self, energy: np.ndarray, variance: np.ndarray) -> None:
+        """Correct children (4, channels, entries) in place: they add up to their parents."""
+        others = all_but_one(variance) + self.parents.variance
+        total = np.maximum(variance + others, 1e-300)
+        rest = energy.sum(axis=0) - self.parents.energy
+        energy -= variance / total * rest
+        variance *= others / total
+
+    def _sorted_entries(
+        self, cell: np.ndarray, energy: np.ndarray, variance: np.ndarray
+    ) -> Entries:
+        """Entries of the children that exist, by cell."""
+        child, entry = np.nonzero(cell >= 0)
+        order = np.argsort(cell[child, entry], kind="stable")
+        child = child[order]
+        entry = entry[order]
+        return Entries(
+            cell=cell[child, entry],
+            pixel=self.parents.pixel[entry],
+            energy=energy[child, :, entry].T,
+            variance=variance[child, :, entry].T,
+        )
+
+
+class PictureLog:
+    """Pictures in the order of an adaptive scan's requests, a batch in each block of a store.
+
+    The next request depends on nothing but the pictures before. So a scan that was stopped is run
+    again from its start with the pictures of the log, to the bit the same, until it asks for a new
+    one. Without a camera that is an AcquisitionError. `done` counts the pictures that were asked
+    for.
+    """
+
+    def __init__(
+        self, store: BlockStore, camera: ScanCamera | None, progress: Callable[[int], None]
+    ) -> None:
+        self.done = 0
+        self._store = store
+        self._camera = camera
+        self._progress = progress
+        self._batches = 0
+
+    def announce(self, patterns: Iterable[np.ndarray]) -> None:
+        """Announce the patterns of the next batches that are not in the store."""
+        if self._camera is None:
+            return
+        size = self._store.layout.block_rows
+        batch = self._batches
+        while self._is_written(batch):
+            batch += 1
+        stored = (batch - self._batches) * size
+        self._camera.announce(islice(patterns, stored, None), size)
+
+    def take(self, patterns: list[np.ndarray]) -> list[Picture]:
+        """The pictures of the next batch of patterns, as many as a block has at most."""
+        batch = self._batches
+        self._batches += 1
+        if self._is_written(batch):
+            pictures = self._read(batch, len(patterns))
+            self._count(len(patterns))
+            return pictures
+        if self._camera is None:
+            raise AcquisitionError(
+                f"{self._store.path}: the next batch of patterns is not photographed"
+            )
+        pictures = self._camera.take(patterns, self._count)
+        self._write(batch, pictures)
+        return pictures
+
+    def _read(self, batch: int, expected: int) -> list[Picture]:
+        """Pictures of a batch in the store, which must be as many as expected."""
+        layout = self._store.layout
+        _, pixels = layout.block_shape(batch, "columns")
+        values = []
+        variances = []
+        for channel in range(layout.channels):
+            block = self._store.block(channel, batch)
+            values.append(np.reshape(block.matrix.data, (-1, pixels)))
+            variances.append(np.reshape(block.variance, (-1, pixels)))
+        if len(values[0]) != expected:
+            raise AcquisitionError(
+                f"{self._store.path} has {len(values[0])} pictures in batch {batch}; "
+                f"it must have {expected}: it is that of another scan"
+            )
+        pictures = []
+        for value, variance in zip(np.stack(values, 1), np.stack(variances, 1), strict=True):
+            pictures.append(Picture(value=value, variance=variance))
+        return pictures
+
+    def _write(self, batch: int, pictures: Sequence[Picture]) -> None:
+        """Commit the pictures of a batch, each a full column of its block."""
+        layout = self._store.layout
+        shape = layout.block_shape(batch, "columns")
+        _, pixels = shape
+        row, column = np.indices((len(pictures), pixels)).reshape(2, -1)
+        for channel in range(layout.channels):
+            value = np.concatenate([picture.value[channel] for picture in pictures])
+            variance = np.concatenate([picture.variance[channel] for picture in pictures])
+            matrix = scipy.sparse.csr_array((value, (row, column)), shape=shape)
+            self._store.write(channel, batch, matrix, variance)
+
+    def _is_written(self, batch: int) -> bool:
+        channels = range(self._store.layout.channels)
+        return all((channel, batch) in self._store.written for channel in channels)
+
+    def _count(self, pictures: int) -> None:
+        self.done += pictures
+        self._progress(self.done)
+
+
+def finish(
+    store: BlockStore, grid: ScanGrid, core: Core, mixing: np.ndarray | None, sigmas: float
+) -> None:
+    """Make the compressed transport of a scan's core, which replaces its pictures in the store."""
+    for channel, variance in enumerate(core.variances()):
+        store.extra(f"core_variance_{channel}", variance.data)
+    arrays = transport_arrays(core, mixing, sigmas) | grid.noise(core.known_entries)
+    store.finalize(compressed=CompressedRecord(arrays))
+
+
+def transport_arrays(
     core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0
 ) -> dict[str, np.ndarray]:
-    """The arrays of a scan as a compressed transport (`ltcl.transport`): S diag(1) with S = I + (C W - I).
+    """The arrays of a scan as a compressed transport (`ltcl.transport`).
 
-    Its first bounce is 0, so that the pixel can be masked, where it is not above 0 by `sigmas`
-    standard deviations. C W - I is C less 1 at every pixel's own cell.
+    It is S diag(1) with S = I + (C W - I): C W - I is C less 1 at every pixel's own cell. Its first
+    bounce is 0, so that the pixel can be masked, where it is not above 0 by `sigmas` standard
+    deviations.
     """
-    cells, matrices, variance = core.cells, core.matrices(), core.matrices("variance")
-    own, noise = (
-        np.stack([A.multiply(cells.W.T).sum(axis=1) for A in B]) for B in (matrices, variance)
-    )
+    cells = core.cells
+    matrices = core.matrices()
+    diagonal = np.stack([_diagonal_of_product(C, cells) for C in matrices])
+    noise = np.stack([_diagonal_of_product(V, cells) for V in core.variances()])
     result: dict[str, Any] = {
         "grid": cells.grid,
-        "first_bounce": first_bounce.drop_uncertain(own, noise, sigmas),
+        "first_bounce": first_bounce.drop_uncertain(diagonal, noise, sigmas),
+        "basis_0.name": "pyramid",
+        "basis_0.grid": cells.grid,
     }
-    result |= {"basis_0.name": "pyramid", "basis_0.grid": cells.grid}
-    result |= {} if mixing is None else {"mixing": mixing}
-    columns = np.ones(cells.offsets[1])
+    if mixing is not None:
+        result["mixing"] = mixing
     for c, C in enumerate(matrices):
-        values = C.data - (C.indices == np.repeat(np.arange(len(columns)), np.diff(C.indptr)))
-        R = {"kind": "compressed", "error": 0.0, "out": -1, "into": 0, "diagonal": own[c] - 1.0}
-        R |= {"core.kind": "csr", "core.error": 0.0, "core.shape": np.array(C.shape, np.int64)}
-        R |= {"core.data": values.astype(np.float32), "core.indices": C.indices.astype(np.int32)}
-        R |= {"core.indptr": C.indptr.astype(np.int64)}
-        result |= {
-            f"columns_{c}": columns,
-            f"system_{c}.sign": 1.0,
-            f"system_{c}.solution_error": 0.0,
-        }
-        result |= {f"system_{c}.R.{name}": value for name, value in R.items()}
+        result[f"columns_{c}"] = np.ones(cells.pixels)
+        result[f"system_{c}.sign"] = 1.0
+        result[f"system_{c}.solution_error"] = 0.0
+        for name, value in _remainder_arrays(C, diagonal[c]).items():
+            result[f"system_{c}.R.{name}"] = value
     return {name: np.asarray(value) for name, value in result.items()}
 
 
-def colour(starts: np.ndarray, pixels: np.ndarray, count: int) -> np.ndarray:
-    """Colours (n,) from 0 of n cells: no camera pixel is active in two of one colour (Sen et al. 2005).
+def _diagonal_of_product(C: scipy.sparse.csr_array, cells: Cells) -> np.ndarray:
+    """Diagonal of C W, (N,)."""
+    return C.multiply(cells.W.T).sum(axis=1)
 
-    Greedy, the cells with most active pixels first, each into the first colour that is free. Cell k
-    is active at the camera pixels ``pixels[starts[k]:starts[k + 1]]``, of `count`.
+
+def _remainder_arrays(C: Any, diagonal: np.ndarray) -> dict[str, Any]:
+    """R = C W - I as a compressed operator: its core C less 1 at every pixel's own cell."""
+    rows = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
+    values = C.data - (C.indices == rows)
+    return {
+        "kind": "compressed",
+        "error": 0.0,
+        "out": -1,
+        "into": 0,
+        "diagonal": diagonal - 1.0,
+        "core.kind": "csr",
+        "core.error": 0.0,
+        "core.shape": np.array(C.shape, np.int64),
+        "core.data": values.astype(np.float32),
+        "core.indices": C.indices.astype(np.int32),
+        "core.indptr": C.indptr.astype(np.int64),
+    }
+
+
+def colour_cells(starts: np.ndarray, pixels: np.ndarray, count: int) -> np.ndarray:
+    """Colours (n,) from 0 of n cells: no camera pixel is active in two of one colour.
+
+    Greedy (Sen et al. 2005): the cells with most active pixels first, each into the first colour
+    that is free. Cell k is active at the camera pixels ``pixels[starts[k]:starts[k + 1]]``, of
+    `count`.
     """
-    colours, used = (
-        np.zeros(len(starts) - 1, np.int64),
-        np.full(count, 0, object),
-    )  # a bit for each colour
+    colours = np.zeros(len(starts) - 1, np.int64)
+    used = np.full(count, 0, object)  # a bit for each colour
     for cell in np.argsort(-np.diff(starts), kind="stable"):
-        own = pixels[starts[cell] : starts[cell + 1]]
-        bits = np.bitwise_or.reduce(used[own], initial=0)
-        colours[cell] = (~bits & (bits + 1)).bit_length() - 1
-        used[own] |= 1 << int(colours[cell])
+        active = pixels[starts[cell] : starts[cell + 1]]
+        bits = np.bitwise_or.reduce(used[active], initial=0)
+        lowest_free_bit = ~bits & (bits + 1)
+        colours[cell] = lowest_free_bit.bit_length() - 1
+        used[active] |= 1 << int(colours[cell])
     return colours

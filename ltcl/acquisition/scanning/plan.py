@@ -3,8 +3,8 @@
 
 For N pixels with direct light d, indirect light g of all pixels together and ambient light a
 (radiance), an entry of T off its diagonal is about l = g / N. A photograph of radiance L and t
-seconds has the variance V(L) = variance(L t) / t^2 of the noise model; several are merged as 1 / V
-= sum_k 1 / V_k. Entries have
+seconds has the variance V(L) = variance(L t) / t^2 of the noise model; several are merged as
+1 / V = sum_k 1 / V_k. Entries have
 
     pixel      V(l + a);  V(d + a) on the diagonal
     hadamard   2 / m V(m l + a) in batches of n pixels, m = (n + 1) / 2 of them lit at a time;
@@ -32,16 +32,27 @@ from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import adaptive, columns
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 
-_MANY = 2048  # pixels from which one at a time, or as many patterns, take too long
-_INDIRECT = 0.25  # of what a camera pixel sees under white, unless it is measured: a white corner
-_SYSTEMATIC = 0.002  # relative error of T p by the calibration: response and white
-_SIMILAR = 1.5  # times the smallest error: fewer photographs count more
-_BYTES = 12  # of an entry: value, index, variance
+# Pixels from which one at a time, or as many patterns, take too long.
+MAX_SINGLE_PIXELS = 2048
+# Indirect share of a camera pixel's light under white, unless it is measured: a white corner.
+INDIRECT_SHARE = 0.25
+# Relative error of T p by the calibration: response and white.
+CALIBRATION_ERROR = 0.002
+# Error relative to the smallest one, up to which fewer photographs count more.
+MAX_ERROR_RATIO = 1.5
+# Bytes of an entry: value, index, variance.
+ENTRY_BYTES = 12
+# Camera pixels count as lit above this share of the brightest under white.
+LIT_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Light:
-    """Linear sensor values a second of a pixel: from its own light, all others together, and no projector."""
+    """Linear sensor values a second of a pixel.
+
+    `direct` from its own light, `indirect` from all other pixels together, `ambient` without the
+    projector.
+    """
 
     direct: float = 0.5
     indirect: float = 0.2
@@ -50,11 +61,25 @@ class Light:
 
 @dataclass(frozen=True, repr=False)
 class Plan:
-    """Of one strategy, on a `grid` (h, w).
+    """Plan of one strategy.
 
-    `patterns` of the scan (of an adaptive one at most); `photographs`, those of the `calibration`
-    included; `seconds` of all, with overhead; bytes on `disk` at most; relative `error` of T p by
-    noise, 1 at most.
+    Attributes
+    ----------
+    strategy : str
+    grid : tuple of int
+        Pixels (h, w) of T.
+    patterns : int
+        Patterns of the scan, for "adaptive" at most.
+    calibration : int
+        Photographs of the calibration.
+    photographs : int
+        Photographs of all, those of the calibration included.
+    seconds : float
+        Time of all, with overhead.
+    disk : int
+        Bytes on the disk, at most.
+    error : float
+        Relative error of T p by noise, 1 at most.
     """
 
     strategy: str
@@ -67,9 +92,22 @@ class Plan:
     error: float
 
     def __repr__(self) -> str:
-        (h, w), time = self.grid, timedelta(seconds=round(self.seconds))
-        each = f"{h} x {w} pixels, {self.photographs} photographs, {time}, error of T p {self.error:.2%}"
-        return f"<ltcl Plan {self.strategy}: {each}>"
+        h, w = self.grid
+        time = timedelta(seconds=round(self.seconds))
+        return (
+            f"<ltcl Plan {self.strategy}: {h} x {w} pixels, {self.photographs} photographs, "
+            f"{time}, error of T p {self.error:.2%}>"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Outlook:
+    """Patterns of a scan in batches of a size, its stored entries, and the variance of T p."""
+
+    patterns: int
+    batches: int
+    entries: int
+    variance: float
 
 
 def plans(
@@ -85,87 +123,171 @@ def plans(
     overhead: float = 0.0,
     calibration: int | None = None,
 ) -> dict[str, Plan]:
-    """A plan for every strategy.
+    """Plan a scan with every strategy.
 
-    Each pattern is photographed at all `exposures` (seconds, ascending), each batch of patterns
-    ends with one more photograph (`acquisition.anchor`), and each takes `overhead` seconds besides.
-    `noise` and `light` are guessed before the calibration, then `measured`; it takes `calibration`
-    photographs, by default as `acquisition.calibrate` expects. The others are as in `ltcl.acquire`.
+    Each pattern is photographed at all exposures, and each batch of patterns ends with one more
+    photograph (`acquisition.anchor`).
 
+    Parameters
+    ----------
+    grid : tuple of int
+        Pixels (h, w) of the projector.
+    exposures : sequence of float
+        Seconds, ascending.
+    noise, light : NoiseModel, Light, optional
+        Of the camera and of the scene; None: guessed, as before the calibration.
+    channels, block, order, threshold
+        As in `ltcl.acquire`.
+    overhead : float
+        Seconds of each photograph besides its exposure.
+    calibration : int, optional
+        Photographs of the calibration; None: as many as expected.
+
+    Examples
+    --------
     >>> strategies = plans((64, 64), (0.5, 8.0))
     >>> strategies["pixel"].patterns, strategies["adaptive"].patterns < 1000
     (4160, True)
     """
-    noise, light = noise or NoiseModel(), light or Light()
-    d, g, white, times = (
-        light.direct,
-        light.indirect,
-        light.direct + light.indirect,
-        np.array(exposures),
-    )
-    before = expected_photographs(grid, channels=channels) if calibration is None else calibration
-
-    def variance(radiance: float) -> float:
-        x = (radiance + light.ambient) * times
-        t, x = times[x < noise.saturation], x[x < noise.saturation]
-        return float(1.0 / np.sum(t**2 / noise.variance(x))) if t.size else math.inf
-
+    if noise is None:
+        noise = NoiseModel()
+    if light is None:
+        light = Light()
+    if calibration is None:
+        calibration = expected_photographs(grid, channels=channels)
+    times = np.array(exposures)
+    merged = _MergedNoise(noise, light.ambient, times)
     result = {}
-    for name in STRATEGIES:
-        pixels = Blocks(grid, min(block, max(grid))).grid if name == "block" else grid
-        n = math.prod(pixels)
-        if name == "adaptive":  # its pictures are kept to the end
-            # A camera pixel divides at most as many cells as have its threshold each.
-            cells, active = adaptive.Cells(grid), 1.0 + g / white / max(threshold, 1e-9)
-            patterns = math.ceil(sum(4 * np.minimum(np.diff(cells.offsets)[1:], active)))
-            patterns, size = min(patterns, adaptive.most_patterns(cells)), adaptive.AT_ONCE
-            entries, K = n * patterns, max(1.0, 3.0 * math.log(n, 4))
-            square = K * variance(g / K) + (threshold / 2 * white) ** 2
-        else:  # columns are stored twice while they are transposed
-            code = columns.code_of(name, pixels, order)
-            patterns, size, entries = columns.patterns(code, n), code.size, 2 * n * n
-            bright, own, other = 1, variance(d), variance(g / n)
-            if name == "hadamard":
-                bright, m = size, (size + 1) / 2
-                other = 2.0 / m * variance(m * g / n)
-                own = (other + 2.0 / m * variance(d + m * g / n)) / 2
-            total = bright * own + (n - bright) * other
-            square = (total - (bright * own**2 + (n - bright) * other**2) / total) / 3.0
-        error = (
-            math.hypot(math.sqrt(max(square, 0.0)) / white, _SYSTEMATIC)
-            if math.isfinite(square)
-            else 1.0
+    for strategy in STRATEGIES:
+        pixels = grid
+        if strategy == "block":
+            pixels = Blocks(grid, min(block, max(grid))).grid
+        if strategy == "adaptive":
+            outlook = _adaptive_outlook(grid, threshold, merged, light)
+        else:
+            code = columns.choose_code(strategy, pixels, order)
+            outlook = _column_outlook(code, math.prod(pixels), merged, light)
+        photographs = calibration + len(times) * outlook.patterns + outlook.batches
+        # The calibration's exposures are about the geometric mean of those of the scan.
+        calibration_seconds = calibration * math.sqrt(times[0] * times[-1])
+        scan_seconds = outlook.patterns * times.sum()
+        seconds = calibration_seconds + scan_seconds + outlook.batches * times[0]
+        result[strategy] = Plan(
+            strategy=strategy,
+            grid=pixels,
+            patterns=outlook.patterns,
+            calibration=calibration,
+            photographs=photographs,
+            seconds=float(seconds + photographs * overhead),
+            disk=channels * ENTRY_BYTES * outlook.entries,
+            error=_relative_error(outlook.variance, light),
         )
-        batches = -(-(patterns if name == "adaptive" else n) // size)
-        count = before + len(times) * patterns + batches
-        seconds = (
-            before * math.sqrt(times[0] * times[-1]) + patterns * times.sum() + batches * times[0]
-        )
-        seconds, disk = float(seconds + count * overhead), channels * _BYTES * entries
-        result[name] = Plan(name, pixels, patterns, before, count, seconds, disk, min(error, 1.0))
     return result
 
 
-def measured(calibration: Calibration) -> Light:
-    """The light of a measured scene; which part of it is indirect is taken as a quarter."""
-    white, dark = (light.value[light.valid] for light in (calibration.white, calibration.ambient))
-    lit = (
-        float(np.median(white[white > 0.1 * white.max(initial=0.0)]))
-        if white.size
-        else Light().direct
+class _MergedNoise:
+    """Variance of a radiance that several exposures are merged to."""
+
+    def __init__(self, noise: NoiseModel, ambient: float, times: np.ndarray) -> None:
+        self.noise = noise
+        self.ambient = ambient
+        self.times = times
+
+    def variance(self, radiance: float) -> float:
+        """Variance of light with the ambient light; infinite if every exposure saturates."""
+        linear = (radiance + self.ambient) * self.times
+        usable = linear < self.noise.saturation
+        if not usable.any():
+            return math.inf
+        precision = self.times[usable] ** 2 / self.noise.variance(linear[usable])
+        return float(1.0 / np.sum(precision))
+
+
+def _adaptive_outlook(
+    grid: tuple[int, int], threshold: float, merged: _MergedNoise, light: Light
+) -> _Outlook:
+    """A scan by cells, whose pictures are kept to the end."""
+    pixels = math.prod(grid)
+    white = light.direct + light.indirect
+    cells = adaptive.Cells(grid)
+    # A camera pixel divides at most as many cells as have its threshold each.
+    active = 1.0 + light.indirect / white / max(threshold, 1e-9)
+    divided = np.minimum(np.diff(cells.offsets)[1:], active)
+    patterns = min(math.ceil(sum(4 * divided)), adaptive.most_patterns(cells))
+    terms = max(1.0, 3.0 * math.log(pixels, 4))
+    noise = terms * merged.variance(light.indirect / terms)
+    return _Outlook(
+        patterns=patterns,
+        batches=-(-patterns // adaptive.BATCH_SIZE),
+        entries=pixels * patterns,
+        variance=noise + (threshold / 2 * white) ** 2,
     )
-    ambient = max(float(np.median(dark)), 0.0) if dark.size else 0.0
-    return Light((1.0 - _INDIRECT) * lit, _INDIRECT * lit, ambient)
+
+
+def _column_outlook(
+    code: columns.Code, pixels: int, merged: _MergedNoise, light: Light
+) -> _Outlook:
+    """A scan by columns, which are stored twice while they are transposed."""
+    direct = light.direct
+    if isinstance(code, columns.Hadamard):
+        bright_entries = code.size
+        lit = (code.size + 1) / 2
+        lit_light = lit * light.indirect / pixels
+        dark_variance = 2.0 / lit * merged.variance(lit_light)
+        lit_variance = 2.0 / lit * merged.variance(direct + lit_light)
+        bright_variance = (dark_variance + lit_variance) / 2
+    else:
+        bright_entries = 1
+        bright_variance = merged.variance(direct)
+        dark_variance = merged.variance(light.indirect / pixels)
+    dark_entries = pixels - bright_entries
+    total = bright_entries * bright_variance + dark_entries * dark_variance
+    squares = bright_entries * bright_variance**2 + dark_entries * dark_variance**2
+    return _Outlook(
+        patterns=columns.count_patterns(code, pixels),
+        batches=-(-pixels // code.size),
+        entries=2 * pixels * pixels,
+        variance=(total - squares / total) / 3.0,
+    )
+
+
+def _relative_error(variance: float, light: Light) -> float:
+    """Relative error of T p, 1 at most."""
+    if not math.isfinite(variance):
+        return 1.0
+    noise = math.sqrt(max(variance, 0.0)) / (light.direct + light.indirect)
+    return min(math.hypot(noise, CALIBRATION_ERROR), 1.0)
+
+
+def measured(calibration: Calibration) -> Light:
+    """Light of a measured scene; a quarter of it is taken as indirect."""
+    white = calibration.white.value[calibration.white.valid]
+    dark = calibration.ambient.value[calibration.ambient.valid]
+    lit = Light.direct
+    if white.size:
+        is_lit = white > LIT_SHARE * white.max(initial=0.0)
+        lit = float(np.median(white[is_lit]))
+    ambient = 0.0
+    if dark.size:
+        ambient = max(float(np.median(dark)), 0.0)
+    return Light(
+        direct=(1.0 - INDIRECT_SHARE) * lit, indirect=INDIRECT_SHARE * lit, ambient=ambient
+    )
 
 
 def choose(plans: dict[str, Plan]) -> tuple[str, str]:
-    """The strategy of "auto", and why: adaptive for many pixels, or of fewer photographs at similar error."""
+    """The strategy of "auto", and why.
+
+    Adaptive for many pixels, or if it takes fewer photographs at a similar error.
+    """
     h, w = plans["pixel"].grid
-    if h * w > _MANY:
-        return "adaptive", f"{h * w} pixels are more than {_MANY}"
+    if h * w > MAX_SINGLE_PIXELS:
+        return "adaptive", f"{h * w} pixels are more than {MAX_SINGLE_PIXELS}"
     errors = {name: plans[name].error for name in ("pixel", "hadamard", "adaptive")}
-    best = min(("pixel", "hadamard"), key=errors.__getitem__)
-    fewer = plans["adaptive"].photographs < plans[best].photographs
-    each = ", ".join(f"{name} {100 * error:.2g} %" for name, error in errors.items())
-    why = f"relative error of a picture T p: {each}; adaptive takes {'' if fewer else 'no '}fewer photographs"
-    return ("adaptive" if fewer and errors["adaptive"] <= _SIMILAR * errors[best] else best), why
+    best = "hadamard" if errors["hadamard"] < errors["pixel"] else "pixel"
+    takes_fewer = plans["adaptive"].photographs < plans[best].photographs
+    is_similar = errors["adaptive"] <= MAX_ERROR_RATIO * errors[best]
+    listed = ", ".join(f"{name} {100 * error:.2g} %" for name, error in errors.items())
+    difference = "fewer" if takes_fewer else "no fewer"
+    reason = f"relative error of a picture T p: {listed}; adaptive takes {difference} photographs"
+    return ("adaptive" if takes_fewer and is_similar else best), reason

@@ -21,7 +21,7 @@ import scipy.sparse
 from ltcl.device import Device
 from ltcl.errors import InputError
 from ltcl.operators import Operator, ScaledColumns, as_operator
-from ltcl.solvers.bounded import Bounded, inwards, minimise
+from ltcl.solvers.bounded import Bounded, minimise, round_inwards
 from ltcl.transport.transport import Transport
 
 # Pictures (M, k) or light (N, k), one array per system.
@@ -54,7 +54,7 @@ class Limits:
     @classmethod
     def in_float32(cls, bounds: tuple[float, float], masked: np.ndarray) -> Limits:
         """Limits of float32 within the bounds, so that a rounded pattern does not exceed them."""
-        low, high = inwards(*bounds)
+        low, high = round_inwards(*bounds)
         if not -np.inf < low < high < np.inf:
             raise InputError(f"bounds is {bounds}; there must be two numbers of float32 within")
         return cls(float(low), float(high), masked)

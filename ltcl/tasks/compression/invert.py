@@ -40,8 +40,8 @@ from ltcl.device import Device, open_device
 from ltcl.errors import ConvergenceError, InputError, ToleranceError
 from ltcl.operators import CSR, Compressed, Dense, Host, IdentityPlus, Operator, Tiles
 from ltcl.solvers import Inverse
+from ltcl.solvers.chebyshev import chebyshev_rate, chebyshev_steps
 from ltcl.solvers.result import Status
-from ltcl.solvers.stationary import chebyshev_rate, chebyshev_steps
 from ltcl.tasks.compression.coefficients import (
     INVERSE_NAMES,
     basis_names,

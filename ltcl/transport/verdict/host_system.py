@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ltcl.solvers.host_krylov import block_gmres
 from ltcl.transport.covariance import EntryErrors, channel_matrices
 from ltcl.transport.transport import Transport
 
@@ -14,8 +15,6 @@ from ltcl.transport.transport import Transport
 KRYLOV_STEPS = 8
 # Right-hand sides of one solve.
 BLOCK_SIZE = 8
-# Relative singular values that count in the least squares problem of a solve.
-MIN_SINGULAR_VALUE = 1e-6
 
 
 class HostSystem:
@@ -46,29 +45,9 @@ class HostSystem:
         """S^-1 b, (N, k), with the least residual in block Krylov spaces."""
         solutions = []
         for start in range(0, b.shape[1], BLOCK_SIZE):
-            solutions.append(self._solve_block(b[:, start : start + BLOCK_SIZE]))
+            block = b[:, start : start + BLOCK_SIZE]
+            solutions.append(block_gmres(self.matmat, block, steps=KRYLOV_STEPS))
         return np.hstack(solutions)
-
-    def _solve_block(self, b: np.ndarray) -> np.ndarray:
-        """Block GMRES without restart (Saad, Iterative Methods for Sparse Linear Systems, 6.12)."""
-        block, first = np.linalg.qr(b)
-        k = len(first)
-        basis = block
-        # S basis = (basis and one more block) H
-        H = np.zeros((k, 0))
-        for _ in range(KRYLOV_STEPS):
-            # 1. One product.
-            x = self.matmat(block)
-            # 2. The parts of it outside of the basis are the next block.
-            h = basis.T @ x
-            block, r = np.linalg.qr(x - basis @ h)
-            basis = np.hstack([basis, block])
-            below = np.zeros((k, H.shape[1]))
-            H = np.block([[H, h], [below, r]])
-        # 3. The combination of the basis with the least residual.
-        e = np.pad(first, ((0, len(H) - k), (0, 0)))
-        coefficients = np.linalg.lstsq(H, e, rcond=MIN_SINGULAR_VALUE)[0]
-        return basis[:, :-k] @ coefficients
 
 
 class HostErrors(EntryErrors):

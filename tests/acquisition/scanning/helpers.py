@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Corners whose transport is known, rigs that photograph them, and what scans of them are measured by."""
+"""Corners whose transport is known, rigs that photograph them, and errors of scans of them."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ CLEAN: dict[str, Any] = {
     "response": "linear",
     "black": 0.0,
 }
+"""Options of a camera without noise."""
 
 
 @cache
@@ -34,24 +35,28 @@ def rig(n: int = 8, **options: Any) -> VirtualRig:
 def dense(T: ltcl.Transport) -> np.ndarray:
     """All of T, by products with every pixel."""
     n = T.grid[0] * T.grid[1]
-    return (T @ np.eye(n).reshape(n, *T.grid)).reshape(n, n).T.astype(np.float64)
+    pixels = np.eye(n).reshape(n, *T.grid)
+    return (T @ pixels).reshape(n, n).T.astype(np.float64)
 
 
 def unseen_patterns(grid: tuple[int, int]) -> np.ndarray:
     """Patterns that no scan has seen: three smooth ones, three of noise; (N, 6)."""
     y, x = np.mgrid[: grid[0], : grid[1]] / max(grid)
     smooth = [0.5 + 0.5 * np.sin(9 * x + k + 5 * y) for k in range(3)]
-    return np.stack([*smooth, *np.random.default_rng(11).random((3, *grid))]).reshape(6, -1).T
+    noise = np.random.default_rng(11).random((3, *grid))
+    return np.stack([*smooth, *noise]).reshape(6, -1).T
 
 
 def unit(measured: np.ndarray, truth: np.ndarray) -> float:
-    """The camera's unit of light, which nothing but its last code fixes: least squares of row sums."""
-    ours, theirs = measured.sum(axis=1), truth.sum(axis=1)
-    return float(ours @ theirs / (ours @ ours))
+    """The camera's unit of light, which only its last code fixes: least squares of row sums."""
+    sums = measured.sum(axis=1)
+    return float(sums @ truth.sum(axis=1) / (sums @ sums))
 
 
 def relative_error(measured: np.ndarray, truth: np.ndarray, grid: tuple[int, int]) -> float:
-    """The largest of T p, in the camera's unit."""
+    """The largest relative error of T p over unseen patterns p, in the camera's unit."""
     P = unseen_patterns(grid)
-    ours, theirs = unit(measured, truth) * (measured @ P), truth @ P
-    return float(np.max(np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)))
+    pictures = unit(measured, truth) * (measured @ P)
+    expected = truth @ P
+    errors = np.linalg.norm(pictures - expected, axis=0) / np.linalg.norm(expected, axis=0)
+    return float(errors.max())

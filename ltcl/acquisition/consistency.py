@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Checks of a calibration: photographs that cannot be what they should be are refused by number.
+
+    geometry        pixels of the photographs and of the projector
+    black           no lamp was on in one photograph of several
+    uniform codes   show black and a rising part of white
+    light           white is brighter than black, and the scan's exposures show it
+    map             no pattern of Gray code was exchanged with its inverse
+
+An AcquisitionError names photographs, an InputError an argument of `ltcl.acquire`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ltcl.acquisition import agreement, anchor
+from ltcl.acquisition.agreement import CameraModel
+from ltcl.acquisition.geometry import Correspondence, Resampling, decode
+from ltcl.acquisition.radiometry import Radiance
+from ltcl.acquisition.radiometry.exposures import NO_LIGHT
+from ltcl.acquisition.rig import Shots
+from ltcl.acquisition.session import CaptureSession, Photograph
+from ltcl.errors import AcquisitionError, InputError
+
+# Light of a lamp in a photograph of black, relative to full scale: less moves T p by less than
+# 1 %; more may be another pattern, which `agreement` reports.
+MIN_LAMP_LEVEL = 0.01
+MAX_LAMP_LEVEL = 0.1
+# Standard deviations by which the mean of a photograph must be above the others.
+LAMP_SIGMAS = 5.0
+# Standard deviations of noise that white must be above.
+MIN_SIGMAS = 3.0
+# Relative deviation of a projector's curve from pixel to pixel that is allowed.
+PROJECTOR_UNEVENNESS = 0.1
+# Correlation of a picture of blocks with their pattern: 0.98 and more with the right map.
+MIN_MAP_CORRELATION = 0.9
+# Share of a pixel's own light in what white shows there, at least, in most scenes.
+MIN_DIRECT_SHARE = 0.5
+
+
+def check_geometry(shots: Shots, geometry: str | Correspondence) -> None:
+    """Refuse a geometry of other pixels than those of the first photograph."""
+    grid = shots.grid
+    camera = shots.camera_grid
+    name = repr(geometry)
+    if isinstance(geometry, Correspondence):
+        grid = geometry.grid
+        camera = geometry.camera_grid
+        name = "a Correspondence"
+    elif geometry == "aligned":
+        camera = shots.grid
+    if (grid, camera) != (shots.grid, shots.camera_grid):
+        raise InputError(
+            f"geometry is {name}, from photographs of {camera} to a projector of {grid}; "
+            f"the rig has photographs of {shots.camera_grid} and a projector of {shots.grid}"
+        )
+
+
+def check_black(session: CaptureSession, photographs: Sequence[Photograph]) -> None:
+    """Refuse a photograph of black that is brighter than the others of the same exposure.
+
+    Compared pixel by pixel with that one, all others would deviate.
+    """
+    light = np.stack([session.linear(photograph).ravel() for photograph in photographs])
+    level = light.mean(axis=1)
+    deviation = light - light.mean(axis=0) - level[:, None]
+    noise_of_level = float(np.std(deviation)) / math.sqrt(light.shape[1])
+    excess = level - level.min()
+    threshold = MIN_LAMP_LEVEL + LAMP_SIGMAS * noise_of_level
+    is_too_bright = (excess > threshold) & (excess < MAX_LAMP_LEVEL)
+    if is_too_bright.any():
+        name = session.name(photographs[int(np.argmax(is_too_bright))])
+        raise AcquisitionError(
+            f"{name}, of black, is too bright: another light was on; {agreement.ADVICE}"
+        )
+
+
+def check_light(
+    exposures: Sequence[float], white: Radiance, resampling: Resampling, camera: CameraModel
+) -> None:
+    """Refuse a projector without light; exposures that saturate lit pixels, or show noise alone."""
+    noise_of_sum = math.sqrt(white.variance[white.valid].sum())
+    if white.value.sum() <= MIN_SIGMAS * noise_of_sum:
+        raise AcquisitionError(
+            f"photographs are no brighter under white than under black; {NO_LIGHT}"
+        )
+    valid_light = np.where(white.valid, white.value, 0.0)
+    light = resampling.apply(valid_light)[resampling.seen]
+    is_lit = light > 0
+    level = float(np.median(light[is_lit])) if is_lit.any() else 0.0
+    shortest = exposures[0]
+    longest = exposures[-1]
+    read_noise = float(np.sqrt(camera.noise.variance(0.0)))
+    if shortest * MIN_DIRECT_SHARE * level > camera.noise.saturation:
+        reason = f"saturates at {shortest:g} s, which must be below {shortest / 2:.2g}"
+    elif 0 < longest * level < MIN_SIGMAS * read_noise:
+        reason = f"is lost in noise at {longest:g} s, which must be above {2 * longest:.2g}"
+    else:
+        return
+    raise InputError(f"exposures is {exposures}; half of white {reason}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _UniformReference:
+    """Black and white at some `pixels` of the photographs, (n, c), with their variances."""
+
+    pixels: np.ndarray
+    black: np.ndarray
+    black_variance: np.ndarray
+    light: np.ndarray
+    white_variance: np.ndarray
+
+    @classmethod
+    def from_pictures(cls, ambient: Radiance, white: Radiance) -> _UniformReference:
+        known = white.valid & ambient.valid
+        in_all_channels = known.reshape(*known.shape[:2], -1).all(axis=2)
+        pixels = agreement.spread(np.flatnonzero(in_all_channels))
+        black = agreement.sample(ambient.value, pixels).astype(np.float64)
+        bright = agreement.sample(white.value, pixels).astype(np.float64)
+        return cls(
+            pixels=pixels,
+            black=black,
+            black_variance=agreement.sample(ambient.variance, pixels).astype(np.float64),
+            light=bright - black,
+            white_variance=agreement.sample(white.variance, pixels).astype(np.float64),
+        )
+
+    def share_of_white(self, picture: Radiance) -> tuple[float, float]:
+        """Part g of white that a picture shows, by least squares, and its standard deviation."""
+        value = agreement.sample(picture.value, self.pixels)
+        variance = agreement.sample(picture.variance, self.pixels)
+        valid = agreement.sample(picture.valid, self.pixels)
+        weight = self.light[valid]
+        total = max(float(np.sum(weight**2)), 1e-30)
+        share = float(np.sum(((value - self.black) * self.light)[valid])) / total
+        noise = (variance + self.black_variance)[valid]
+        deviation = float(np.sqrt(np.sum(weight**2 * noise))) / total
+        return share, deviation
+
+    def expected(self, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance under a part of white, and its variance."""
+        light = share * self.light
+        unevenness = (PROJECTOR_UNEVENNESS * share * self.light) ** 2
+        variance = self.black_variance + share**2 * self.white_variance + unevenness
+        return self.black + light, variance
+
+
+def check_uniform(
+    session: CaptureSession,
+    photographs: Sequence[Photograph],
+    pictures: Sequence[Radiance],
+    ambient: Radiance,
+) -> None:
+    """Refuse photographs of uniform codes that do not show black and a rising part of white.
+
+    The last of `pictures` is white; if it is that of a colour, so is the last photograph.
+    """
+    *darker_pictures, white = pictures
+    reference = _UniformReference.from_pictures(ambient, white)
+    about_white = ""
+    if len(photographs) > len(darker_pictures):
+        about_white = f", which {session.name(photographs[-1])} is"
+    previous_share = 0.0
+    previous_name = None
+    for photograph, picture in zip(photographs, darker_pictures, strict=False):
+        name = session.name(photograph)
+        share, share_noise = reference.share_of_white(picture)
+        sampled = agreement.sample(photograph.image, reference.pixels)
+        deviation = agreement.find_deviation(
+            [sampled], [photograph.seconds], session.camera, reference.expected(share)
+        )
+        if deviation is not None:
+            raise AcquisitionError(
+                f"{name}, of a uniform code, does not show a part of white{about_white}: "
+                f"another light was on, or it is another pattern; {agreement.ADVICE}"
+            )
+        tolerance = MIN_SIGMAS * share_noise + PROJECTOR_UNEVENNESS * previous_share
+        if previous_name is not None and share < previous_share - tolerance:
+            raise AcquisitionError(
+                f"{previous_name} or {name} deviates: it shows {share / previous_share:.2g} times "
+                f"the light of a darker code; {agreement.ADVICE}"
+            )
+        previous_share = share
+        previous_name = name
+
+
+def check_map(
+    session: CaptureSession,
+    resampling: Resampling,
+    stripes: Sequence[Photograph],
+    blocks: np.ndarray,
+    white: np.ndarray,
+) -> None:
+    """Refuse Gray code in which a pattern was exchanged with its inverse.
+
+    Its map is mirrored in part. The picture of blocks (H, W[, c]) tells: it is more like their
+    pattern in the map that exchanging them back gives. `white` is a picture too; both are without
+    ambient light.
+    """
+    if not stripes:
+        return
+    likeness = _block_correlation(resampling, blocks, white)
+    if likeness > MIN_MAP_CORRELATION:
+        return
+    light = [session.linear(photograph) for photograph in stripes]
+    for k in range(0, len(stripes) - 2, 2):
+        exchanged = light.copy()
+        exchanged[k] = light[k + 1]
+        exchanged[k + 1] = light[k]
+        with contextlib.suppress(InputError):
+            mapping = decode(exchanged, resampling.grid, levels=session.shots.levels)
+            corrected = Resampling.of(mapping)
+            if _block_correlation(corrected, blocks, white) > max(likeness, MIN_MAP_CORRELATION):
+                names = f"{session.name(stripes[k])} and {session.name(stripes[k + 1])}"
+                raise AcquisitionError(
+                    f"{names} are exchanged, a pattern and its inverse; {agreement.ADVICE}"
+                )
+
+
+def _block_correlation(resampling: Resampling, blocks: np.ndarray, white: np.ndarray) -> float:
+    """Correlation of a picture of blocks, relative to white, with their pattern."""
+    codes = anchor.pattern(resampling.grid).ravel()
+    lit = resampling.apply(blocks).reshape(len(codes), -1).sum(axis=1)
+    full = resampling.apply(white).reshape(len(codes), -1).sum(axis=1)
+    seen = resampling.seen.ravel() & (full > 0)
+    # Without any pixels, or if all are alike, the correlation is NaN.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(np.corrcoef(lit[seen] / full[seen], codes[seen])[0, 1])
