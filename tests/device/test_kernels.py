@@ -16,6 +16,7 @@ from pyopencl import _cl
 
 from ltcl.device import sources, vectors
 from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
+from ltcl.solvers import krylov_state
 
 TWINS = (Path(__file__).parents[1] / "reference.py").read_text(encoding="utf-8")
 FILES = sorted(path.stem for path in sources.folder().glob("*.cl"))
@@ -44,9 +45,24 @@ def test_every_kernel_has_a_twin_and_every_line_its_mark(name):
         assert re.search(rf"^def {twin}", TWINS, re.MULTILINE), kernel
 
 
-DEFINES = {"K": 2, "STRIP": 2, "WIDTH": 8, "PLACE": "int", "VALUES": 2, "TAPS": 4, "PAIRS": 1}
 HEADER = "common/lanes.h"
-DEFINES |= {"LANES": 8, "BLOCKS": 1, "CHUNK": 2, "WALKS": 2, "CHANNELS": 2, "LINKED": 1}
+# One value of each define of each file.
+DEFINES = {
+    "K": 2,
+    "STRIP": 2,
+    "WIDTH": 8,
+    "PLACE": "int",
+    "VALUES": 2,
+    "TAPS": 4,
+    "PAIRS": 1,
+    "LANES": 8,
+    "BLOCKS": 1,
+    "CHUNK": 2,
+    "WALKS": 2,
+    "CHANNELS": 2,
+    "LINKED": 1,
+    **krylov_state.DEFINES,
+}
 
 
 @pytest.mark.parametrize("name", FILES)
