@@ -147,7 +147,7 @@ class Launch:
     def __init__(self, kernel: Kernel, items: Size, group: Size, arguments: dict[str, Any]) -> None:
         self._kernel = kernel
         self._name = kernel.name
-        self._queue = kernel.device.launch
+        self._device = kernel.device
         self._parameters = kernel.parameters
         self._group = kernel.group(group if isinstance(group, tuple) else (group,))
         self.resize(items)
@@ -161,7 +161,7 @@ class Launch:
     def __call__(self) -> None:
         """Queue the launch; returns at once."""
         if self._has_items:
-            self._queue(self._name, self._handle, self._size, self._group)
+            self._device.launch(self._name, self._handle, self._size, self._group)
 
     def set(self, /, **values: Any) -> None:
         """Change arguments, by name, for the launches that follow: ``launch.set(keep=0.5)``."""
