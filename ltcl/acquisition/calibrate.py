@@ -26,7 +26,8 @@ from ltcl.acquisition import anchor, consistency, radiometry
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.calibration import Calibration
-from ltcl.acquisition.exposure import (
+from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
+from ltcl.acquisition.metering import (
     MAX_EXPOSURE_RATIO,
     SATURATED_CODE,
     WHITE_LEVEL,
@@ -39,7 +40,6 @@ from ltcl.acquisition.exposure import (
     offered_exposures,
     scan_exposures,
 )
-from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
 from ltcl.acquisition.radiometry import Radiance, Response
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
