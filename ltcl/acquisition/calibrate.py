@@ -195,7 +195,7 @@ def expected_photographs(
     times = CaptureTimes(black=(2.0, 3.0), white=(1.0, 2.0, 3.0), scan=(2.0, 3.0))
     repeats = effort.repeats(frames, camera_pixels)
     groups = effort.requests(grid, channels, repeats, times)
-    captures = sum(len(group) for group in groups)
+    captures = sum(map(len, groups))
     return EXPECTED_PROBES + effort.exposures * len(ramps) + stripes + captures
 
 
