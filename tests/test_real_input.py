@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A transport traced by an independent renderer, with the true bounces: ../shared/data/transport-dihedral.
+"""A transport traced by an independent renderer, with its true bounces.
 
-What may be expected of the bounces, from what is known of the file (README.md there): F is wrong by
-e, 0.93 % for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a corner whose
-form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and 0.15 % of T p.
+The file is ../shared/data/transport-dihedral. Bounds of the errors follow from its README.md: F is
+wrong by e, 0.93 % for diag(T) and 0.26 % for the exact one; ||A|| <= m = 0.7, the albedo of a
+corner whose form factors sum to less than one; noise is n of the picture, in `bounces.npz`, and
+0.15 % of T p.
 
 With F' = (1 + d) F the solve gives b_0' = (1 + d) b_0, and to first order of d, X = S^-1 = I - A,
 
     b_k' - b_k = A^k d b_0 - sum_{j < k} A^j d (b_{k-1-j} - b_{k-j})
 
-so that its norm is at most e (m^k |b_0| + sum m^j |b_{k-1-j} - b_{k-j}|). Noise is independent from pixel to
-pixel: it passes the I of X as it is, A averages it away, and it adds to the bias as squares do.
+so that its norm is at most e (m^k |b_0| + sum m^j |b_{k-1-j} - b_{k-j}|). Noise is independent from
+pixel to pixel: it passes the I of X as it is, A averages it away, and it adds to the bias as
+squares do.
 """
 
 from __future__ import annotations
@@ -29,14 +31,15 @@ BOUNCES = 4  # k = 0 .. 3
 
 
 def norm(pictures: np.ndarray) -> np.ndarray:
-    """Of each frame (..., h, w)."""
+    """Norm of each frame (..., h, w)."""
     return np.linalg.norm(pictures, axis=(-2, -1))
 
 
 @pytest.fixture(scope="module")
 def transports(shared_data: Path, device: ltcl.Device) -> dict[str, ltcl.Transport]:
     with np.load(shared_data / "transport-dihedral" / "transport.npz") as file:
-        T, (h, w) = file["T"], file["grid"].tolist()
+        T = file["T"]
+        h, w = file["grid"].tolist()
     return {how: ltcl.Transport(T, (h, w), how, device=device) for how in ERROR_OF_F}
 
 
@@ -50,7 +53,7 @@ def truth(shared_data: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def errors(truth, transports) -> dict[str, np.ndarray]:
-    """Of bounce k in each picture, as a fraction of its direct part: (k, frames)."""
+    """Error of bounce k in each picture, as a fraction of its direct part: (k, frames)."""
     bounces, _ = truth
     result = {}
     for how, T in transports.items():
@@ -61,7 +64,7 @@ def errors(truth, transports) -> dict[str, np.ndarray]:
 
 
 def bound(truth: tuple[np.ndarray, np.ndarray], error_of_F: float) -> np.ndarray:
-    """What the module's first lines promise, like `errors`."""
+    """The bound in the docstring of this module, (k, frames) like `errors`."""
     bounces, noise = truth
     size = norm(bounces)
     steps = norm(bounces[:-1] - bounces[1:])  # |b_k - b_(k+1)|
@@ -89,7 +92,7 @@ def test_the_exact_first_bounce_is_better_where_bias_dominates(truth, errors):
 
 @pytest.mark.parametrize("how", ERROR_OF_F)
 def test_a_texture_within_reach_is_reproduced(transports, how):
-    """Half of what the fully lit wall shows, times stripes, a disc and a ramp: p stays within 0 and 1."""
+    """Half of the fully lit wall, times stripes, a disc and a ramp: p stays within 0 and 1."""
     T = transports[how]
     matrix = T.matrices[0].astype(np.float64)
     y, x = np.mgrid[: T.grid[0], : T.grid[1]] / np.array(T.grid).reshape(2, 1, 1)
@@ -100,6 +103,5 @@ def test_a_texture_within_reach_is_reproduced(transports, how):
     assert c.clipped == 0.0
     assert np.linalg.norm(matrix @ c.pattern - target) <= 0.01 * np.linalg.norm(target)
     uncompensated = matrix @ (target / T.first_bounce)
-    assert np.linalg.norm(uncompensated - target) > 0.1 * np.linalg.norm(
-        target
-    )  # there was something to do
+    # The compensation had an effect.
+    assert np.linalg.norm(uncompensated - target) > 0.1 * np.linalg.norm(target)

@@ -34,7 +34,7 @@ from ltcl.acquisition.metering import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
-from ltcl.acquisition.rigs.virtual import CURVES, Sensor
+from ltcl.acquisition.rigs.simulated import CURVES, Sensor
 from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.settings import ScanSettings
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError

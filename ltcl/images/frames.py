@@ -44,7 +44,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame of a folder or a video.
+    """A frame of a folder or a video.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Source:
 
 
 def is_frames(path: str | os.PathLike[str]) -> bool:
-    """Whether `path` is a folder, or has the extension of a video."""
+    """True if `path` is a folder, or has the extension of a video."""
     return Path(path).is_dir() or Path(path).suffix.lower() in EXTENSIONS
 
 

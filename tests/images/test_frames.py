@@ -68,13 +68,13 @@ def film(count: int, size: tuple[int, int] = (32, 48)) -> np.ndarray:
 @pytest.mark.parametrize("suffix", [".mkv", ".avi"])
 @pytest.mark.parametrize("size", [(2, 2), (32, 48)])
 def test_lossless_videos_give_every_code_back(tmp_path, suffix, size):
-    codes, path = film(5, size), tmp_path / f"a{suffix}"
-    codes[1], codes[2] = codes[0], codes[2, ..., :1]  # the latter is grey, and comes back as that
-    pictures = [
-        *images.from_srgb(codes[:4] / 255),
-        2 * images.from_srgb(codes[4] / 255) - 0.5,
-    ]  # is clipped
-    codes[4] = np.rint(255 * images.to_srgb(np.clip(pictures[4], 0, 1)))
+    path = tmp_path / f"a{suffix}"
+    codes = film(5, size)
+    codes[1] = codes[0]
+    codes[2] = codes[2, ..., :1]  # grey, and read as grey
+    clipped = 2 * images.from_srgb(codes[4] / 255) - 0.5
+    pictures = [*images.from_srgb(codes[:4] / 255), clipped]
+    codes[4] = np.rint(255 * images.to_srgb(np.clip(clipped, 0, 1)))
     assert write_video(path, iter(pictures), fps=12.5) == 5
     np.testing.assert_array_equal(cv2.VideoCapture(str(path)).read()[1][..., ::-1], codes[0])  # BGR
     source = open_frames(path)
@@ -96,14 +96,17 @@ def test_a_video_is_upright_as_a_player_shows_it(tmp_path):
     )
     turned = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
     (tmp_path / "b.mp4").write_bytes(data[:place] + turned + data[place + 36 :])
-    for codes, turned in zip(
-        *(open_frames(tmp_path / name) for name in ("a.mp4", "b.mp4")), strict=True
-    ):
-        np.testing.assert_allclose(turned.picture(), np.rot90(codes.picture(), -1), atol=0.02)
+    original = open_frames(tmp_path / "a.mp4")
+    rotated = open_frames(tmp_path / "b.mp4")
+    for frame, turned_frame in zip(original, rotated, strict=True):
+        expected = np.rot90(frame.picture(), -1)
+        np.testing.assert_allclose(turned_frame.picture(), expected, atol=0.02)
 
 
 def test_a_truncated_video_gives_the_frames_there_are_and_an_error(tmp_path):
-    codes, frames, path = film(20), [], tmp_path / "cut.avi"
+    path = tmp_path / "cut.avi"
+    codes = film(20)
+    frames = []
     write_video(path, images.from_srgb(codes / 255))
     path.write_bytes(path.read_bytes()[: int(0.9 * path.stat().st_size)])
     with pytest.raises(FileError) as error:

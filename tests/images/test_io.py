@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is written is what is read, format by format; the sRGB curve and resampling against closed forms."""
+"""Pictures written and read, format by format; the sRGB curve and resampling."""
 
 from __future__ import annotations
 
@@ -23,9 +23,12 @@ INTEGERS = [(".png", 8), (".png", 16), (".bmp", 8), (".tif", 8), (".tiff", 16)]
 @pytest.mark.parametrize("encoding", ["auto", "srgb", "linear"])
 @pytest.mark.parametrize(("suffix", "bits"), INTEGERS)
 def test_integer_formats_give_every_code_back(tmp_path, suffix, bits, encoding, shape):
-    path, white = tmp_path / f"a{suffix}", 2**bits - 1
+    path = tmp_path / f"a{suffix}"
+    white = 2**bits - 1
     codes = random.integers(0, white + 1, shape)
-    linear = codes / white if encoding == "linear" else images.from_srgb(codes / white)
+    linear = codes / white
+    if encoding != "linear":
+        linear = images.from_srgb(linear)
     images.write(path, linear, encoding=encoding, bits=bits)
     result = images.read(path, encoding=encoding)
     assert (result.dtype, result.flags.c_contiguous) == (np.float32, True)
@@ -78,10 +81,8 @@ def test_a_picture_is_read_upright_and_a_photograph_keeps_its_pixels(
 
 
 def test_palettes_are_looked_up_and_bits_are_black_and_white(tmp_path):
-    palette, bits = (
-        Image.fromarray(np.array([[1, 0]], np.uint8), "P"),
-        Image.fromarray(np.eye(2) > 0),
-    )
+    palette = Image.fromarray(np.array([[1, 0]], np.uint8), "P")
+    bits = Image.fromarray(np.eye(2) > 0)
     palette.putpalette([10, 20, 30, 40, 50, 60])
     for picture, codes in ((palette, [[[40, 50, 60], [10, 20, 30]]]), (bits, 255 * np.eye(2))):
         picture.save(tmp_path / "a.png")
@@ -92,7 +93,8 @@ def test_palettes_are_looked_up_and_bits_are_black_and_white(tmp_path):
     ("suffix", "dtype"), [(".png", "uint8"), (".png", "uint16"), (".tif", "float32")]
 )
 def test_alpha_is_dropped_only_where_it_is_opaque(tmp_path, suffix, dtype):
-    path, white = tmp_path / f"a{suffix}", 1 if dtype == "float32" else np.iinfo(dtype).max
+    path = tmp_path / f"a{suffix}"
+    white = 1 if dtype == "float32" else np.iinfo(dtype).max
     codes = np.full((3, 3, 4), white, dtype)
     cv2.imwrite(str(path), codes)
     np.testing.assert_array_equal(images.read(path), np.ones((3, 3, 3)))

@@ -19,12 +19,11 @@ from ltcl.images.thumbnails import thumbnails
 
 
 def decoded(html: str) -> list[np.ndarray]:
-    data = [
-        base64.b64decode(part) for part in re.findall(r'src="data:image/png;base64,([^"]+)"', html)
-    ]
-    return [
-        np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)) for png in data
-    ]
+    pictures = []
+    for part in re.findall(r'src="data:image/png;base64,([^"]+)"', html):
+        png = np.frombuffer(base64.b64decode(part), np.uint8)
+        pictures.append(np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED)))
+    return pictures
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +45,8 @@ def results() -> dict[str, Any]:
 
 
 def test_text_is_one_line(results: dict[str, Any], tmp_path: Path) -> None:
-    T, store = ltcl.scenes.dihedral(4).transport(), tmp_path / "T.zarr"
+    T = ltcl.scenes.dihedral(4).transport()
+    store = tmp_path / "T.zarr"
     ltcl.acquire(VirtualRig(T, T.grid), geometry="aligned", strategy="pixel", store=store)
     for name, result in {**results, "Report": Report.of(store)}.items():
         text = repr(result)
@@ -64,7 +64,8 @@ def test_html_holds_small_pictures(results: dict[str, Any], name: str, count: in
 
 def test_pictures_are_encoded_as_light() -> None:
     """White is the 0.99 quantile; colours, frames and large pictures as their means."""
-    light, nan = np.full((200, 100, 3), (0.5, 0.25, 0.0)), np.full((2, 2), np.nan)
+    light = np.full((200, 100, 3), (0.5, 0.25, 0.0))
+    nan = np.full((2, 2), np.nan)
     frames = np.stack([np.eye(2), np.ones((2, 2))])
     html = thumbnails("a < b", {"x": light, "frames": frames, "dark": np.zeros((2, 2)), "nan": nan})
     colour, first, *black = decoded(html)

@@ -141,7 +141,7 @@ def decode(
 
 
 def _fits_neighbours(value: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Whether valid coordinates (H, W) fit those of their neighbours.
+    """True where valid coordinates (H, W) fit those of their neighbours.
 
     The centre of a plane is the median of its 5 x 5 neighbourhood. A pixel may deviate from that by
     one projector pixel and twice the median absolute deviation of the neighbours, which is large at

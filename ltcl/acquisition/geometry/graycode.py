@@ -28,7 +28,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import check_photographs
-from ltcl.acquisition.radiometry.merge import in_strips
+from ltcl.acquisition.radiometry.strips import in_strips
 from ltcl.errors import InputError
 
 # Values of all pictures of a strip of rows: 2 MiB of float32 stay in the cache.
@@ -59,7 +59,7 @@ BELOW_PAIR = (np.s_[..., :-1, :], np.s_[..., 1:, :])
 
 @dataclass(frozen=True)
 class Axis:
-    """One projector coordinate of every camera pixel, arrays (H, W) float32.
+    """A projector coordinate of every camera pixel, arrays (H, W) float32.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ def _gray_bits(size: int, bits: int) -> list[np.ndarray]:
 
 
 def _has_fine_stripes(code: GrayCode) -> np.ndarray:
-    """Whether each pattern but the last two, white and black, has fine stripes."""
+    """True for patterns with fine stripes; the last two, white and black, are left out."""
     column_bits, row_bits = code.bits
     significance = np.concatenate([np.arange(column_bits)[::-1], np.arange(row_bits)[::-1]])
     return np.repeat(significance < FINE_BITS, 2)

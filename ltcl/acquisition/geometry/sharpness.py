@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How well a camera separates the projector's pixels, from photographs of Gray code stripes.
+"""Sharpness of a camera on the projector's pixels, from photographs of Gray code stripes.
 
 With b = 1 and -1 where a pattern of stripes is on and off, and D the photograph of it less that of
 its inverse, on the projector's grid, light from elsewhere is in both and cancels. The rest of pixel
@@ -51,7 +51,7 @@ MIN_PATTERNS = 3
 
 @dataclass(frozen=True)
 class Sharpness:
-    """How well a camera separates the projector's pixels.
+    """Sharpness of a camera: to what extent it separates the projector's pixels.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from ltcl.acquisition.geometry.graycode import BELOW_PAIR, RIGHT_PAIR, Axis
-from ltcl.acquisition.radiometry.merge import in_strips
+from ltcl.acquisition.radiometry.strips import in_strips
 
 # Projector pixels by which a plane may leave a pixel's cell: six times the error of an edge.
 MAX_CELL_EXCESS = 0.25

@@ -7,6 +7,7 @@
     noise           noise of a camera, estimated from repeated photographs
     black_level     level of a camera without light
     merge           photographs to radiance, with its variance and its valid pixels
+    strips          work on a picture in strips of rows, in parallel
     projector       from codes to the light of the projector, and how its colours mix
 
 A linear value is light on the sensor, 1 at the largest code; radiance is linear value per second.

@@ -124,8 +124,9 @@ def exposure_stack(images: Sequence[Any], seconds: Any, levels: int | None = Non
     order = np.argsort(times, kind="stable")
     shape = arrays[0].shape
     pixels = shape[0] * shape[1]
+    ordered = [arrays[k].reshape(pixels, -1) for k in order]
     stack = ExposureStack(
-        images=tuple(arrays[k].reshape(pixels, -1) for k in order),
+        images=tuple(ordered),
         shape=shape,
         seconds=times[order],
         levels=code_levels(arrays, levels),
@@ -200,7 +201,7 @@ def _check_order(stack: ExposureStack, order: np.ndarray) -> None:
 
 
 def _is_brighter(short: np.ndarray, long: np.ndarray, ratio: float, rounding: float) -> bool:
-    """Whether codes (pixels, channels) may have `ratio` times the exposure of others."""
+    """True if codes (pixels, channels) may have `ratio` times the exposure of others."""
     is_clear = np.maximum(short, long) < ORDER_TEST.clipped_code
     rise = (long - short)[is_clear]
     if ratio == 1.0 or rise.size < 2:

@@ -17,9 +17,7 @@ saturated or at the lowest code.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,6 +28,7 @@ from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import ExposureStack, exposure_stack
 from ltcl.acquisition.radiometry.noise import NoiseModel, choose_levels
 from ltcl.acquisition.radiometry.response import Response
+from ltcl.acquisition.radiometry.strips import in_strips
 from ltcl.errors import InputError
 
 # Standard deviations: clipping there moves a mean by less than a hundredth of one.
@@ -126,7 +125,9 @@ def merge(
     pixels, channels = stack.images[0].shape
     if response.channels > channels:
         raise InputError("response has 3 channels, but images are grey; it must have one")
-    offsets = _channel_offsets(noise.black if black is None else black, channels)
+    if black is None:
+        black = noise.black
+    offsets = _channel_offsets(black, channels)
     mergers = [ChannelMerger(stack, response, noise, offsets[c], c) for c in range(channels)]
     value = np.empty((pixels, channels), np.float32)
     variance = np.empty((pixels, channels), np.float32)
@@ -139,17 +140,6 @@ def merge(
     in_strips(pixels, BLOCK_PIXELS, merge_rows)
     shape = stack.shape
     return Radiance(value.reshape(shape), variance.reshape(shape), valid.reshape(shape))
-
-
-def in_strips(height: int, rows: int, work: Callable[[slice], None]) -> None:
-    """Do `work` on slices of at most `rows` (at least one) of `height` rows, in parallel."""
-    step = max(rows, 1)
-    strips = [slice(top, min(top + step, height)) for top in range(0, height, step)]
-    if len(strips) == 1:  # a thread takes longer to start than a small picture to merge
-        work(strips[0])
-        return
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(work, strips))
 
 
 def _channel_offsets(black: Any, channels: int) -> np.ndarray:
@@ -196,7 +186,8 @@ class ChannelMerger:
 
     def merge(self, pixels: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Value, variance and validity of some pixels."""
-        light = self._linear(np.stack([image[pixels] for image in self.images]))
+        codes = np.stack([image[pixels] for image in self.images])
+        light = self._linear(codes)
         is_unsaturated = light <= self.saturation
         light -= self.black
         light *= is_unsaturated

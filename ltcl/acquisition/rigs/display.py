@@ -1,37 +1,51 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Display`: codes, full screen, on a projector that is a display of this computer; `show` of a folder there.
+"""`Display`: codes in full screen, on a projector that is a display of this computer.
 
 Pixels of the grid become square blocks of display pixels, of codes round(255 x) for x in [0, 1],
-with black around. pygame-ce (SDL 2) draws. Known limits: 8 bits; one display in a process, used
-from the main thread.
+with black around. pygame-ce (SDL 2) draws. `show` displays a folder of patterns one after the
+other. Known limits: 8 bits; one display in a process, used from the main thread.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition.rig import Closing, as_codes, load_extra
-from ltcl.acquisition.rigs.folder import FolderRig, Shot, enlarge
+from ltcl.acquisition.rigs.folder import FolderRig, enlarge
+from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.files import as_path
 from ltcl.images.frames import open_frames
 
-_POLL = 0.05  # seconds
+# Seconds between two looks for a key or a photograph.
+POLL_SECONDS = 0.05
 
 
 class Display(Closing):
-    """One display, full screen, that shows codes of `grid` (h, w), at most its pixels (extra `projector`).
+    """A display in full screen that shows codes of a grid (extra `projector`).
 
-    `index` counts from 0; None is the second display, or the only one. InputError where it is
-    missing, the grid does not fit, or pygame has a window already; AcquisitionError where pygame-ce
-    is not installed, or no display goes full screen.
+    Parameters
+    ----------
+    grid : (int, int)
+        Height and width of the codes, at most the pixels of the display.
+    index : int, optional
+        Number of the display, from 0; None for the second display, or the only one.
+
+    Raises
+    ------
+    InputError
+        The display is missing, the grid does not fit, or pygame has a window already.
+    AcquisitionError
+        pygame-ce is not installed, or no display goes full screen.
 
     Examples
     --------
@@ -53,36 +67,40 @@ class Display(Closing):
                 raise AcquisitionError(f"no display can be opened: {error}") from error
 
     def show(self, codes: Any) -> None:
-        """Show codes, (h, w) or (h, w, 3) in [0, 1]; AcquisitionError once the display is closed."""
+        """Show codes, (h, w) or (h, w, 3) in [0, 1]; AcquisitionError if the display is closed."""
         codes = as_codes(codes, self.grid, 3)
         self.key_pressed()
         levels = enlarge(np.rint(codes * 255).astype(np.uint8), self.size)
-        levels = np.broadcast_to(levels[..., None] if levels.ndim == 2 else levels, (*self.size, 3))
-        self._pygame.surfarray.blit_array(
-            self._screen, levels.swapaxes(0, 1)
-        )  # pygame counts pixels (x, y)
+        if levels.ndim == 2:
+            levels = levels[..., None]
+        levels = np.broadcast_to(levels, (*self.size, 3))
+        # pygame counts pixels (x, y).
+        self._pygame.surfarray.blit_array(self._screen, levels.swapaxes(0, 1))
         self._pygame.display.flip()
 
     def key_pressed(self) -> bool:
-        """Whether a key was pressed since the last call; Escape and the window's button close the display."""
+        """True if a key was pressed since the last call.
+
+        Escape and the window's button close the display: AcquisitionError, then and afterwards.
+        """
         if self._screen is None:
             raise AcquisitionError("the display is closed")
-        pygame, pressed = self._pygame, False
+        pygame = self._pygame
+        is_pressed = False
         for event in pygame.event.get():
-            if event.type == pygame.QUIT or (
-                event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE
-            ):
+            is_key = event.type == pygame.KEYDOWN
+            if event.type == pygame.QUIT or (is_key and event.key == pygame.K_ESCAPE):
                 self.close()
                 raise AcquisitionError("the display was closed by its window or the Escape key")
-            pressed |= event.type == pygame.KEYDOWN
-        return pressed
+            is_pressed |= is_key
+        return is_pressed
 
     def describe(self) -> dict[str, Any]:
-        """Plain JSON for the records."""
+        """The display as plain JSON."""
         return {"kind": "display", "index": self.index, "size": self.size, "period": self.period}
 
     def close(self) -> None:
-        """Give the display back; it cannot show anything after that."""
+        """Release the display; it cannot show anything afterwards."""
         self._screen = None
         self._pygame.display.quit()
 
@@ -90,24 +108,34 @@ class Display(Closing):
         display = self._pygame.display
         display.init()
         sizes = display.get_desktop_sizes()
-        self.index = (
-            min(1, len(sizes) - 1) if index is None else checks.count("index", index, least=0)
-        )
-        if self.index not in range(len(sizes)):
-            offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes)) or "none"
-            raise InputError(f"index is {index}, of {offered}; a projector must extend the desktop")
+        self.index = _choose_display(index, sizes)
         w, h = sizes[self.index]
-        self.size = h, w
-        enlarge(np.zeros(self.grid), self.size)  # refuses what does not fit
+        self.size = (h, w)
+        enlarge(np.zeros(self.grid), self.size)  # refuses a grid that does not fit
         rate = display.get_desktop_refresh_rates()[self.index]
         self.period = 1.0 / rate if rate > 0 else None
         self._screen = display.set_mode((w, h), self._pygame.FULLSCREEN, display=self.index)
-        if (actual := self._screen.get_size()) != (w, h):
+        actual_size = self._screen.get_size()
+        if actual_size != (w, h):
             raise AcquisitionError(
-                f"full screen is {actual}, not {w, h}; switch the desktop's scaling off"
+                f"full screen is {actual_size}, not {w, h}; switch the desktop's scaling off"
             )
         self._pygame.mouse.set_visible(False)
         display.set_allow_screensaver(False)
+
+
+def _choose_display(index: int | None, sizes: list[tuple[int, int]]) -> int:
+    """Number of a display among those of `sizes` (w, h); None is the second or the only one."""
+    if index is None:
+        chosen = min(1, len(sizes) - 1)
+    else:
+        chosen = checks.count("index", index, least=0)
+    if chosen not in range(len(sizes)):
+        offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes))
+        if not offered:
+            offered = "none"
+        raise InputError(f"index is {index}, of {offered}; a projector must extend the desktop")
+    return chosen
 
 
 def show(
@@ -116,14 +144,34 @@ def show(
     advance: str | float = "key",
     progress: Callable[[Shot, int, int], None] | None = None,
 ) -> int:
-    """Show the patterns of a folder, or one picture, full screen, one after the other; returns how many.
+    """Show the patterns of a folder, or one picture, in full screen, one after the other.
 
-    Of a `FolderRig` in the order of the shooting list, without photographs that are there already;
-    else the pictures of the folder by the numbers in their names. `display` counts from 0, or is an
-    open one or the like: `show(codes)` and `key_pressed()`. The next pattern is shown after a
-    "key", at the "arrival" of the photograph in the folder, or after so many seconds, as `advance`
-    says. `progress` is called with each `Shot`, how many were before it, and how many there are.
-    Errors as of `Display`; InputError or FileError for an unusable `advance`, nothing to show.
+    Parameters
+    ----------
+    folder : path
+        Folder of a `FolderRig`, whose patterns come in the order of the shooting list, without
+        those that are photographed already; or a folder of pictures, in the order of the numbers in
+        their names; or one picture.
+    display : int or object
+        Number of the display, from 0; or an open one, or any object with `show(codes)` and
+        `key_pressed()`.
+    advance : "key", "arrival" or float
+        The next pattern is shown after a key, after the photograph arrives in the folder, or after
+        so many seconds.
+    progress : callable, optional
+        Called with each `Shot`, the number of shots before it, and the number of all.
+
+    Returns
+    -------
+    int
+        The number of patterns.
+
+    Raises
+    ------
+    InputError, FileError
+        `advance` cannot be used, or there is nothing to show; as in `Display`.
+    AcquisitionError
+        As in `Display`.
 
     Examples
     --------
@@ -132,24 +180,20 @@ def show(
     ltcl.errors.FileError: nowhere: has no shooting list, which 'ltcl acquire run' writes
     """
     folder = as_path(folder)
-    if isinstance(advance, str) and advance not in ("key", "arrival"):
+    if not isinstance(advance, str):
+        checks.number("advance", advance, above=0.0)
+    elif advance not in ("key", "arrival"):
         raise InputError(f"advance is {advance!r}; it must be 'key', 'arrival' or seconds")
-    patience = (
-        float("inf") if isinstance(advance, str) else checks.number("advance", advance, above=0.0)
-    )
     is_picture = folder.is_file() and advance != "arrival"
-    folder, name = (folder.parent, folder.name) if is_picture else (folder, "")
-    rig = FolderRig(folder, (1, 1))  # any grid has the same list
     if is_picture:
-        shots = [Shot(1, name, 0.0, "")]
-    elif rig.shots:
-        shots = [rig.shots[number - 1] for number in rig.missing()]
-    elif advance == "arrival" or not folder.is_dir() or (folder / "acquisition.toml").exists():
-        raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
-    else:
-        shots = [Shot(frame.number, frame.name, 0.0, "") for frame in open_frames(folder)]
+        shots = [Shot(1, folder.name, 0.0, "")]
+        folder = folder.parent
+    rig = FolderRig(folder, (1, 1))  # any grid has the same list
+    if not is_picture:
+        shots = _shots_to_show(rig, advance)
     if not shots:
         return 0
+
     h, w = images.read(folder / shots[0].pattern).shape[:2]
     is_open = hasattr(display, "show")
     with contextlib.nullcontext(display) if is_open else Display((h, w), index=display) as screen:
@@ -157,9 +201,29 @@ def show(
             screen.show(images.read(folder / shot.pattern, encoding="linear"))
             if progress is not None:
                 progress(shot, done, len(shots))
-            end = time.monotonic() + patience
-            while time.monotonic() < end and not (screen.key_pressed() and advance == "key"):
-                if advance == "arrival" and shot.number not in rig.missing():
-                    break
-                time.sleep(_POLL)
+            _wait_for_next(screen, rig, shot, advance)
     return len(shots)
+
+
+def _shots_to_show(rig: FolderRig, advance: str | float) -> list[Shot]:
+    """Shots of the shooting list that are still missing, or the pictures of a plain folder."""
+    if rig.shots:
+        return [rig.shots[number - 1] for number in rig.missing()]
+    folder: Path = rig.folder
+    has_project = (folder / "acquisition.toml").exists()
+    if advance == "arrival" or not folder.is_dir() or has_project:
+        raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
+    return [Shot(frame.number, frame.name, 0.0, "") for frame in open_frames(folder)]
+
+
+def _wait_for_next(screen: Any, rig: FolderRig, shot: Shot, advance: str | float) -> None:
+    """Wait for a key, for the photograph of the shot, or for some seconds."""
+    patience = math.inf if isinstance(advance, str) else advance
+    end = time.monotonic() + patience
+    while time.monotonic() < end:
+        is_pressed = screen.key_pressed()
+        if is_pressed and advance == "key":
+            return
+        if advance == "arrival" and shot.number not in rig.missing():
+            return
+        time.sleep(POLL_SECONDS)

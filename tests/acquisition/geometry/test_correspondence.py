@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Maps from Gray code against the truth: smooth ones, the rim of the picture, folds and occluders."""
+"""Maps from Gray code against the truth: smooth ones, the rim, folds and occluders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from ltcl.acquisition.geometry import GrayCode, Resampling, decode
 from tests.acquisition.geometry.scenes import homography, photographs, places, turned
 from tests.acquisition.scanning.helpers import corner
 
-GRID, CAMERA = (8, 16), (30, 60)
+GRID = (8, 16)
+CAMERA = (30, 60)
 random = np.random.default_rng()
 
 
@@ -53,13 +54,15 @@ def test_places_and_light_are_known_up_to_the_rim(size, turn, shift) -> None:
     mapping = decode([(C @ p.ravel()).reshape(camera) for p in GrayCode(GRID).patterns()], GRID)
     x, y = places(place, camera)
     deviation = np.hypot(mapping.x - x, mapping.y - y)
-    (h, w), valid = GRID, mapping.valid
+    h, w = GRID
+    valid = mapping.valid
     rim = valid & ((np.minimum(x, w - 1 - x) < 0.5) | (np.minimum(y, h - 1 - y) < 0.5))
     assert rim.sum() > 100
     assert np.sqrt(np.mean(deviation[rim] ** 2)) < 0.04
     assert deviation[rim].max() < 0.08
     assert np.sqrt(np.mean(deviation[valid & ~rim] ** 2)) < 0.03
-    R, area = Resampling.of(mapping), np.asarray(C.sum(axis=0)).reshape(GRID)
+    R = Resampling.of(mapping)
+    area = np.asarray(C.sum(axis=0)).reshape(GRID)
     assert R.seen[area > 0.97 * area.max()].all()
     for p in random.random((3, np.prod(GRID))):
         light = corner() @ p
@@ -68,14 +71,15 @@ def test_places_and_light_are_known_up_to_the_rim(size, turn, shift) -> None:
 
 
 def folded(u: Any, v: Any) -> tuple[Any, Any]:
-    """The camera is beside the projector: at the corner's edge the map is continuous, its slope is not."""
-    a, b = u / 3.0 - 1.0, v / 3.0 - 0.8
+    """The camera is beside the projector: at the corner's edge the slope of the map jumps."""
+    a = u / 3.0 - 1.0
+    b = v / 3.0 - 0.8
     bend = np.maximum(a - 7.5, 0.0)
     return a - 0.25 * bend, b + 0.02 * a
 
 
 def occluded(u: Any, v: Any) -> tuple[Any, Any]:
-    """A board nearer to both shifts what it shows: some pixels behind it only the projector sees."""
+    """A board nearer to both shifts places: some pixels behind it only the projector sees."""
     x, y = folded(u, v)
     board = (np.abs(u - 14.7) < 7.2) & (np.abs(v - 14.4) < 7.4)
     return np.where(board, x + 3.0, x), y
@@ -100,7 +104,8 @@ def test_folds_and_occluders(place: Any, response: str, limit: float) -> None:
     )
     shots = Shots(rig)
     images = [shots.photograph(codes, 0.5) for codes in GrayCode(GRID).patterns()]
-    mapping, (x, y) = decode(images, GRID, levels=shots.levels), places(place, CAMERA)
+    mapping = decode(images, GRID, levels=shots.levels)
+    x, y = places(place, CAMERA)
     inside = (np.abs(x - 7.5) < 7.5) & (np.abs(y - 3.5) < 3.5)
     deviation = np.where(mapping.valid & inside, np.hypot(mapping.x - x, mapping.y - y), 0.0)
     assert mapping.valid[inside].mean() > 0.9
@@ -109,7 +114,8 @@ def test_folds_and_occluders(place: Any, response: str, limit: float) -> None:
     assert not mapping.valid[(x < -1) | (x > 16) | (y < -1) | (y > 8)].any()
     R = Resampling.of(mapping)
     area = np.asarray(C.sum(axis=0)).reshape(GRID)  # in camera pixels
-    hidden, clear = area < 0.05, area > 7.5
+    hidden = area < 0.05
+    clear = area > 7.5
     assert hidden.any() == (place is occluded)
     assert not R.seen[hidden].any()
     assert R.seen[area > 4].all()

@@ -25,14 +25,18 @@ def test_the_patterns_are_those_of_opencv():
 @pytest.mark.parametrize("levels", [None, 200])
 def test_its_own_patterns_decode_exactly_also_in_colour(grid, levels):
     code = GrayCode(grid)
-    images = [p if levels is None else (20 + levels * p).astype(np.uint8) for p in code.patterns()]
+    images = code.patterns()
+    if levels is not None:
+        images = [(20 + levels * pattern).astype(np.uint8) for pattern in images]
     assert len(images) == code.count
-    for pictures in (images, [np.stack([image, image // 2, image], axis=-1) for image in images]):
-        for axis, exact in zip(
-            code.decode(pictures), np.mgrid[: grid[0], : grid[1]][::-1], strict=True
-        ):
-            np.testing.assert_array_equal(axis.value, exact)
-            np.testing.assert_array_equal(axis.width, 1)
+    colour = [np.stack([image, image // 2, image], axis=-1) for image in images]
+    exact_y, exact_x = np.mgrid[: grid[0], : grid[1]]
+    for pictures in (images, colour):
+        x, y = code.decode(pictures)
+        np.testing.assert_array_equal(x.value, exact_x)
+        np.testing.assert_array_equal(y.value, exact_y)
+        np.testing.assert_array_equal(x.width, 1)
+        np.testing.assert_array_equal(y.width, 1)
 
 
 @pytest.mark.parametrize("n", range(1, 16))
@@ -48,7 +52,7 @@ def test_a_pixel_on_an_edge_lies_between_its_two_columns(n):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_rows_do_not_continue_in_the_next_row(turned):
-    """A camera of two columns: the last pixel of a row and the first of the next differ by one, too."""
+    """In two columns the last pixel of a row and the first of the next differ by one, too."""
     code = GrayCode((6, 2))
     x, y = code.decode([p[:, ::-1] if turned else p for p in code.patterns()])
     np.testing.assert_array_equal(x.right, [[0.5, np.nan]] * 6)
@@ -77,10 +81,12 @@ def test_pixels_that_no_stripe_lights_are_not_valid():
 def test_hardly_a_pixel_is_wrong_with_noise_and_with_light_from_elsewhere(
     grid, noise, indirect, least
 ):
-    """Direct light is 0.6 of full scale; of indirect light bits are certain up to nearly twice as much."""
-    place, camera = homography((150, 200), grid), (150, 200)
+    """Direct light is 0.6 of full scale; bits are certain up to nearly twice as much indirect."""
+    camera = (150, 200)
+    place = homography(camera, grid)
     images = list(photographs(place, camera, grid, noise, random, indirect))
-    mapping, (x, y) = decode(images, grid, subpixel=False), places(place, camera)
+    mapping = decode(images, grid, subpixel=False)
+    x, y = places(place, camera)
     assert mapping.decoded > least
     deviation = np.maximum(np.abs(mapping.x - x), np.abs(mapping.y - y))[mapping.valid]
     assert np.mean(deviation > 1.0) < 1e-3
@@ -100,7 +106,8 @@ def test_tall_pictures_are_decoded_as_their_parts() -> None:
         return 0.7 * u + 0.005 * v + 0.3, 0.55 * v + 0.02 * u + 0.2
 
     images = list(photographs(place, (700, 111), (400, 83), 0.0, random))
-    whole, inside = decode(images, (400, 83)), slice(40, 110)
+    whole = decode(images, (400, 83))
+    inside = slice(40, 110)
     for top in (100, 230, 400, 540):
         rows = slice(top, top + 150)
         alone = decode([image[rows] for image in images], (400, 83))

@@ -55,7 +55,7 @@ def points(mapping, board) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_board_is_a_plane(points):
-    """But for distortion of the two lenses, a homography takes one picture of a plane to the other."""
+    """Except for lens distortion, a homography takes one picture of a plane to the other."""
     camera, projector = points
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
     distance = np.linalg.norm(
@@ -67,23 +67,25 @@ def test_the_board_is_a_plane(points):
 
 
 def test_the_calibration_of_the_authors_agrees(shared_data, points):
-    """Points triangulated by it fall back on the pixels they came from, within its own residual of 0.86."""
+    """Triangulated points project back on their pixels, within its own residual of 0.86."""
     path = shared_data / "graycode-real" / "calibration_result.xml"
-    file, names = (
-        cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ),
-        ("cam_int", "cam_dist", "proj_int"),
-    )
-    K, D, P, E, R, t = (
-        file.getNode(name).mat() for name in (*names, "proj_dist", "roration", "translation")
-    )
-    camera, projector = points[0][::20], STEP * points[1][::20].astype(np.float64)
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    K = file.getNode("cam_int").mat()
+    D = file.getNode("cam_dist").mat()
+    P = file.getNode("proj_int").mat()
+    E = file.getNode("proj_dist").mat()
+    R = file.getNode("roration").mat()
+    t = file.getNode("translation").mat()
+    camera = points[0][::20]
+    projector = STEP * points[1][::20].astype(np.float64)
     lenses = ((camera, K, D), (projector, P, E))
     rays = [cv2.undistortPoints(points[:, None], k, d)[:, 0].T for points, k, d in lenses]
     X = cv2.triangulatePoints(np.eye(3, 4), np.hstack([R, t.reshape(3, 1)]), *rays)
     X = (X[:3] / X[3]).T
-    back = cv2.projectPoints(X, cv2.Rodrigues(R)[0], t, P, E)[0][:, 0], projector
-    ahead = cv2.projectPoints(X, np.zeros(3), np.zeros(3), K, D)[0][:, 0], camera
-    for seen, exact in (back, ahead):
+    rotation, _ = cv2.Rodrigues(R)
+    in_projector, _ = cv2.projectPoints(X, rotation, t, P, E)
+    in_camera, _ = cv2.projectPoints(X, np.zeros(3), np.zeros(3), K, D)
+    for seen, exact in ((in_projector[:, 0], projector), (in_camera[:, 0], camera)):
         assert np.sqrt(np.mean(np.sum((seen - exact) ** 2, axis=1))) < 0.857
     flat = X - X.mean(axis=0)
     spread = np.linalg.svd(flat, full_matrices=False)[1] / np.sqrt(len(X))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs on the projector's grid: what is exact, averaged or masked; by rays through camera pixels."""
+"""Photographs on the projector's grid against rays through camera pixels."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("grid", "camera"), SIZES)
 def test_smooth_pictures_come_out_where_the_camera_sees(grid, camera):
-    """Constants exactly, waves to a hundredth of their contrast; whole pixels inside, none outside."""
+    """Constants are exact, waves good to a hundredth of their contrast; none is seen outside."""
     x, y = places(homography(camera, grid), camera)
-    R, (X, Y) = Resampling.of(known(x, y, grid)), np.mgrid[: grid[0], : grid[1]][::-1].astype(float)
+    R = Resampling.of(known(x, y, grid))
+    Y, X = np.mgrid[: grid[0], : grid[1]].astype(float)
     assert R.weights[~R.seen.ravel()].nnz == 0
     np.testing.assert_allclose(R.apply(np.full(camera, 7.5))[R.seen], 7.5, rtol=2e-6)
     full = R.coverage > 0.9
@@ -43,8 +44,9 @@ def test_smooth_pictures_come_out_where_the_camera_sees(grid, camera):
     tilted = np.abs(R.apply(0.3 * x - 0.2 * y) - (0.3 * X - 0.2 * Y))[full]
     assert np.mean(tilted) < 0.012  # of 0.3 a pixel
     assert not R.seen[(x.max() + 5 - X < 0) | (y.max() + 5 - Y < 0)].any()
-    left, right, top, bottom = x[:, 0].max(), x[:, -1].min(), y[0].max(), y[-1].min()
-    inside = np.minimum(np.minimum(X - left, right - X), np.minimum(Y - top, bottom - Y)) > 4
+    inside_x = np.minimum(X - x[:, 0].max(), x[:, -1].min() - X)
+    inside_y = np.minimum(Y - y[0].max(), y[-1].min() - Y)
+    inside = np.minimum(inside_x, inside_y) > 4
     assert np.quantile(R.coverage[inside], 0.05) > 0.85
 
 
@@ -59,7 +61,7 @@ def test_variance_is_that_of_independent_pixels():
 
 
 def test_nothing_leaks_across_the_border_of_an_object():
-    """The right half lies 12 projector pixels further on: no footprint spans the gap, which stays unseen."""
+    """The right half lies 12 projector pixels further: no footprint spans the gap."""
     v, u = np.mgrid[:40, :40].astype(float)
     x = u + np.where(u >= 20, 12.0, 0.0)
     R = Resampling.of(known(x, v, (40, 52)))
@@ -106,13 +108,11 @@ def test_smaller_camera_pixels_separate_noise_pixel_by_pixel(size, missing, limi
     place, camera = turned(WALL, size * np.hypot(1, turn), turn, wide=1.32)
     valid = random.random(camera) >= missing
     x, y = places(place, camera)
-    inside = (np.abs(x - (WALL[1] - 1) / 2) < WALL[1] / 2) & (
-        np.abs(y - (WALL[0] - 1) / 2) < WALL[0] / 2
-    )
-    C, R = (
-        camera_map(place, camera, WALL, points=24),
-        Resampling.of(known(x, y, WALL, inside & valid)),
-    )
+    h, w = WALL
+    inside_x = np.abs(x - (w - 1) / 2) < w / 2
+    inside_y = np.abs(y - (h - 1) / 2) < h / 2
+    C = camera_map(place, camera, WALL, points=24)
+    R = Resampling.of(known(x, y, WALL, inside_x & inside_y & valid))
     assert R.seen.mean() > (0.98 if missing else 0.999)
     assert R.coverage[R.seen].min() > (0.1 if missing else 0.5)
     for p in random.random((3, *WALL)):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,10 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.images import from_srgb, to_srgb
 
 Curve = Callable[[np.ndarray], np.ndarray]
-_G, _M = 1.2, 0.25  # of a film: light^G / (light^G + M^G)
+
+# Film: light^G / (light^G + M^G).
+FILM_EXPONENT = 1.2
+FILM_MIDDLE = 0.25**FILM_EXPONENT
 
 # Light to code and code to light, both of [0, 1].
 CURVES: dict[str, tuple[Curve, Curve]] = {
@@ -20,15 +23,15 @@ CURVES: dict[str, tuple[Curve, Curve]] = {
     "srgb": (to_srgb, from_srgb),
     "gamma2.2": (lambda x: x ** (1 / 2.2), lambda c: c**2.2),
     "film": (
-        lambda x: (1 + _M**_G) * x**_G / (x**_G + _M**_G),
-        lambda c: _M * (c / (1 + _M**_G - c)) ** (1 / _G),
+        lambda x: (1 + FILM_MIDDLE) * x**FILM_EXPONENT / (x**FILM_EXPONENT + FILM_MIDDLE),
+        lambda c: (FILM_MIDDLE * c / (1 + FILM_MIDDLE - c)) ** (1 / FILM_EXPONENT),
     ),
 }
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Poisson and read noise of linear light, the curve above a black offset of the codes, then levels."""
+    """Poisson and read noise of linear light, a curve above a black offset, and rounding."""
 
     curve: str = "srgb"
     levels: int = 256
@@ -37,7 +40,7 @@ class Camera:
     black: float = 0.004
 
     def codes(self, light: np.ndarray) -> np.ndarray:
-        """Of linear values without noise, in [0, 1]; odd below 0."""
+        """Codes of linear values without noise, in [0, 1]; odd below 0."""
         encode = CURVES[self.curve][0]
         return self.black + (1 - self.black) * np.copysign(
             encode(np.minimum(np.abs(light), 1.0)), light
@@ -58,6 +61,12 @@ class Camera:
             np.uint8 if self.levels == 256 else np.uint16
         )
 
+    def bracket(
+        self, radiance: np.ndarray, seconds: Iterable[float], rng: np.random.Generator
+    ) -> list[np.ndarray]:
+        """A photograph at each exposure."""
+        return [self.shoot(radiance, t, rng) for t in seconds]
+
     @property
     def response(self) -> Response:
         return Response(self.light(np.linspace(0, 1, 16385)))
@@ -65,6 +74,15 @@ class Camera:
     @property
     def noise(self) -> NoiseModel:
         return NoiseModel(self.electrons, self.read, 0.0, 0.96, self.levels)
+
+
+def shoot_channels(
+    cameras: list[Camera], radiance: np.ndarray, seconds: list[float]
+) -> list[np.ndarray]:
+    """Photographs (H, W, 3) whose channels have a camera each."""
+    random = np.random.default_rng()
+    channels = [camera.bracket(radiance, seconds, random) for camera in cameras]
+    return list(np.stack(channels, axis=-1))
 
 
 def corner(n: int = 256) -> np.ndarray:

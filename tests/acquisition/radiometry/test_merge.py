@@ -3,29 +3,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ltcl.acquisition.radiometry import NoiseModel, Response, merge
 from ltcl.errors import InputError
-from tests.acquisition.radiometry.cameras import CURVES, Camera, corner
+from tests.acquisition.radiometry.cameras import CURVES, Camera, corner, shoot_channels
 
 SECONDS = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
 random = np.random.default_rng()
-STEPS, REPEATS = 40, 8000
+STEPS = 40
+REPEATS = 8000
 
 
 @pytest.mark.parametrize("levels", [256, 4096, 0])
 @pytest.mark.parametrize("curve", CURVES)
 def test_merged_radiance_is_unbiased_and_its_variance_true(curve, levels):
-    """At every brightness, from near the noise to all but the shortest exposure saturated.
+    """Brightness goes from near the noise to all but the shortest exposure saturated.
 
     A mean of 8000 has the standard error 0.011 of the noise of one: four and a half are allowed. In
     8 bits the read noise is half a code, so that it dithers them.
     """
     camera = Camera(curve, levels, read=0.002 if levels == 256 else 0.001, black=0.02)
     light = np.repeat(np.geomspace(2.5e-3, 6.0, STEPS), REPEATS).reshape(STEPS, REPEATS)
-    shots = [camera.shoot(light, t, random) for t in SECONDS]
+    shots = camera.bracket(light, SECONDS, random)
     merged = merge(shots, SECONDS, camera.response, camera.noise)
     assert merged.valid.mean() > 0.999
     error = np.where(merged.valid, merged.value - light, 0.0)
@@ -36,9 +39,10 @@ def test_merged_radiance_is_unbiased_and_its_variance_true(curve, levels):
 
 @pytest.mark.parametrize("light", [0.0, 0.2])
 def test_it_is_as_good_as_the_noise_allows(light):
-    """The bound of Cramer and Rao where all exposures are clear; without light radiance scatters about 0."""
-    camera, t = Camera("linear", 4096, black=0.02), np.array(SECONDS)
-    shots = [camera.shoot(np.full((200, 200), light), seconds, random) for seconds in SECONDS]
+    """It reaches the bound of Cramer and Rao; without light radiance scatters about 0."""
+    camera = Camera("linear", 4096, black=0.02)
+    t = np.array(SECONDS)
+    shots = camera.bracket(np.full((200, 200), light), SECONDS, random)
     merged = merge(shots, SECONDS, camera.response, camera.noise)
     bound = 1.0 / np.sum(t**2 / camera.noise.variance(light * t))
     assert merged.valid.all()
@@ -70,14 +74,10 @@ def test_the_mean_of_repeated_photographs_and_its_variance(shots):
 
 
 def test_each_channel_has_its_own_response():
-    cameras = [
-        Camera(curve, 65536, electrons=1e9, read=0.0) for curve in ("srgb", "gamma2.2", "film")
-    ]
+    clean = Camera("srgb", 65536, electrons=1e9, read=0.0)
+    cameras = [clean, replace(clean, curve="gamma2.2"), replace(clean, curve="film")]
     response = Response(np.concatenate([camera.response.values for camera in cameras]))
-    shots = [
-        np.stack([camera.shoot(corner(32), t, random) for camera in cameras], axis=-1)
-        for t in (0.5, 1)
-    ]
+    shots = shoot_channels(cameras, corner(32), [0.5, 1.0])
     merged = merge(shots, [0.5, 1.0], response, NoiseModel(1e9, 1e-5))
     ratio = merged.value / corner(32)[..., None]
     np.testing.assert_allclose(ratio[merged.valid], 1.0, rtol=4e-3)
@@ -130,23 +130,22 @@ def test_a_few_noisy_pixels_among_saturated_ones_are_in_order(pixels, light, noi
 @pytest.mark.parametrize("black", [0.004, 0.16])
 @pytest.mark.parametrize(("lit", "hot"), [(0.0, 0.0), (0.01, 0.0), (0.3, 0.0), (0.0, 0.01)])
 def test_a_dark_picture_is_as_dark_at_any_exposure(black, lit, hot):
-    """Black cloth around some pixels that are lit, around hot ones, which never change, or around none."""
-    camera, light = Camera("gamma2.2", 16384, read=5e-4, black=black), np.zeros((40, 60))
-    light.flat[: int(lit * light.size)] = 0.03 * random.random(int(lit * light.size))
+    """Black cloth is around some lit pixels, around hot ones, which never change, or alone."""
+    camera = Camera("gamma2.2", 16384, read=5e-4, black=black)
+    light = np.zeros((40, 60))
+    lit_pixels = int(lit * light.size)
+    light.flat[:lit_pixels] = 0.03 * random.random(lit_pixels)
     stuck = random.random(light.shape) < hot
     for ratio in (1.5, 60.0):
-        shots = [np.where(stuck, 11469, camera.shoot(light, t, random)) for t in (1.0, ratio)]
-        assert merge(
-            [shot.astype(np.uint16) for shot in shots], [1.0, ratio], levels=16384
-        ).valid.any()
+        shots = np.stack(camera.bracket(light, [1.0, ratio], random))
+        shots[:, stuck] = 11469
+        assert merge(list(shots), [1.0, ratio], levels=16384).valid.any()
 
 
 @pytest.mark.parametrize("order", [[0, 1, 3, 2, 4, 5], [0, 1, 2, 2, 4, 5], [0, 2, 3, 4, 5, 1]])
 def test_photographs_in_the_wrong_order_are_named(order):
-    shots, later = (
-        [Camera().shoot(corner(), t, random) for t in SECONDS],
-        5 if order[-1] == 1 else 3,
-    )
+    shots = Camera().bracket(corner(), SECONDS, random)
+    later = 5 if order[-1] == 1 else 3
     with pytest.raises(InputError, match=rf"images\[{later}\] .* images\[{later - 1}\]"):
         merge([shots[k] for k in order], SECONDS)
 

@@ -15,8 +15,14 @@ from tests.acquisition.radiometry.cameras import Camera, corner
 random = np.random.default_rng()
 
 
+def burst(camera: Camera, light: np.ndarray, seconds: float, count: int) -> list[np.ndarray]:
+    """Photographs repeated without any change."""
+    return camera.bracket(light, [seconds] * count, random)
+
+
 def test_the_variance_is_photons_reading_and_rounding():
-    model, light = NoiseModel(1000.0, 0.01, levels=11), np.array([-0.1, 0.0, 0.5])
+    model = NoiseModel(1000.0, 0.01, levels=11)
+    light = np.array([-0.1, 0.0, 0.5])
     np.testing.assert_allclose(
         model.variance(light, 2.0), light.clip(0) / 1000 + 1e-4 + 2.0**2 * 0.1**2 / 12
     )
@@ -30,7 +36,7 @@ def test_the_variance_is_photons_reading_and_rounding():
 def test_photon_transfer_estimates_electrons_and_read_noise(curve, levels, read):
     """Half a million degrees of freedom: a standard error of about half a percent."""
     camera = Camera(curve, levels, 4000.0, read, black=0.05)
-    bursts = [[camera.shoot(corner(), t, random) for _ in range(5)] for t in (0.05, 1.0)]
+    bursts = [burst(camera, corner(), t, 5) for t in (0.05, 1.0)]
     model = estimate(bursts, response=camera.response, levels=levels or None)
     assert model.electrons == pytest.approx(4000.0, rel=0.03)
     assert model.read == pytest.approx(read, rel=0.03)
@@ -51,9 +57,7 @@ def test_read_noise_is_estimated_where_black_is_clipped_or_rounded_to_one_code(
     """
     camera = Camera("linear", 256, electrons, read, black)
     ramp = np.broadcast_to(np.linspace(0, 1, 64) ** 2.2 * 0.6, (64, 64))
-    bursts = [
-        [camera.shoot(light, 1.0, random) for _ in range(6)] for light in (ramp, 0 * ramp, 0 * ramp)
-    ]
+    bursts = [burst(camera, light, 1.0, 6) for light in (ramp, 0 * ramp, 0 * ramp)]
     model = estimate(bursts, response=camera.response, levels=256)
     assert model.electrons == pytest.approx(electrons, rel=0.24)
     assert abs(model.read - read) < max(0.5 * read, 0.29 / 255)  # what rounding alone adds
@@ -63,21 +67,17 @@ def test_a_scene_that_moves_between_repeated_photographs_is_not_noise():
     """Edges of a few pixels: were they noise, nothing that moves would deviate from it any more."""
     camera = Camera("linear", 4096, 10000.0, 0.002, black=0.05)
     light = np.where(np.arange(96) // 24 % 2, 0.7, 0.1) * np.linspace(0.8, 1.0, 64)[:, None]
-    bursts = [[camera.shoot(x, 1.0, random) for x in (light, np.roll(light, 1, axis=1))]]
-    model = estimate(bursts, response=camera.response, levels=4096)
+    moved = np.roll(light, 1, axis=1)
+    burst = [camera.shoot(light, 1.0, random), camera.shoot(moved, 1.0, random)]
+    model = estimate([burst], response=camera.response, levels=4096)
     assert model.electrons == pytest.approx(10000.0, rel=0.2)
 
 
 @pytest.mark.parametrize("levels", [4096, 0])
 def test_pixels_that_are_clipped_at_either_end_do_not_count(levels):
-    camera, light = (
-        Camera("linear", levels, read=5e-4, black=0.0),
-        np.geomspace(1e-3, 8, 9600).reshape(80, 120),
-    )
-    bursts = [
-        [camera.shoot(light * t, 1.0, random).clip(0, None) for _ in range(6)]
-        for t in (0.05, 0.3, 0.0)
-    ]
+    camera = Camera("linear", levels, read=5e-4, black=0.0)
+    light = np.geomspace(1e-3, 8, 9600).reshape(80, 120)
+    bursts = [list(np.clip(burst(camera, light, t, 6), 0, None)) for t in (0.05, 0.3, 0.0)]
     model = estimate(bursts, levels=levels or None)
     assert model.electrons == pytest.approx(10000.0, rel=0.03)
     assert model.read == pytest.approx(5e-4, rel=0.1)
@@ -125,8 +125,11 @@ LINE = Response.identity()
 
 
 def shots(ambient: np.ndarray, offset: Any) -> list[np.ndarray]:
-    light = [random.poisson(ambient * t * MODEL.electrons) / MODEL.electrons for t in SECONDS]
-    return [offset + part + random.normal(0, MODEL.read, part.shape) for part in light]
+    photographs = []
+    for t in SECONDS:
+        light = random.poisson(ambient * t * MODEL.electrons) / MODEL.electrons
+        photographs.append(offset + light + random.normal(0, MODEL.read, light.shape))
+    return photographs
 
 
 def test_the_level_of_each_channel_is_separated_from_ambient_light_without_bias():
@@ -139,14 +142,13 @@ def test_the_level_of_each_channel_is_separated_from_ambient_light_without_bias(
 
 
 def test_the_projectors_light_is_the_difference():
-    """Offset and ambient light are there with and without the projector, and gone from the difference."""
-    ambient, light = 0.05 * corner(100), 0.5 * corner(100)[::-1]
+    """Offset and ambient light cancel in the difference."""
+    ambient = 0.05 * corner(100)
+    light = 0.5 * corner(100)[::-1]
     black = black_level(shots(ambient, 0.02), SECONDS, LINE, MODEL)
-    pictures = [
-        merge(shots(seen, 0.02), SECONDS, noise=MODEL, black=black)
-        for seen in (ambient, ambient + light)
-    ]
-    lit = pictures[1] - pictures[0]
+    dark = merge(shots(ambient, 0.02), SECONDS, noise=MODEL, black=black)
+    bright = merge(shots(ambient + light, 0.02), SECONDS, noise=MODEL, black=black)
+    lit = bright - dark
     z = (lit.value - light) / np.sqrt(lit.variance)
     assert abs(z.mean()) < 0.06
     assert z.std() == pytest.approx(1.0, abs=0.05)

@@ -18,24 +18,28 @@ random = np.random.default_rng()
 
 def ramp(decode, sigma: float, scale: float = 1.0) -> list[Radiance]:
     """Pictures of uniform codes on a scene with ambient light, with noise."""
-    ambient, share = 0.05 * corner(64), scale * corner(64)[::-1]
+    ambient = 0.05 * corner(64)
+    share = scale * corner(64)[::-1]
     ones = np.ones(share.shape)
-    clean = [ambient + decode(c) * share for c in CODES]
-    return [
-        Radiance(L + random.normal(0, sigma, ones.shape), sigma**2 * ones, ones > 0) for L in clean
-    ]
+    pictures = []
+    for c in CODES:
+        noise = random.normal(0, sigma, ones.shape)
+        light = ambient + decode(c) * share
+        pictures.append(Radiance(light + noise, sigma**2 * ones, ones > 0))
+    return pictures
 
 
 @pytest.mark.parametrize("curves", [["linear"], ["gamma2.2"], ["srgb", "linear", "film"]])
 def test_the_projectors_curve_is_estimated_of_each_channel(curves):
-    decodes, codes = [CURVES[curve][1] for curve in curves], np.linspace(0, 1, 500)
+    codes = np.linspace(0, 1, 500)
+    decodes = [CURVES[curve][1] for curve in curves]
     ramps = [ramp(decode, 0.005) for decode in decodes]
-    ramps[0][5].valid[:8], ramps[0][5].value[:8] = False, 0.0  # which must not count
+    invalid = ramps[0][5]  # its rows must not count
+    invalid.valid[:8] = False
+    invalid.value[:8] = 0.0
     response = projector_response(CODES, ramps)
-    light, same = (
-        np.stack([decode(codes) for decode in ds], axis=-1)
-        for ds in (decodes, [np.array] * len(curves))
-    )
+    light = np.stack([decode(codes) for decode in decodes], axis=-1)
+    same = np.stack([codes] * len(curves), axis=-1)
     np.testing.assert_allclose(response.linear(same), light, atol=2e-3)
     np.testing.assert_allclose(response.linear(response.codes(same)), same, atol=1e-5)
 
@@ -85,9 +89,13 @@ BLACK = Radiance(np.zeros(WALL.shape), np.zeros(WALL.shape), np.full(WALL.shape,
 
 
 def lit(sigma: float, M: np.ndarray = M, ambient: float = 0.0) -> list[Radiance]:
-    clean = [ambient + WALL * M[:, d] for d in range(3)]
-    variance, valid = np.full(WALL.shape, sigma**2), np.full(WALL.shape, True)
-    return [Radiance(c + random.normal(0, sigma, c.shape), variance, valid) for c in clean]
+    variance = np.full(WALL.shape, sigma**2)
+    valid = np.full(WALL.shape, True)
+    pictures = []
+    for d in range(3):
+        noise = random.normal(0, sigma, WALL.shape)
+        pictures.append(Radiance(ambient + WALL * M[:, d] + noise, variance, valid))
+    return pictures
 
 
 def test_the_mixing_of_a_set_up_is_estimated_without_bias_less_black():
@@ -114,10 +122,8 @@ def test_mixings_are_refused_from_a_condition_number_of_a_million():
 
 def test_pictures_without_a_mixing_are_refused():
     good = lit(1e-3)
-    dark, unknown = (
-        replace(good[0], value=0 * WALL),
-        replace(good[0], valid=np.zeros(WALL.shape, bool)),
-    )
+    dark = replace(good[0], value=0 * WALL)
+    unknown = replace(good[0], valid=np.zeros(WALL.shape, bool))
     grey = replace(good[0], value=WALL[..., 0])
     for pictures, message in (
         (good[:2], "lit holds 2"),

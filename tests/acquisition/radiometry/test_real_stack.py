@@ -8,29 +8,40 @@ light is not the same in all of them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from ltcl.acquisition.radiometry import NoiseModel, calibrate, merge
+from ltcl.acquisition.radiometry import NoiseModel, Response, calibrate, merge
 
-EXIF, EXPOSURE_TIME = 0x8769, 33434
+EXIF = 0x8769
+EXPOSURE_TIME = 33434
+
+
+@dataclass(frozen=True)
+class Room:
+    """Photographs, their exposures, and the response estimated from them."""
+
+    images: list[np.ndarray]
+    seconds: np.ndarray
+    response: Response
 
 
 @pytest.fixture(scope="module")
-def room(shared_data: Path) -> SimpleNamespace:
-    images, seconds = [], []
+def room(shared_data: Path) -> Room:
+    images = []
+    seconds = []
     for path in sorted((shared_data / "hdr-stack-real").glob("*.jpg")):
         with Image.open(path) as image:
             images.append(np.array(image))
             seconds.append(float(image.getexif().get_ifd(EXIF)[EXPOSURE_TIME]))
     steps = 2.0 ** np.round(np.log2(seconds))
     assert (len(steps), steps.max(), steps.min()) == (7, 2.0, 2.0**-12)
-    return SimpleNamespace(images=images, seconds=steps, response=calibrate(images, steps))
+    return Room(images, steps, calibrate(images, steps))
 
 
 def test_the_response_is_monotone(room):
@@ -57,7 +68,8 @@ def test_every_part_of_the_stack_merges_to_the_same_radiance(room):
     assert whole.valid.mean() > 0.999
     low, high = np.quantile(whole.value[whole.valid], [0.001, 0.999])
     assert high / low > 1e4  # a photograph has 255
-    odd, even = (merge(room.images[k::2], room.seconds[k::2], room.response, noise) for k in (0, 1))
+    even = merge(room.images[0::2], room.seconds[0::2], room.response, noise)
+    odd = merge(room.images[1::2], room.seconds[1::2], room.response, noise)
     both = (odd.variance < (0.1 * odd.value) ** 2) & (even.variance < (0.1 * even.value) ** 2)
     assert both.mean() > 0.5
     assert abs(np.median(np.log(odd.value[both] / even.value[both]))) < 0.03

@@ -8,7 +8,7 @@ import pytest
 
 from ltcl.acquisition.radiometry import Response, calibrate
 from ltcl.errors import InputError
-from tests.acquisition.radiometry.cameras import CURVES, Camera, corner
+from tests.acquisition.radiometry.cameras import CURVES, Camera, corner, shoot_channels
 
 SECONDS = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
 USED = np.linspace(0.02, 0.9, 400)  # linear values
@@ -55,7 +55,7 @@ def test_bad_tables_are_refused(values, part):
 
 
 def bracket(camera: Camera, seconds=SECONDS) -> list[np.ndarray]:
-    return [camera.shoot(corner(), t, random) for t in seconds]
+    return camera.bracket(corner(), seconds, random)
 
 
 def error(response: Response, camera: Camera) -> float:
@@ -85,10 +85,7 @@ def test_few_exposures_suffice_in_any_order(seconds):
 
 def test_channels_have_curves_of_their_own_and_moving_objects_do_not_count():
     cameras = [Camera("srgb"), Camera("gamma2.2"), Camera("film")]
-    shots = [
-        np.stack([camera.shoot(corner(), t, random) for camera in cameras], axis=-1)
-        for t in SECONDS
-    ]
+    shots = shoot_channels(cameras, corner(), SECONDS)
     shots[2][60:90, 60:120] = 200  # somebody walked by
     for camera, values in zip(cameras, calibrate(shots, SECONDS).values, strict=True):
         assert error(Response(values), camera) < 0.005

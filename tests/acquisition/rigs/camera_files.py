@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files as cameras write them: JPEG, PNG and TIFF with EXIF, a small uncompressed DNG; a shooting list."""
+"""Files as cameras write them: JPEG, PNG and TIFF with EXIF, a small DNG; a shooting list."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write(path: Path, codes: np.ndarray, seconds: float | None = None) -> None:
 
 
 def write_dng(path: Path, raw: np.ndarray, seconds: float, **sides: int) -> None:
-    """Save raw values (h, w) of 12 bits under a red-green-green-blue filter; DNG specification 1.4."""
+    """Save raw values (h, w) of 12 bits under a red-green-green-blue filter as DNG 1.4."""
     h, w = raw.shape
     tags = {
         256: sides.get("w", w),

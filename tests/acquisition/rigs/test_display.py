@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Display` on SDL's dummy driver: what its surface holds, pixel by pixel; `show` on it and on a recorder."""
+"""`Display` on SDL's dummy driver, pixel by pixel; `show` of folders and pictures on it."""
 
 from __future__ import annotations
 
@@ -32,10 +32,13 @@ def screen() -> np.ndarray:
 
 
 def blocks(levels: np.ndarray) -> np.ndarray:
-    """What the screen shows then, (H, W, 3)."""
-    (h, w), expected = levels.shape[:2], np.zeros_like(screen())
-    side = min(len(expected) // h, expected.shape[1] // w)
-    top, left = (len(expected) - h * side) // 2, (expected.shape[1] - w * side) // 2
+    """The screen under these levels, (H, W, 3)."""
+    h, w = levels.shape[:2]
+    expected = np.zeros_like(screen())
+    H, W = expected.shape[:2]
+    side = min(H // h, W // w)
+    top = (H - h * side) // 2
+    left = (W - w * side) // 2
     colours = np.kron(levels.reshape(h, w, -1), np.ones((side, side, 1)))
     expected[top : top + h * side, left : left + w * side] = colours
     return expected
@@ -68,9 +71,13 @@ def test_escape_and_the_windows_button_end_it(kind: int, key: int) -> None:
 @pytest.mark.parametrize(
     ("change", "codes", "message"),
     [
-        *(({"grid": grid}, None, "grid is") for grid in ((1 << 20, 1), (2, 0))),
-        *(({"index": index}, None, f"index is {index}") for index in (7, -1)),
-        *(({}, codes, "codes") for codes in (np.zeros((2, 3)), np.full((2, 2), 1.1), "white")),
+        ({"grid": (1 << 20, 1)}, None, "grid is"),
+        ({"grid": (2, 0)}, None, "grid is"),
+        ({"index": 7}, None, "index is 7"),
+        ({"index": -1}, None, "index is -1"),
+        ({}, np.zeros((2, 3)), "codes"),
+        ({}, np.full((2, 2), 1.1), "codes"),
+        ({}, "white", "codes"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(change: dict[str, Any], codes: Any, message: str) -> None:
@@ -101,7 +108,7 @@ def photograph(rig: FolderRig, number: int) -> None:
 
 @pytest.mark.parametrize("advance", ["key", "arrival", 0.02])
 def test_patterns_are_shown_in_the_order_of_the_list(scan: FolderRig, advance: Any) -> None:
-    """As pictures of 4 x 8 pixels; those that are photographed already are left out."""
+    """Pictures have 4 x 8 pixels; patterns that are photographed already are left out."""
     photograph(scan, 2)
     large = np.kron([[0, 1, 0, 0], [0, 0, 1, 0]], np.full((2, 2), 255))
     shots = []
@@ -130,15 +137,15 @@ def test_a_folder_of_pictures_is_shown_in_the_order_of_their_numbers(tmp_path: P
 
 
 def test_one_picture_is_shown_alone_with_the_blocks_of_a_scan(tmp_path: Path) -> None:
-    codes, shown = random.integers(0, 256, (2, 3)), []
-    for suffix in (".png", ".exr"):  # as 'ltcl compensate' leaves them
-        images.write(
-            (path := tmp_path / "pattern").with_suffix(suffix), codes / 255, encoding="linear"
-        )
-    assert (
-        show(path.with_suffix(".png"), 0, 0.01, lambda *_: shown.append((screen(), blocks(codes))))
-        == 1
-    )
+    codes = random.integers(0, 256, (2, 3))
+    for name in ("pattern.png", "pattern.exr"):  # as 'ltcl compensate' leaves them
+        images.write(tmp_path / name, codes / 255, encoding="linear")
+    shown = []
+
+    def progress(*_: Any) -> None:
+        shown.append((screen(), blocks(codes)))
+
+    assert show(tmp_path / "pattern.png", 0, 0.01, progress) == 1
     np.testing.assert_array_equal(*shown[0])
 
 
@@ -150,7 +157,8 @@ def test_folders_and_displays_that_cannot_be_used_are_named(
 ) -> None:
     with pytest.raises(InputError, match=f"(index|advance) is {value!r}"):
         show(**{"folder": scan.folder, name: value})
-    (begun := scan.folder / "begun").mkdir()
+    begun = scan.folder / "begun"
+    begun.mkdir()
     (begun / "acquisition.toml").touch()
     for folder in ("nowhere", begun):
         with pytest.raises(FileError, match=f"{folder}: has no shooting list"):

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A folder rig with photographs of every kind, each way a folder can be wrong, mistakes in a scan."""
+"""A folder rig with photographs of every kind, damaged folders, and mistakes in a scan."""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -23,7 +22,9 @@ from tests.acquisition.rigs import camera_files
 
 random = np.random.default_rng()
 GRID = (3, 4)
-WHITE, BLACK, HALF = np.ones(GRID), np.zeros(GRID), np.full(GRID, 128 / 255)
+WHITE = np.ones(GRID)
+BLACK = np.zeros(GRID)
+HALF = np.full(GRID, 128 / 255)
 SHOTS = [(WHITE, 0.5), (BLACK, 0.5), (HALF, 0.5), (WHITE, 0.25), (WHITE, 0.5)]
 GREY = np.arange(12, dtype=np.uint8).reshape(GRID)
 COLOUR = np.arange(105, dtype=np.uint8).reshape(5, 7, 3)
@@ -37,15 +38,16 @@ def place(folder: Path, suffix: str = ".png", number: int = 1) -> Path:
 
 
 def put(folder: Path, number: int = 1) -> Path:
-    camera_files.write(path := place(folder, number=number), GREY)
+    path = place(folder, number=number)
+    camera_files.write(path, GREY)
     return path
 
 
 def write(path: Path, seconds: float = 1 / 30) -> None:
-    save, codes = (
-        (camera_files.write, COLOUR) if path.suffix != ".dng" else (camera_files.write_dng, RAW)
-    )
-    save(path, codes, seconds)
+    if path.suffix == ".dng":
+        camera_files.write_dng(path, RAW, seconds)
+    else:
+        camera_files.write(path, COLOUR, seconds)
 
 
 def prepared(folder: Path) -> FolderRig:
@@ -55,7 +57,7 @@ def prepared(folder: Path) -> FolderRig:
 
 
 def photograph(folder: Path, channels: int = 3) -> np.ndarray:
-    """That of white for 1/30 s, the only one."""
+    """The photograph of white for 1/30 s, the only one."""
     return FolderRig(folder, (1, 1), channels).photograph([[1.0]], 1 / 30)
 
 
@@ -64,9 +66,8 @@ def test_a_round_trip_gives_what_the_scene_gives(tmp_path: Path, channels: int, 
     T = [random.random((20, 12)) / 12 for _ in range(channels)]
     scene, direct = (Shots(VirtualRig(T, GRID, camera_grid=(4, 5), bits=12)) for _ in range(2))
     shape = GRID if channels == 1 else (*GRID, 3)
-    patterns = [
-        (random.integers(0, 2**bits, shape) / (2**bits - 1)).astype(np.float32) for _ in range(4)
-    ]
+    levels = random.integers(0, 2**bits, (4, *shape))
+    patterns = list((levels / (2**bits - 1)).astype(np.float32))
     shots = [(x, s) for x in patterns for s in (0.5, 2.0)] + [(patterns[0], 0.5)]
     options: dict[str, Any] = {"channels": channels, "pattern_bits": bits, "camera_bits": 12}
     Shots(FolderRig(tmp_path, GRID, **options)).prepare(shots)
@@ -77,18 +78,17 @@ def test_a_round_trip_gives_what_the_scene_gives(tmp_path: Path, channels: int, 
         images.write(tmp_path / f"{line['save as']}.tif", image / 65535, encoding="linear", bits=16)
 
     again = Shots(FolderRig(tmp_path, GRID, **options))
-    for (
-        x,
-        seconds,
-    ) in shots:  # the last is a repeat: another photograph of the same, with other noise
+    # The last is a repeat: another photograph of the same, with other noise.
+    for x, seconds in shots:
         np.testing.assert_array_equal(again.photograph(x, seconds), direct.photograph(x, seconds))
     assert (again.levels, again.name(9)) == (4096, "photograph 9 (photo_000009.tif)")
     assert again.describe()["rig"]["kind"] == "folder"
 
 
 def test_patterns_at_the_projectors_own_resolution(tmp_path: Path) -> None:
-    """3 x 4 pixels on 20 x 31: blocks of 6 x 6, 1 pixel of black above and below, 3 and 4 at the sides."""
-    rig, codes = FolderRig(tmp_path, GRID, projector=(20, 31)), np.arange(12).reshape(GRID) / 11
+    """3 x 4 pixels on 20 x 31 are blocks of 6 x 6, with 1 row of black above and below."""
+    rig = FolderRig(tmp_path, GRID, projector=(20, 31))
+    codes = np.arange(12).reshape(GRID) / 11
     rig.prepare([(codes, 0.5)])
     expected = np.pad(np.kron(np.rint(codes * 255), np.ones((6, 6))), [(1, 1), (3, 4)])
     np.testing.assert_array_equal(
@@ -96,29 +96,25 @@ def test_patterns_at_the_projectors_own_resolution(tmp_path: Path) -> None:
     )
     put(tmp_path)
     np.testing.assert_array_equal(rig.photograph(codes, 0.5), GREY)
-    with pytest.raises(
-        PhotographMissing, match="photograph 2 "
-    ):  # what is projected is not the same
+    # Another grid on the projector is another pattern.
+    with pytest.raises(PhotographMissing, match="photograph 2 "):
         FolderRig(tmp_path, GRID).photograph(codes, 0.5)
 
 
 @pytest.mark.parametrize("name", ["unknown", "0", "photographs.txt", "photographs/photo_1.webp"])
 def test_the_first_that_is_missing_is_the_next_step(tmp_path: Path, name: str) -> None:
-    """Other entries of the folder hide no photograph; to ask for what is not there counts as no repeat."""
+    """Other entries of the folder hide no photograph; a missing one is not counted as a repeat."""
     rig = prepared(tmp_path)
     (tmp_path / name).write_text("notes")
-    for shot in (SHOTS[0], SHOTS[2]):
-        with pytest.raises(
-            PhotographMissing, match=r"photograph 1 .*pattern_000001.*0\.5 s"
-        ) as error:
-            rig.photograph(*shot)
+    message = r"photograph 1 .*pattern_000001.*0\.5 s"
+    for codes, seconds in (SHOTS[0], SHOTS[2]):
+        with pytest.raises(PhotographMissing, match=message) as error:
+            rig.photograph(codes, seconds)
         assert (error.value.number, error.value.missing) == (1, 5)
-        assert error.value.shot == (
-            1,
-            "patterns/pattern_000001.png",
-            0.5,
-            "photographs/photo_000001",
-        )
+        shot = error.value.shot
+        assert (shot.number, shot.seconds) == (1, 0.5)
+        assert shot.pattern == "patterns/pattern_000001.png"
+        assert shot.save_as == "photographs/photo_000001"
     put(tmp_path)
     np.testing.assert_array_equal(rig.photograph(*SHOTS[0]), GREY)
     assert rig.missing() == (2, 3, 4, 5)
@@ -136,23 +132,19 @@ def test_preparing_twice_changes_nothing_and_a_second_batch_counts_on(tmp_path: 
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     put(tmp_path)
     rig.photograph(*SHOTS[0])
-    with pytest.raises(InputError):
-        rig.prepare(
-            [SHOTS[0], SHOTS[0], (WHITE, 0.0)]
-        )  # the second and a third photograph of the same
+    with pytest.raises(InputError):  # after the second and a third photograph of the same
+        rig.prepare([SHOTS[0], SHOTS[0], (WHITE, 0.0)])
     with pytest.raises(PhotographMissing) as error:
         rig.photograph(HALF, 1.0)  # nobody announced it
-    assert (error.value.number, error.value.missing, len(FolderRig(tmp_path, GRID).shots)) == (
-        2,
-        6,
-        7,
-    )
+    assert (error.value.number, error.value.missing) == (2, 6)
+    assert len(FolderRig(tmp_path, GRID).shots) == 7
 
 
 @pytest.mark.parametrize("other", ["PHOTO_000001.PNG", "photo_1.png"])
 def test_two_files_for_one_number_are_refused(tmp_path: Path, other: str) -> None:
-    """Names that differ in case only are two files as well, where the file system keeps them apart."""
-    rig, path = prepared(tmp_path), put(tmp_path)
+    """Names that differ in case only are two files as well, if the file system keeps them apart."""
+    rig = prepared(tmp_path)
+    path = put(tmp_path)
     shutil.copy(path, path.with_name(other))
     names = "|".join([other, path.name])
     with pytest.raises(AcquisitionError, match=f"({names}) and ({names})"):
@@ -166,7 +158,8 @@ WRONG = [
     7,
     None,
     [{"codes": "0"}],
-    *([{"codes": "0", "seconds": seconds}] for seconds in (-1, np.inf)),
+    [{"codes": "0", "seconds": -1}],
+    [{"codes": "0", "seconds": np.inf}],
 ]
 LISTS = [json.dumps({"format": "ltcl shooting list 1", "shots": shots}) for shots in WRONG]
 
@@ -181,29 +174,31 @@ def test_a_damaged_list_is_refused(tmp_path: Path, content: str) -> None:
 
 
 def test_the_cameras_own_files_are_taken(tmp_path: Path) -> None:
-    """In the order of their numbers, in place of those that are missing, all or none, and each once."""
+    """Files come in the order of their numbers, all or none, and each once."""
     rig = prepared(tmp_path)
     paths = [tmp_path / name for name in ("IMG_101.png", "IMG_100.png", "IMG_10.png", "IMG_9.png")]
     for k, path in enumerate(paths):
         camera_files.write(path, GREY + 4 - k)
     put(tmp_path, 2)
-    for files, message in [
-        (paths[1:], "holds 3 .* 4 "),
-        ([*paths[1:], __file__], r"test_folder\.py: "),
-    ]:
-        with pytest.raises(InputError, match=message):
-            rig.take(files)
+    with pytest.raises(InputError, match=r"holds 3 .* 4 "):
+        rig.take(paths[1:])
+    with pytest.raises(InputError, match=r"test_folder\.py: "):
+        rig.take([*paths[1:], __file__])
     assert rig.missing() == (1, 3, 4, 5)
     rig.take(paths)
-    np.testing.assert_array_equal([rig.photograph(*s)[0, 0] for s in SHOTS], [1, 0, 2, 3, 4])
+    first_codes = [rig.photograph(codes, seconds)[0, 0] for codes, seconds in SHOTS]
+    assert first_codes == [1, 0, 2, 3, 4]
     assert all(path.exists() for path in paths)  # copied, not moved
     rig.prepare([(HALF, 1.0), (HALF, 1.0)])
     with pytest.raises(InputError, match=r"0 new .* 2 .* 6 to 7"):
         rig.take(paths)
-    camera_files.write(new := tmp_path / "IMG_11.png", GREY + 5)
-    shutil.copyfile(paths[0], twin := tmp_path / "IMG_102.png")  # a second one, equal in every byte
+    new = tmp_path / "IMG_11.png"
+    camera_files.write(new, GREY + 5)
+    twin = tmp_path / "IMG_102.png"
+    shutil.copyfile(paths[0], twin)  # a second one, equal in every byte
     rig.take([twin, new, *paths])
-    assert [rig.photograph(HALF, 1.0)[0, 0] for _ in range(2)] == [5, 4]
+    assert rig.photograph(HALF, 1.0)[0, 0] == 5
+    assert rig.photograph(HALF, 1.0)[0, 0] == 4
 
 
 NAMES = ["projector_grid", "channels", "camera_bits", "pattern_bits", "projector", "exposures"]
@@ -243,7 +238,8 @@ def test_codes_are_not_changed(tmp_path: Path, kind: str, shape: tuple[int, ...]
 def test_floats_above_full_scale_are_refused(tmp_path: Path) -> None:
     """Codes of 12 bits as floats. A hot pixel alone is no reason."""
     codes = np.full((12, 16), 0.5, np.float32)
-    codes[3, 4], codes[0, 0] = 7.0, 1.0005
+    codes[3, 4] = 7.0
+    codes[0, 0] = 1.0005
     images.write(place(tmp_path, ".exr"), codes)
     np.testing.assert_array_equal(photograph(tmp_path), codes)
     images.write(place(tmp_path, ".exr"), codes * np.float32(300.0))
@@ -269,15 +265,18 @@ def test_damage_gives_one_line_or_a_photograph(tmp_path: Path, suffix: str) -> N
     write(path)
     content = np.frombuffer(path.read_bytes(), np.uint8)
     for _ in range(50):
-        damaged, places = content.copy(), random.integers(0, len(content), 4)
-        damaged[places[1:]] = random.integers(0, 256, 3)
-        path.write_bytes(damaged[: places[0] if places[0] % 2 else None].tobytes())
-        message = f"photograph 1 ({path.name}) "
+        damaged = content.copy()
+        end, *places = random.integers(0, len(content), 4)
+        damaged[places] = random.integers(0, 256, 3)
+        if end % 2:
+            damaged = damaged[:end]
+        path.write_bytes(damaged.tobytes())
         try:
             assert photograph(tmp_path).size
         except LtclError as error:
             message = str(error)
-        assert re.fullmatch(re.escape(f"photograph 1 ({path.name}) ") + ".*", message)
+            assert message.startswith(f"photograph 1 ({path.name}) ")
+            assert "\n" not in message
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.1])
@@ -324,17 +323,16 @@ def scan(folder: Path, store: Path, progress: Any = None) -> np.ndarray:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     """A folder with all that a person photographed for a scan, and the T that came of it."""
-    root, truth = (
-        tmp_path_factory.mktemp("session"),
-        ltcl.scenes.dihedral(4, albedo=0.6).transport().matrices[0],
-    )
+    root = tmp_path_factory.mktemp("session")
+    truth = ltcl.scenes.dihedral(4, albedo=0.6).transport().matrices[0]
     lit = VirtualRig(truth, (4, 8), ambient=0.01, response="linear")
     for _ in range(30):
         try:
             T = scan(root / "photos", root / "T.zarr")
         except PhotographMissing:
             for shot in camera_files.shooting_list(root / "photos"):
-                path, seconds = root / "photos" / f"{shot['save as']}.png", float(shot["seconds"])
+                path = root / "photos" / f"{shot['save as']}.png"
+                seconds = float(shot["seconds"])
                 codes = images.read_codes(root / "photos" / shot["project"]) / np.float32(255)
                 if not path.exists():
                     camera_files.write(path, lit.photograph(codes, seconds), seconds)
@@ -362,8 +360,10 @@ def stop(step: str, done: int, total: int) -> None:
 def test_a_bad_photograph_is_named_by_its_file(
     session: tuple[Path, np.ndarray], tmp_path: Path, swaps: list[tuple[int, int]], text: str
 ) -> None:
-    """The calibration was committed in an earlier session. Put right, the scan goes on where it was."""
-    folder, store = Path(shutil.copytree(session[0], tmp_path / "photos")), tmp_path / "T.zarr"
+    """The calibration is of an earlier session; with the right files the scan goes on."""
+    folder = tmp_path / "photos"
+    store = tmp_path / "T.zarr"
+    shutil.copytree(session[0], folder)
     with pytest.raises(KeyboardInterrupt):
         scan(folder, store, stop)
     first = len(list((folder / "photographs").iterdir())) - 6  # before the pattern of blocks

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`LiveRig` on SDL's dummy display, before cameras that lag, tear, adapt, drift, freeze and go away."""
+"""`LiveRig` on SDL's dummy display, with cameras that lag, tear, adapt, drift or freeze."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -12,11 +13,12 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition import Display, LiveRig, Shots, VirtualRig
-from ltcl.acquisition.rigs import live
+from ltcl.acquisition.rigs import link
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
 random = np.random.default_rng()
-GRID, SECONDS = (6, 8), 1 / 15
+GRID = (6, 8)
+SECONDS = 1 / 15
 FRAME = 1 / 30  # seconds between two frames of the camera
 WHITE = np.ones(GRID, np.float32)
 CLEAN: dict[str, Any] = {"gain": None, "read": 0.0}
@@ -29,7 +31,7 @@ def scene(**options: Any) -> VirtualRig:
 
 
 class Screen(Display):
-    """A display that remembers what it showed; in place of `time`, a clock that only waiting moves."""
+    """A display that remembers the codes it showed, and a clock that only waiting moves."""
 
     now = 100.0
     history: list[tuple[float, np.ndarray]]
@@ -50,7 +52,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Screen]:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with Screen(GRID) as screen:
         screen.history = [(-math.inf, 0 * WHITE)]
-        monkeypatch.setattr(live, "time", screen)
+        monkeypatch.setattr(link, "time", screen)
         yield screen
 
 
@@ -62,13 +64,17 @@ class Watcher:
     grows, frames hang.
     """
 
-    channels, stream, readout, queue = 1, True, 0.02, 3
+    channels = 1
+    stream = True
+    readout = 0.02
+    queue = 3
     exposures: tuple[float, ...] | None = None
 
     def __init__(
         self, screen: Screen, rig: VirtualRig, latency: float = 0.08, **options: Any
     ) -> None:
-        self.screen, self.rig = screen, rig
+        self.screen = screen
+        self.rig = rig
         self.latency: Callable[[float], float] = lambda _: latency
         self.gain: Callable[[float, np.ndarray], float] = lambda moment, codes: 1.0
         self.frames = self._index = 0
@@ -111,7 +117,7 @@ def camera(screen: Screen) -> Any:
 
 
 def patterns(count: int) -> np.ndarray:
-    """Of codes that 8 bits hold."""
+    """Random patterns of codes that 8 bits hold."""
     return (random.integers(0, 256, (count, *GRID)) / 255).astype(np.float32)
 
 
@@ -124,16 +130,28 @@ def test_photographs_are_those_of_what_is_shown(
     screen: Screen, kind: type[Watcher], latency: float
 ) -> None:
     """Also of a single pixel of one code, a change below what the camera's noise is taken for."""
-    rig, truth = LiveRig(kind(screen, scene(**LINEAR), latency=latency), screen), scene(**LINEAR)
-    shots = [(codes, seconds) for codes in patterns(6) for seconds in (SECONDS, 1 / 60)]
+    rig = LiveRig(kind(screen, scene(**LINEAR), latency=latency), screen)
+    truth = scene(**LINEAR)
+    shots = list(itertools.product(patterns(6), (SECONDS, 1 / 60)))
     shots += [(single(k % 3, k, 4 / 255), SECONDS) for k in range(8)]
-    shots += [(patterns(1)[0], seconds) for seconds in (256 / 60, 1 / 60, 256 / 60)] + [
-        (0 * WHITE, 1 / 60)
-    ]
+    shots += [(patterns(1)[0], seconds) for seconds in (256 / 60, 1 / 60, 256 / 60)]
+    shots.append((0 * WHITE, 1 / 60))
     for codes, seconds in shots:
         np.testing.assert_array_equal(
             rig.photograph(codes, seconds), truth.photograph(codes, seconds)
         )
+
+
+class Bursts:
+    """A latency that jumps now and then, and falls by a frame each frame."""
+
+    excess = 0.0
+
+    def latency(self, _: float) -> float:
+        self.excess = max(0.0, self.excess - FRAME)
+        if random.random() < 0.1:
+            self.excess = random.uniform(0, 0.4)
+        return 0.05 + self.excess
 
 
 @pytest.mark.parametrize("readout", [0.0, 0.03])
@@ -141,24 +159,20 @@ def test_photographs_are_those_of_what_is_shown(
 def test_latency_that_grows_spoils_no_photograph(
     screen: Screen, readout: float, later: float | None
 ) -> None:
-    """To tenfold, also back again, or in bursts of a random length: what was shown before may come late."""
-    camera, truth = Watcher(screen, scene(**LINEAR), latency=0.08, readout=readout), scene(**LINEAR)
-    rig, burst = LiveRig(camera, screen), [0.0]
+    """Latency grows to tenfold, falls again, or comes in bursts: older pictures may come late."""
+    camera = Watcher(screen, scene(**LINEAR), latency=0.08, readout=readout)
+    truth = scene(**LINEAR)
+    rig = LiveRig(camera, screen)
     rig.photograph(WHITE, SECONDS)
-
-    def latency(_: float) -> float:
-        burst[0] = random.uniform(0, 0.4) if random.random() < 0.1 else max(0.0, burst[0] - FRAME)
-        return 0.05 + burst[0]
-
-    shots = [
-        *patterns(3),
-        0 * WHITE,
-        WHITE,
-        *(single(1, k, 2 / 255) for k in range(4)),
-        *patterns(3),
-    ]
-    for number, codes in enumerate(shots):
-        camera.latency = latency if later is None else lambda _, n=number: 0.05 if n == 5 else later
+    bursts = Bursts()
+    points = [single(1, k, 2 / 255) for k in range(4)]
+    for number, codes in enumerate([*patterns(3), 0 * WHITE, WHITE, *points, *patterns(3)]):
+        if later is None:
+            camera.latency = bursts.latency
+        elif number == 5:
+            camera.latency = lambda _: 0.05
+        else:
+            camera.latency = lambda _: later
         np.testing.assert_array_equal(
             rig.photograph(codes, SECONDS), truth.photograph(codes, SECONDS)
         )
@@ -167,12 +181,11 @@ def test_latency_that_grows_spoils_no_photograph(
 def test_noise_is_no_change(screen: Screen) -> None:
     """48 pixels: means of identical frames differ by 0.2 % of full scale, 2 % of what is dim."""
     options = {"gain": 3000.0, "read": 0.01, "response": "linear", "black": 0.06}
-    rig, truth = (
-        LiveRig(Watcher(screen, scene(**options)), screen, drift=0.06),
-        scene(**(options | CLEAN)),
-    )
+    rig = LiveRig(Watcher(screen, scene(**options)), screen, drift=0.06)
+    truth = scene(**(options | CLEAN))
     for codes in [*patterns(4), 0 * WHITE, single(1, 1)] * 4:
-        image, expected = rig.photograph(codes, SECONDS), truth.photograph(codes, SECONDS)
+        image = rig.photograph(codes, SECONDS)
+        expected = truth.photograph(codes, SECONDS)
         assert np.abs(image.astype(float) - expected).mean() < 5
     assert rig.survey is not None
     assert 1 / 255 < rig.survey.tolerance < rig.survey.contrast / 4
@@ -188,7 +201,8 @@ def test_latency_is_measured(screen: Screen, latency: float) -> None:
 
 
 def test_a_camera_that_freezes_is_named_stale(camera: Any) -> None:
-    rig, (first, second) = LiveRig(camera, camera.screen), patterns(2)
+    rig = LiveRig(camera, camera.screen)
+    first, second = patterns(2)
     rig.photograph(first, SECONDS)
     camera.latency = lambda _: math.inf
     with pytest.raises(AcquisitionError, match=r"^photograph 2: the frame is stale"):
@@ -207,11 +221,12 @@ def test_a_camera_that_freezes_is_named_stale(camera: Any) -> None:
 
 def automatic(speed: float) -> Any:
     """The gain of a camera that adapts to the brightness."""
-    state = [1.0]
+    current = 1.0
 
     def gain(_: float, codes: np.ndarray) -> float:
-        state[0] *= (0.5 / max(float(codes.mean()), 0.2) / state[0]) ** speed
-        return state[0]
+        nonlocal current
+        current *= (0.5 / max(float(codes.mean()), 0.2) / current) ** speed
+        return current
 
     return gain
 
@@ -230,14 +245,16 @@ def test_set_ups_that_cannot_be_measured_are_refused(
     screen: Screen, options: dict[str, Any], gain: Any, message: str
 ) -> None:
     camera = Watcher(screen, scene(**options))
-    camera.gain = gain or camera.gain
+    if gain is not None:
+        camera.gain = gain
     with pytest.raises(AcquisitionError, match=f"photograph 1: .*{message}"):
         LiveRig(camera, screen, patience=0.5).photograph(WHITE, SECONDS)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
 def test_a_lamp_that_fades_is_found_at_the_next_identical_shot(camera: Any, resumed: bool) -> None:
-    rig, (codes,) = LiveRig(camera, camera.screen), patterns(1)
+    rig = LiveRig(camera, camera.screen)
+    (codes,) = patterns(1)
     earlier = rig.photograph(codes, SECONDS)
     if resumed:
         rig = LiveRig(camera, camera.screen)
@@ -259,8 +276,19 @@ def test_it_is_a_rig_and_names_what_goes_away_with_its_photograph(camera: Any) -
             shots.photograph(0 * WHITE, SECONDS)
 
 
+def colour_ripple(periods: float) -> float:
+    """Relative range of the light of a colour, lit a third of each period, over the begin."""
+
+    def light_until(t: np.ndarray) -> np.ndarray:
+        return np.floor(t) / 3 + np.minimum(t % 1, 1 / 3)
+
+    begin = np.linspace(0, 1, 3001)
+    light = light_until(begin + periods) - light_until(begin)
+    return np.ptp(light) / np.mean(light)
+
+
 def test_exposures_are_multiples_of_the_period(screen: Screen, camera: Any) -> None:
-    """Or those a camera offers whose light, a colour in a third of each period, varies by 6 % at most."""
+    """A camera's own exposures are offered if the light of a colour varies by 6 % at most."""
     multiples = np.array(LiveRig(camera, screen, period=1 / 60).exposures) * 60
     np.testing.assert_allclose(multiples, np.rint(multiples), rtol=1e-12)
     assert np.max(multiples[1:] / multiples[:-1]) <= 2
@@ -272,15 +300,10 @@ def test_exposures_are_multiples_of_the_period(screen: Screen, camera: Any) -> N
         rig.photograph(WHITE, 1 / 50)
     assert camera.frames == 0  # refused before anything is shown
     camera.exposures = tuple(np.geomspace(1 / 4000, 8, 200))
-    offered, begins = (
-        LiveRig(camera, screen, period=1 / 60).exposures or (),
-        np.linspace(0, 1, 3001),
-    )
+    offered = LiveRig(camera, screen, period=1 / 60).exposures
+    assert offered is not None
     for seconds in camera.exposures:
-        early, late = (
-            np.floor(t) / 3 + np.minimum(t % 1, 1 / 3) for t in (begins, begins + 60 * seconds)
-        )
-        ripple = np.ptp(late - early) / np.mean(late - early)
+        ripple = colour_ripple(60 * seconds)
         assert ripple < 0.061 if seconds in offered else ripple > 0.039
     camera.exposures = (0.001, 0.02)
     with pytest.raises(InputError, match=r"period is 0\.01667 s"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`MitsubaRig` against closed forms and quadrature: what the projector casts and what one bounce of it is."""
+"""`MitsubaRig` against closed forms and quadrature: light of the projector and one bounce."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ CLEAN: dict[str, Any] = {
     "response": "linear",
 }
 LINEAR: dict[str, Any] = {**FAST, "projector_response": "linear", "sensitivity": 1.0}
-ALBEDO, DISTANCE = 0.5, 2.0
+ALBEDO = 0.5
+DISTANCE = 2.0
 
 
 def wall(**more: Any) -> dict[str, Any]:
@@ -60,7 +61,8 @@ def rig(scene: Any = None, **change: Any) -> MitsubaRig:
 
 
 def test_a_wall_shows_the_pattern_pixel_by_pixel(tmp_path: Path) -> None:
-    codes, described = random.random((*GRID, 3)).astype(np.float32), wall()
+    codes = random.random((*GRID, 3)).astype(np.float32)
+    described = wall()
     parsed = mi.parser.parse_dict(mi.parser.ParserConfig("scalar_rgb"), described)
     mi.parser.write_file(parsed, str(tmp_path / "wall.xml"))
     for scene in (described, tmp_path / "wall.xml"):
@@ -78,8 +80,9 @@ def test_white_is_at_half_of_the_range() -> None:
 
 
 def test_one_bounce_is_that_of_quadrature() -> None:
-    """White light on the left wall of a right angle, x = -z; the right wall shows its first bounce."""
-    n, albedo = 8, 0.6
+    """White light is on the left wall, x = -z; the right wall shows its first bounce."""
+    n = 8
+    albedo = 0.6
     options: dict[str, Any] = {
         "albedo": albedo,
         "depth": 3,
@@ -94,14 +97,14 @@ def test_one_bounce_is_that_of_quadrature() -> None:
     s = (np.arange(80) + 0.5) / 80 * np.sqrt(0.5)
     x, y = np.meshgrid(-s, s * np.sqrt(2) - 0.5)
     left = np.stack([x, y, -x], axis=-1).reshape(-1, 3)
-    normal, facing = np.array([1.0, 0.0, 1.0]) / np.sqrt(2), np.array([-1.0, 0.0, 1.0]) / np.sqrt(2)
+    normal = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
+    facing = np.array([-1.0, 0.0, 1.0]) / np.sqrt(2)
     away = left - [0.0, 0.0, 3.0]
     far = np.linalg.norm(away, axis=1)
     # A plane across the axis at distance 1 gets the irradiance pi everywhere.
     L = albedo * (-far / away[:, 2]) ** 3 * (-away @ normal / far) / far**2
-    tangent = (
-        1.02 * np.sqrt(0.5) / (3.0 - np.sqrt(0.5))
-    )  # of half the frame, around the outer edges
+    # Half the frame, around the outer edges.
+    tangent = 1.02 * np.sqrt(0.5) / (3.0 - np.sqrt(0.5))
     across = (2 * (np.arange(n * 4) + 0.5) / (n * 4) - 1) * tangent  # 4 x 4 rays in each pixel
     tx, ty = np.meshgrid(across, -across)
     k = 3.0 / (1 + tx)  # where they meet the right wall, x = z
@@ -112,10 +115,8 @@ def test_one_bounce_is_that_of_quadrature() -> None:
     expected = bounced.reshape(n, 4, n // 2, 4).mean(axis=(1, 3))
 
     assert image[:, : n // 2].sum() > 10 * image[:, n // 2 :].sum()  # left is left
-    inner = (
-        slice(2, 6),
-        slice(1, 3),
-    )  # away from the seam, where quadrature is poor, and from edges
+    # Away from the seam, where quadrature is poor, and from edges.
+    inner = np.s_[2:6, 1:3]
     np.testing.assert_allclose(image[:, n // 2 :][inner], expected[inner], rtol=0.08)
     assert image[:, n // 2 :][inner].mean() == pytest.approx(expected[inner].mean(), rel=0.02)
 
@@ -123,11 +124,14 @@ def test_one_bounce_is_that_of_quadrature() -> None:
 @pytest.mark.parametrize(("name", "walls"), [("dihedral", 2), ("trihedral", 3), ("box", 5)])
 def test_all_walls_of_a_scene_are_lit_and_seen(name: str, walls: int) -> None:
     colours = np.arange(3 * walls).reshape(walls, 3) % 5 / 5 + 0.1  # no two walls have the same hue
-    grid, options = (24, 32), {"albedo": colours, "depth": 2, **LINEAR}
-    views = [
-        MitsubaRig(name, grid, baseline=x, **options).radiance(np.ones(grid)) for x in (0.0, 1.0)
-    ]
-    lit, hues = views[0].max(axis=-1) > 0, colours / np.linalg.norm(colours, axis=1, keepdims=True)
+    grid = (24, 32)
+    options = {"albedo": colours, "depth": 2, **LINEAR}
+    views = []
+    for x in (0.0, 1.0):
+        view = MitsubaRig(name, grid, baseline=x, **options).radiance(np.ones(grid))
+        views.append(view)
+    lit = views[0].max(axis=-1) > 0
+    hues = colours / np.linalg.norm(colours, axis=1, keepdims=True)
     assert 0.3 < lit.mean() < 1  # walls fill the frame, with black around
     nearest = [np.argmax(view[view.max(axis=-1) > 0] @ hues.T, axis=1) for view in views]
     assert set(nearest[0]) == set(range(walls))
@@ -142,11 +146,9 @@ def test_it_is_a_rig_that_leaves_the_variant_of_others(monkeypatch: pytest.Monke
     assert (image.shape, shots.levels, shots.camera_grid) == ((5, 7, 3), 4096, (5, 7))
     assert mi.variant() == "scalar_spectral"
     facts = shots.describe()["rig"]
-    assert (facts["kind"], facts["scene"], facts["variant"]) == (
-        "mitsuba",
-        "trihedral",
-        "scalar_rgb",
-    )
+    assert facts["kind"] == "mitsuba"
+    assert facts["scene"] == "trihedral"
+    assert facts["variant"] == "scalar_rgb"
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(AcquisitionError, match=r"mitsuba.*ltcl\[rig\]"):
         MitsubaRig("box", GRID)
@@ -171,10 +173,9 @@ ELSEWHERE = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "hei
             "albedo is of dihedral, trihedral, box",
         ),
         ({"albedo": 1.0}, InputError, "albedo .* 1 to 1"),
-        *(
-            ({name: -9.0}, InputError, f"{name} is -9")
-            for name in ("baseline", "channels", "sensitivity")
-        ),
+        ({"baseline": -9.0}, InputError, "baseline is -9"),
+        ({"channels": -9.0}, InputError, "channels is -9"),
+        ({"sensitivity": -9.0}, InputError, "sensitivity is -9"),
     ],
 )
 def test_bad_scenes_and_arguments_are_named(

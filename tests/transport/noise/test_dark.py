@@ -47,7 +47,7 @@ class Corner(NamedTuple):
 
 @cache
 def corner() -> Corner:
-    """Albedo 0.85, direct light of 81.8 %; 12 pixels with 1e-6 of their light, one without light."""
+    """Albedo 0.85, direct light of 81.8 %; 12 pixels have 1e-6 of their light, one has none."""
     rng = np.random.default_rng(1)
     N = n * n
     G = np.asarray(ltcl.scenes.dihedral(n).form_factors)
@@ -99,6 +99,7 @@ def test_gain_is_that_without_these_pixels(picture) -> None:
     assert np.linalg.norm(missing) < 0.015 * np.linalg.norm(c.target)
 
 
+@pytest.mark.slow
 def test_the_command_line_does_the_same_and_shows_them(program, tmp_path: Path) -> None:  # noqa: F811
     case = corner()
     grey = tmp_path / "grey.exr"

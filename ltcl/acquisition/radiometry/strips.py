@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Work on a picture in strips of rows, in parallel: temporary arrays then stay in the cache."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+
+def in_strips(height: int, rows: int, work: Callable[[slice], None]) -> None:
+    """Do `work` on slices of at most `rows` (at least one) of `height` rows, in parallel."""
+    step = max(rows, 1)
+    strips = [slice(top, min(top + step, height)) for top in range(0, height, step)]
+    if len(strips) == 1:  # a thread takes longer to start than the work on a small picture
+        work(strips[0])
+        return
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(work, strips))
