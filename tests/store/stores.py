@@ -125,7 +125,7 @@ def status_of(child: int) -> int:
 
 
 def at_line(number: int, act: Callable[[], None]) -> list[int]:
-    """Call `act` from here on at the line of ltcl's code with that number; returns the lines so far, growing."""
+    """Call `act` at the line of ltcl's code with that number; returns the lines so far, growing."""
     count = [0]
 
     def line(frame: FrameType, event: str, _: Any) -> Any:
