@@ -13,7 +13,7 @@ import numpy as np
 import ltcl
 from _coefficients import relative
 from ltcl.scenes import Scene, box
-from ltcl.scenes.viewer import Viewer
+from ltcl.scenes.camera import SceneCamera
 from ltcl.solvers import Solution, Status
 
 NEUTRAL, FLOOR = (1, 2, 3, 5), 2  # walls, in the order of `box`: the first is red, the fifth green
@@ -35,7 +35,7 @@ def coloured_box(n: int) -> tuple[Scene, np.ndarray]:
 
 def from_the_front(scene: Scene) -> Scene:
     """The scene seen through its sixth wall, the red one on the left and the green one on the right."""
-    return replace(scene, viewer=Viewer(eye=(2.36, 0.5, 0.52), target=(0, 0.5, 0.52)))
+    return replace(scene, viewer=SceneCamera(eye=(2.36, 0.5, 0.52), target=(0, 0.5, 0.52)))
 
 
 def bounce(scene: Scene, light: np.ndarray) -> np.ndarray:

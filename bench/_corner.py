@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from ltcl.scenes import exchange
-from ltcl.scenes.scene import transport
+from ltcl.scenes.scene import transport_matrix
 
 
 class Bounce:
@@ -77,9 +77,9 @@ def interreflection(n: int, albedo: float, progress: Callable[[str], object]) ->
     for number, kind in enumerate(kinds):
         progress(f"  bounces of light, kind {number + 1} of 4")
         form_factors = np.tensordot(signs[number], images, 1)
-        kind[:] = transport(form_factors, np.full(size, albedo), np.ones(size)) / albedo - np.eye(
-            size
-        )
+        kind[:] = transport_matrix(
+            form_factors, np.full(size, albedo), np.ones(size)
+        ) / albedo - np.eye(size)
     R = np.empty((n, 2 * n, n, 2 * n), np.float32)
     for image, of_kinds in enumerate(signs):
         block = np.tensordot(of_kinds / 4, kinds, 1).reshape(half, n, half, n)

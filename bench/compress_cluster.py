@@ -19,7 +19,8 @@ from _coefficients import note
 from _corner import Bounce
 from _harness import Options, Row, options, report
 from ltcl.operators import Wavelet
-from ltcl.tasks.compression.coefficients import Analysis, Coefficients, coefficients
+from ltcl.tasks.compression.bases import CoefficientAnalysis
+from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source
 from resolution131k import MEMORY, REFERENCE, THRESHOLD
 
@@ -28,7 +29,7 @@ SHARE = 0.6  # of the time of one worker, which two may take
 
 def compress(given: Options, rows: Bounce, workers: int) -> tuple[Coefficients, float]:
     """The numbers of A, and seconds they took."""
-    W, host = Analysis(Wavelet(given.device, rows.grid, "db2")), "127.0.0.1"
+    W, host = CoefficientAnalysis(Wavelet(given.device, rows.grid, "db2")), "127.0.0.1"
     sizes = {"n_workers": workers, "threads_per_worker": 1, "env": {"POCL_MAX_PTHREAD_COUNT": "1"}}
     with (
         LocalCluster(host=host, dashboard_address=f"{host}:0", **sizes) as cluster,

@@ -34,7 +34,7 @@ from _harness import Options, options, product, seconds
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import dihedral, landscape
-from ltcl.scenes.viewer import draw as draw_view
+from ltcl.scenes.camera import draw as draw_view
 from ltcl.tasks.compression import SparseInverse, invert_coefficients
 from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source

@@ -38,8 +38,9 @@ from _harness import Options, options
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.scenes import landscape
-from ltcl.show.window import Window, play
-from ltcl.viewer.answers import Scene
+from ltcl.show.player import Pace, play
+from ltcl.show.window import Window
+from ltcl.viewer.answers import ViewerScene
 
 FLAGS = ["--headless=new", "--remote-debugging-port=0", "--window-size=1280,900", "--no-sandbox"]
 FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
@@ -210,7 +211,7 @@ def touch(page: Chromium, T: ltcl.Transport, given: Options) -> tuple[float, flo
     return float(np.percentile(times, 95)), *rates, busy
 
 
-def playing(page: Chromium, T: ltcl.Transport, folder: Path, given: Options) -> dict[str, Any]:
+def playing(page: Chromium, T: ltcl.Transport, folder: Path, given: Options) -> Pace:
     """What is reached with a film and a kept inverse."""
     frames = (video.TO_LINEAR[codes] for codes in video.film(T, 10 if given.smoke else FRAMES))
     write_video(folder / "film.mkv", frames, FPS)
@@ -218,7 +219,12 @@ def playing(page: Chromium, T: ltcl.Transport, folder: Path, given: Options) -> 
     with Window("film", open_browser=False) as window:
         page.open(f"{window.url}#projector")
         return play(
-            Scene(T, "T", {}, None), open_frames(folder / "film.mkv"), window, 1.0, nothing, **rules
+            ViewerScene(T, "T", {}, None),
+            open_frames(folder / "film.mkv"),
+            window,
+            1.0,
+            nothing,
+            **rules,
         )
 
 
@@ -252,7 +258,7 @@ def main() -> None:
         below(f"probe, 95th percentile, {size}", probe, PROBE_MS, "ms"),
         rate(f"painting, {size}", painting, PAINT),
         rate(f"sliders of bounces, {size}", sliding, SLIDE),
-        rate(f"a film of {FPS:g} frames/s, {size}", film["frames_per_second"], PLAY),
+        rate(f"a film of {FPS:g} frames/s, {size}", film.frames_per_second, PLAY),
         below(f"first picture after the command, {size}", first, FIRST, "s"),
         below(f"probe, 95th percentile, {small_size}", small_probe, SMALL_MS, "ms"),
         rate(f"painting, {small_size}", small_painting, often),
@@ -262,8 +268,8 @@ def main() -> None:
         "bytes of T": large.nbytes,
         f"the viewer's ms of a processor for a column, {size}": busy,
         f"the viewer's ms of a processor for a column, {small_size}": small_busy,
-        "frames of the film dropped": film["dropped"],
-        "latency of the film, s": film["latency"],
+        "frames of the film dropped": film.dropped,
+        "latency of the film, s": film.latency,
         "load of the machine": os.getloadavg()[0],
     }
     figures.conclude(given, "The viewer in Chromium", [] if given.smoke else claims, facts, Figure)

@@ -101,7 +101,15 @@ def _append(app: Sphinx, docname: str, source: list[str]) -> None:
         source[0] += PAGES[docname]()
 
 
+def _write_schema(app: Sphinx) -> None:
+    """Write the file to which the page on JSON links."""
+    from generated import write_schema
+
+    write_schema()
+
+
 def setup(app: Sphinx) -> None:
-    """What Sphinx calls."""
+    """Register all of this with Sphinx."""
     app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
+    app.connect("builder-inited", _write_schema)
     app.connect("source-read", _append)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Ends of reference pages, as MyST: the commands, from the program; fields of their JSON, from its schema."""
+"""Parts of the reference that are made of the program: its commands, and the fields of their JSON.
+
+Pages get their ends, in MyST; the JSON Schema is a file to download.
+"""
 
 from __future__ import annotations
 
@@ -11,30 +14,58 @@ from typing import Any
 import typer
 
 from ltcl.cli.main import app
+from ltcl.cli.reports.schema import schema
 
-SCHEMA = Path(__file__).parent / "reference" / "json-schema.json"
+# Written when the site is built; the page on JSON links to it.
+SCHEMA_FILE = Path(__file__).parent / "reference" / "generated" / "json-schema.json"
+OPTIONS_TABLE = "| option | what it does |\n|---|---|"
+FIELDS_TABLE = "| field | type | meaning |\n|---|---|---|"
+
+
+def write_schema() -> None:
+    """Write the JSON Schema of all reports."""
+    SCHEMA_FILE.parent.mkdir(parents=True, exist_ok=True)
+    SCHEMA_FILE.write_text(json.dumps(schema(), indent=1) + "\n", encoding="utf-8")
 
 
 def commands() -> str:
-    """A section for each command, with what its --help prints."""
-    return "\n".join(_command(typer.main.get_command(app), "ltcl"))
+    """Return a section for each command, with its --help."""
+    return "\n".join(_command_lines(typer.main.get_command(app), "ltcl"))
 
 
-def _command(command: Any, name: str) -> Iterator[str]:
+def _command_lines(command: Any, name: str) -> Iterator[str]:
     context = command.context_class(command, info_name=name)
     if name != "ltcl":
         yield f"\n({_label(name)})=\n## {name}\n"
         yield _prose(command.help)
     if not hasattr(command, "commands"):
-        usage = command.get_usage(context).removeprefix("Usage: ").replace("{", "").replace("}", "")
-        yield f"\n```text\n{' '.join(usage.split())}\n```\n\n| option | what it does |\n|---|---|"
-        for parameter in command.params:
-            if not parameter.hidden:
-                names, text = parameter.get_help_record(context)
-                yield f"| {_code(names)} | {_prose(text)} |"
-    for part, inner in getattr(command, "commands", {}).items():
-        if not inner.hidden:
-            yield from _command(inner, f"{name} {part}")
+        yield from _option_lines(command, context)
+        return
+    for part, inner in command.commands.items():
+        yield from _command_lines(inner, f"{name} {part}")
+
+
+def _option_lines(command: Any, context: Any) -> Iterator[str]:
+    """Yield the usage of a command, and a table of its options, under the headings of --help."""
+    usage = command.get_usage(context).removeprefix("Usage: ")
+    usage = usage.replace("{", "").replace("}", "")
+    yield f"\n```text\n{' '.join(usage.split())}\n```"
+    for panel, parameters in _panels(command).items():
+        if panel:
+            yield f"\n**{panel}**"
+        yield f"\n{OPTIONS_TABLE}"
+        for parameter in parameters:
+            names, text = parameter.get_help_record(context)
+            yield f"| {_code(names)} | {_prose(text)} |"
+
+
+def _panels(command: Any) -> dict[str, list[Any]]:
+    """Return arguments and options by their headings."""
+    panels: dict[str, list[Any]] = {}
+    for parameter in command.params:
+        panel = parameter.rich_help_panel or ""
+        panels.setdefault(panel, []).append(parameter)
+    return panels
 
 
 def _label(name: str) -> str:
@@ -46,79 +77,108 @@ def _code(text: str) -> str:
 
 
 def _prose(text: str) -> str:
-    """Words of a help text, in which stars, brackets and bars are themselves."""
+    """Escape a help text, in which stars, brackets and bars stand for themselves."""
     for sign in "\\`*_|<>[]{}":
         text = text.replace(sign, f"\\{sign}")
     return text.replace("--", r"-\-")
 
 
 def fields() -> str:
-    """A section for each command, then one for each part that several have: fields, types, meanings."""
-    parts = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
-    program: Any = typer.main.get_command(app)
-    named = {
-        label: words
-        for name, each in program.commands.items()
-        for label, words in _names(name, each)
-    }
+    """Return a section for each command, then one for each shared part, with its fields."""
+    parts = schema()["$defs"]
+    titles = _titles_of_commands()
+    others = sorted(name for name in parts if name not in titles)
     lines = []
-    for name, schema in sorted(parts.items(), key=lambda part: [*named, part[0]].index(part[0])):
-        title = f"ltcl {named[name]}" if name in named else _words(name)
-        lines += [f"\n(json-{name})=\n## {title}\n", schema["description"], ""]
-        rows, choices = [*_rows(schema, "", parts)], schema.get("items", schema).get("anyOf", ())
-        lines += [f"Each is a {' or a '.join(map(_type, choices))}."] * bool(choices)
-        lines += ["| field | type | meaning |", "|---|---|---|", *rows] if rows else []
+    for name in [*titles, *others]:
+        lines += _part_lines(name, titles.get(name, _words(name)), parts)
     return "\n".join(lines)
 
 
-def _names(name: str, command: Any) -> list[tuple[str, str]]:
-    """Parts of the schema, and words of the command line, of a command and those below it."""
-    inner = getattr(command, "commands", {}).items()
-    return [(f"{name}-{part}", f"{name} {part}") for part, each in inner if not each.hidden] or [
-        (name, name)
-    ]
+def _titles_of_commands() -> dict[str, str]:
+    """Return titles by definitions of the schema."""
+    program: Any = typer.main.get_command(app)
+    titles = {}
+    for name, command in program.commands.items():
+        inner = getattr(command, "commands", None)
+        if inner is None:
+            titles[name] = f"ltcl {name}"
+            continue
+        for part in inner:
+            titles[f"{name}-{part}"] = f"ltcl {name} {part}"
+    return titles
 
 
-def _rows(schema: dict[str, Any], path: str, parts: dict[str, Any]) -> Iterator[str]:
-    """Of a table: the fields of an object by their paths, `[]` for each entry of a list."""
-    required = schema.get("required", ())
-    if (entries := schema.get("items")) and "properties" in entries:
-        yield from _rows(entries, f"{path}[]", parts)
-    if isinstance(more := schema.get("additionalProperties"), dict) and "properties" in more:
-        yield from _rows(more, f"{path}.NAME", parts)
-    for each in schema.get("anyOf", ()) if path else ():
-        yield from _rows(each, path, parts)
-    for name, field in schema.get("properties", {}).items():
+def _part_lines(name: str, title: str, parts: dict[str, Any]) -> list[str]:
+    part = parts[name]
+    lines = [f"\n(json-{name})=\n## {title}\n", part["description"], ""]
+    choices = part.get("items", part).get("anyOf", ())
+    if choices:
+        types = " or a ".join(_type(choice) for choice in choices)
+        lines.append(f"Each is a {types}.")
+    rows = [*_rows(part, "", parts)]
+    if rows:
+        lines += [FIELDS_TABLE, *rows]
+    return lines
+
+
+def _rows(part: dict[str, Any], path: str, parts: dict[str, Any]) -> Iterator[str]:
+    """Yield rows for the fields of an object by their paths; `[]` is each entry of a list."""
+    items = part.get("items", {})
+    if "properties" in items:
+        yield from _rows(items, f"{path}[]", parts)
+    others = part.get("additionalProperties")
+    if isinstance(others, dict) and "properties" in others:
+        yield from _rows(others, f"{path}.NAME", parts)
+    if path:
+        for choice in part.get("anyOf", ()):
+            yield from _rows(choice, path, parts)
+    for name, field in part.get("properties", {}).items():
         place = f"{path}.{name}".removeprefix(".")
-        maybe = "" if name in required else ", not always there"
-        text = (
-            field.get("description")
-            or parts[field["$ref"].split("/")[-1]]["description"].split(". ")[0]
-        )
-        values = ", ".join(
-            f"`{value}`" for value in field.get("enum", ()) if isinstance(value, str)
-        )
-        text += f" One of {values}." * bool(values)
-        yield f"| `{place}` | {_type(field)}{maybe} | {text} |"
+        presence = "" if name in part["required"] else ", not always there"
+        yield f"| `{place}` | {_type(field)}{presence} | {_meaning(field, parts)} |"
         yield from _rows(field, place, parts)
+
+
+def _meaning(field: dict[str, Any], parts: dict[str, Any]) -> str:
+    """Return the description of a field, or the first sentence on the part to which it refers."""
+    if "description" in field:
+        text = field["description"]
+    else:
+        text = parts[_target(field)]["description"].split(". ")[0].removesuffix(".") + "."
+    values = [f"`{value}`" for value in field.get("enum", ()) if isinstance(value, str)]
+    if values:
+        text += f" One of {', '.join(values)}."
+    return text
+
+
+def _target(field: dict[str, Any]) -> str:
+    return field["$ref"].rpartition("/")[2]
 
 
 def _words(name: str) -> str:
     return name.replace("_", " ").replace("-", ", ")
 
 
-def _type(schema: dict[str, Any]) -> str:
-    """In words, with links to the parts that several have."""
-    if "$ref" in schema:
-        name = schema["$ref"].split("/")[-1]
+def _type(field: dict[str, Any]) -> str:
+    """Return a type in words, with links to shared parts."""
+    if "$ref" in field:
+        name = _target(field)
         return f"[{_words(name)}](#json-{name})"
-    if "anyOf" in schema:
-        return " or ".join(_type(each) for each in schema["anyOf"])
-    kinds = schema["type"] if isinstance(schema["type"], list) else [schema["type"]]
+    if "anyOf" in field:
+        return " or ".join(_type(choice) for choice in field["anyOf"])
+    kinds = field["type"]
+    if isinstance(kinds, str):
+        kinds = [kinds]
     if kinds == ["number", "null"]:
-        return "number"  # the page says that any may be null
-    items = f"list of {_type(schema['items'])}" if "items" in schema else "list"
-    return " or ".join(items if kind == "array" else kind for kind in kinds)
+        # The page tells that any number may be null.
+        return "number"
+    words = []
+    for kind in kinds:
+        if kind == "array":
+            words.append(f"list of {_type(field['items'])}")
+        else:
+            words.append(kind)
+    return " or ".join(words)
 
 
 PAGES: dict[str, Callable[[], str]] = {"reference/command-line": commands, "reference/json": fields}

@@ -8,6 +8,7 @@ launch may ask for more than its kernel and device allow.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,80 +22,109 @@ SCENE = ltcl.scenes.dihedral(4, albedo=0.6)
 DESIRED = np.linspace(0.1, 0.3, 32, dtype=np.float32).reshape(SCENE.grid)
 
 
-def apart(found: Any, exact: Any) -> float:
+# A call, and the error that it may have at most.
+CALLS: dict[str, tuple[Callable[[Device], float], float]] = {}
+
+
+def call(name: str, largest_error: float) -> Callable[[Any], Any]:
+    """Register a function of a device, which returns an error."""
+
+    def register(function: Callable[[Device], float]) -> Callable[[Device], float]:
+        CALLS[name] = (function, largest_error)
+        return function
+
+    return register
+
+
+def relative_error(found: Any, exact: Any) -> float:
     return float(np.linalg.norm(np.subtract(found, exact)) / np.linalg.norm(exact))
 
 
-def residual(device: Device, method: str) -> float:
-    S, b = SCENE.transport(device=device).interreflection, np.random.default_rng(0).random((32, 3))
-    options: dict[str, Any] = {"samples": 64} if method in ("monte_carlo", "hybrid") else {}
-    return apart(S @ ltcl.solve(S, b, method, rtol=1e-2, **options).x, b)
-
-
-def compressed(device: Device, **options: Any) -> float:
-    T = ltcl.scenes.dihedral(8, albedo=0.6).transport(device=device)
-    p = np.random.default_rng(1).random(T.grid)
-    return apart(ltcl.compress(T, rtol=0.05, **options) @ p, T @ p)
-
-
-def inverted(device: Device) -> float:
-    T = SCENE.transport(device=device)
-    return apart(
-        T @ ltcl.compensate(T, DESIRED, inverse=ltcl.invert(T, 0.02), rtol=0.02).pattern, DESIRED
-    )
-
-
-def streamed(device: Device) -> float:
-    """A bounce that is computed in each product."""
-    patches = ltcl.scenes.cut(SCENE.walls, 4)
-    A = ltcl.scenes.FormFactor(patches, albedo=SCENE.first_bounce.ravel(), device=device)
-    x = np.random.default_rng(2).random(32)
-    return apart(A @ x, SCENE.A @ x)
-
-
-def separated(device: Device) -> float:
-    b = ltcl.separate(SCENE.transport(device=device), DESIRED, bounces=2)
-    return apart(b.direct + np.sum(b.bounces, axis=0) + b.rest, DESIRED)
-
-
-def relit(device: Device) -> float:
-    T = SCENE.transport(device=device)
-    return apart((T @ DESIRED).ravel(), T.matrices[0] @ DESIRED.ravel())
-
-
-def compensated(device: Device, scale: float = 1.0, **options: Any) -> ltcl.Compensation:
+def compensate(device: Device, scale: float = 1.0, **options: Any) -> ltcl.Compensation:
     return ltcl.compensate(SCENE.transport(device=device), scale * DESIRED, **options)
 
 
-# Each gives an error, and the most it may be.
-CALLS: dict[str, tuple[Callable[[Device], float], float]] = {
-    "compensate": (lambda device: compensated(device).error, 0.02),
-    "compensate brightly": (
-        lambda device: compensated(device, 9, gain="auto", loss=0.5).clipped,
-        1.0,
-    ),
-    "compensate within bounds": (lambda device: compensated(device, bounds=(0.3, 0.5)).error, 1.0),
-    "separate": (separated, 1e-5),
-    "relight": (relit, 1e-5),
-    "analyze": (
-        lambda device: ltcl.analyze(SCENE.transport(device=device)).channels[0].spectral_radius,
-        2.0,
-    ),
-    "matrix iteration": (
-        lambda device: (
-            matrix_series(SCENE.transport(device=device).interreflection, rtol=1e-3).residual
-        ),
-        1e-3,
-    ),
-    "compress": (compressed, 0.06),
-    "compress by rows": (lambda device: compressed(device, basis="haar rows"), 0.06),
-    "invert": (inverted, 0.05),
-    "form factors": (streamed, 1e-4),
-    **{
-        f"solve by {name}": (lambda device, name=name: residual(device, name), 0.3)
-        for name in METHODS
-    },
-}
+@call("compensate", 0.02)
+def compensation_error(device: Device) -> float:
+    return compensate(device).error
+
+
+@call("compensate brightly", 1.0)
+def clipped_share(device: Device) -> float:
+    return compensate(device, 9, gain="auto", loss=0.5).clipped
+
+
+@call("compensate within bounds", 1.0)
+def bounded_error(device: Device) -> float:
+    return compensate(device, bounds=(0.3, 0.5)).error
+
+
+@call("separate", 1e-5)
+def separation_error(device: Device) -> float:
+    b = ltcl.separate(SCENE.transport(device=device), DESIRED, bounces=2)
+    return relative_error(b.direct + np.sum(b.bounces, axis=0) + b.rest, DESIRED)
+
+
+@call("relight", 1e-5)
+def relighting_error(device: Device) -> float:
+    T = SCENE.transport(device=device)
+    return relative_error((T @ DESIRED).ravel(), T.matrices[0] @ DESIRED.ravel())
+
+
+@call("analyze", 2.0)
+def spectral_radius(device: Device) -> float:
+    return ltcl.analyze(SCENE.transport(device=device)).channels[0].spectral_radius
+
+
+@call("matrix iteration", 1e-3)
+def matrix_residual(device: Device) -> float:
+    return matrix_series(SCENE.transport(device=device).interreflection, rtol=1e-3).residual
+
+
+def compression_error(device: Device, **options: Any) -> float:
+    T = ltcl.scenes.dihedral(8, albedo=0.6).transport(device=device)
+    p = np.random.default_rng(1).random(T.grid)
+    return relative_error(ltcl.compress(T, rtol=0.05, **options) @ p, T @ p)
+
+
+@call("compress", 0.06)
+def picture_compression_error(device: Device) -> float:
+    return compression_error(device)
+
+
+@call("compress by rows", 0.06)
+def row_compression_error(device: Device) -> float:
+    return compression_error(device, basis="haar rows")
+
+
+@call("invert", 0.05)
+def inversion_error(device: Device) -> float:
+    T = SCENE.transport(device=device)
+    inverse = ltcl.invert(T, 0.02)
+    pattern = ltcl.compensate(T, DESIRED, inverse=inverse, rtol=0.02).pattern
+    return relative_error(T @ pattern, DESIRED)
+
+
+@call("form factors", 1e-4)
+def form_factor_error(device: Device) -> float:
+    """The error of a bounce that is computed in each product."""
+    patches = ltcl.scenes.cut(SCENE.walls, 4)
+    A = ltcl.scenes.FormFactor(patches, albedo=SCENE.first_bounce.ravel(), device=device)
+    x = np.random.default_rng(2).random(32)
+    return relative_error(A @ x, SCENE.A @ x)
+
+
+def residual(device: Device, method: str) -> float:
+    S = SCENE.transport(device=device).interreflection
+    b = np.random.default_rng(0).random((32, 3))
+    options: dict[str, Any] = {}
+    if method in ("monte_carlo", "hybrid"):
+        options["samples"] = 64
+    return relative_error(S @ ltcl.solve(S, b, method, rtol=1e-2, **options).x, b)
+
+
+for method_name in METHODS:
+    CALLS[f"solve by {method_name}"] = (partial(residual, method=method_name), 0.3)
 
 
 @pytest.mark.parametrize("shaped", ["gpu"], indirect=True)
@@ -102,6 +132,7 @@ CALLS: dict[str, tuple[Callable[[Device], float], float]] = {
 def test_calls_work_in_the_launch_shape_of_a_gpu(
     shaped: Device, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setenv("LTCL_TUNE", "0")  # test_rows.py runs every launch there is to choose from
-    call, most = CALLS[name]
-    assert call(shaped) <= most
+    # test_rows.py runs every launch there is to choose from.
+    monkeypatch.setenv("LTCL_TUNE", "0")
+    function, largest_error = CALLS[name]
+    assert function(shaped) <= largest_error

@@ -1,110 +1,79 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures and a transport: `ltcl compensate`, also of a film, `ltcl separate` and `ltcl relight`."""
+"""`ltcl compensate`: patterns for pictures, with one transport or with many."""
 
 from __future__ import annotations
 
-import glob
-import inspect
-import json
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-import typer
+from PIL import Image
 
-from ltcl import checks
-from ltcl.batch.cluster import connect
-from ltcl.cli import options, pictures
-from ltcl.cli.command import Answer, Context, Progress, UsageError, command, note, percent, table
-from ltcl.cli.options import argument, file, option, writable_file
-from ltcl.errors import BatchError, InputError, LtclError
-from ltcl.files import fill_folder
-from ltcl.store.formats import FORMATS
-from ltcl.tasks import compensation, relighting, report, separation
-from ltcl.transport.transport import Transport
+from ltcl.cli import compensation, loading, options, panels, pictures, scenes
+from ltcl.cli.command import Answer, Context, UsageError, command, note
+from ltcl.cli.options import argument, option
+from ltcl.cli.reports.parts import PictureWithStd, Solve, solves
+from ltcl.cli.reports.pictures import CompensatedPicture, CompensateReport
+from ltcl.cli.tables import percent, table
+from ltcl.errors import InputError, LtclError
+from ltcl.tasks.compensation import compensate as compensate_picture
 
-_MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
-_RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
-# times as bright: what is that much darker is shown a second time on a contact sheet, amplified
-_DIM = 4
-_REASONS = {
+SHARING_PANEL = "Sharing the work"
+# Share of a picture out of reach from which advice is given.
+ADVICE_SHARE = 0.01
+# Pictures of which a contact sheet shows the first ones.
+MAX_SHEET_ROWS = 12
+ADVICE = {
     "dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto",
     "bright": ", by bounces or the background; brighten its dark parts",
 }
+COLUMNS = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
 
 
-def parse_gain(text: str) -> float | str:
-    """A number, or auto."""
-    try:
-        return "auto" if text == "auto" else float(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
-
-
-GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
-_BACKGROUND = "Picture of the light that stays. Default: as measured, else none."
-_VIDEO = "Also a video of the patterns: .mkv or .avi, lossless; or .mp4, which changes their codes."
-_FPS = "Frames a second of that video. Default: as the source, else 25."
-_FORMAT = "png: 16 bits (default); exr: the light as it is."
-_CLUSTER = (
-    "Of frames and scenes. local: processes here, one for each GPU; or a Dask scheduler's ADDRESS."
-)
-_SCENES = "In the place of TRANSPORT: many, as 'scans/*.zarr'. DIR gets a folder each."
-_MPI = "Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'."
-_PICTURES = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
-_FILM: dict[str, Any] = {"rich_help_panel": "Options of frames: a folder or a video"}
-_FRAMES = ("batch", "resume", "frames", "video", "fps", "format", "appearance")
-
-
-def _work_options(
-    batch: Annotated[
-        int | None, option("Frames solved at once. Default: 8.", min=1, **_FILM)
-    ] = None,
-    resume: Annotated[
-        bool, option("Go on where the last run into DIR ended.", "--resume", **_FILM)
+def sharing_options(
+    mpi: Annotated[
+        bool,
+        option(
+            "Share each solve between the ranks of 'mpiexec -n 2 ltcl compensate ... --mpi'.",
+            "--mpi",
+            panel=SHARING_PANEL,
+        ),
     ] = False,
-    frames: Annotated[
-        int | None, option("Only the first N frames.", metavar="N", min=1, **_FILM)
+    transports: Annotated[
+        str | None,
+        option(
+            "Glob pattern of transports, instead of TRANSPORT, such as 'scans/*.zarr'; DIR gets "
+            "a folder for each.",
+            metavar="PATTERN",
+            panel=SHARING_PANEL,
+        ),
     ] = None,
-    video: Annotated[Path | None, file(_VIDEO, callback=writable_file, **_FILM)] = None,
-    fps: Annotated[float | None, option(_FPS, **_FILM)] = None,
-    format: Annotated[Literal["png", "exr"] | None, option(_FORMAT, **_FILM)] = None,
-    appearance: Annotated[
-        bool, option("Also how the scene will look.", "--appearance", **_FILM)
-    ] = False,
-    mpi: Annotated[bool, option(_MPI, "--mpi")] = False,
-    cluster: Annotated[str | None, option(_CLUSTER, metavar="local|ADDRESS")] = None,
+    cluster: Annotated[
+        str | None,
+        option(
+            "Workers for --transports: local processes, one for each GPU, or the ADDRESS of a "
+            "Dask scheduler.",
+            metavar="local|ADDRESS",
+            panel=SHARING_PANEL,
+        ),
+    ] = None,
     workers: Annotated[
-        int | None, option("Processes of --cluster local.", metavar="N", min=1)
+        int | None,
+        option("Number of processes of --cluster local.", metavar="N", min=1, panel=SHARING_PANEL),
     ] = None,
-    transports: Annotated[str | None, option(_SCENES, metavar="PATTERN")] = None,
 ) -> None:
-    """Of many frames, as of `ltcl.batch.compensate_frames`, or scenes, and what shares the work."""
+    """Options that share the work."""
 
 
-@command(*options.TASK, _work_options)
+@command(compensation.target_options, *options.TASK_OPTIONS, sharing_options)
 def compensate(
     context: Context,
-    transport: options.Matrix,
-    out: options.Out,
-    picture: Annotated[list[Path] | None, _PICTURES] = None,
-    gain: Annotated[str | None, option(GAIN, parser=parse_gain, metavar="FACTOR")] = None,
-    loss: Annotated[
-        float | None, option("Error that --gain auto may cost. Default: the least.")
-    ] = None,
-    low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
-    high: Annotated[float, option("Brightest light of the projector.")] = 1.0,
-    clamp: Annotated[
-        bool, option("Clamp what exceeds that, without making up for it.", "--clamp")
-    ] = False,
-    background: Annotated[Path | None, file(_BACKGROUND)] = None,
-    calibration: Annotated[
-        Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")
-    ] = None,
-    weights: Annotated[
-        Path | None, file("Picture of how much the error at each pixel counts.")
+    transport: options.TransportFile,
+    out: options.OutFolder,
+    picture: Annotated[
+        list[Path] | None, argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")
     ] = None,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
@@ -112,395 +81,191 @@ def compensate(
     Writes for each picture the pattern, how the scene will look under it and what is out of the
     projector's reach, exactly as .exr and as .png; all in compensate.png, and compensate.json. The
     .png of a pattern has the codes for the projector, pixel for pixel: those of the measured
-    response with a TRANSPORT of 'ltcl acquire', else sRGB. The others are for the eye, at one
-    exposure, which compensate.json names. Standard deviations by the noise of TRANSPORT, where that
+    response with a TRANSPORT of 'ltcl acquire', else sRGB. The others are for viewing, at one
+    exposure, which compensate.json names. Standard deviations by the noise of TRANSPORT, if that
     is known, are NAME_pattern_std and NAME_appearance_std.
 
     The ambient light of a TRANSPORT of 'ltcl acquire' is the background, and the gain is auto.
 
-    Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch,
-    with one gain for all; Ctrl-C keeps what is done, for --resume. With --cluster workers solve,
-    and do --transports; docs/guide/cluster.md shows how.
+    'ltcl film' is for videos and folders of frames.
     """
-    asked, paths = context.options, picture or []
-    has_scenes = asked["transports"] is not None
-    paths = [transport, *paths] if has_scenes else paths
+    paths = [] if picture is None else picture
+    has_scenes = context.options["transports"] is not None
+    if has_scenes:
+        # The first argument is a picture, too.
+        paths = [transport, *paths]
     if not paths:
         raise UsageError("Missing argument 'PICTURE...'.")
-    film = _film(paths, asked)
+    _check_sharing(context)
     if has_scenes:
-        return _compensate_scenes(context, paths, out)
-    setup, T = options.setup(transport, calibration), options.load(context, transport)
-    if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
-        sizes = (
-            f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
-        )
-        raise InputError(f"{calibration}: is of {sizes}")
-    if setup is not None and not 0.0 <= low < high <= 1.0:
-        raise InputError(
-            f"--low is {low:g} and --high is {high:g}; a measured projector has 0 to 1"
-        )
-    settings = options.solving(context, T, compensation.RTOL)
-    settings |= {"loss": loss, "clamp": clamp, "bounds": (low, high)}
-    settings["gain"] = gain if gain is not None else 1.0 if setup is None else "auto"
-    for name, path in (("weights", weights), ("background", background)):
-        settings[name] = path and pictures.read(
-            context, path, T.camera_grid, "the camera", upright=False
-        )
-    text = options.heading(context, transport, T, rtol=settings["rtol"], gain=settings["gain"])
-    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
-    notes = [options.caveat("errors are", T, asked["exact"])]
-    notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
-    if setup is not None:
-        notes.append(
-            "pattern .png holds the codes of the measured projector; 'ltcl show' shows it there"
-        )
-    if setup is not None and background is None:
-        settings["background"], text["options"]["background"] = setup.ambient, "measured"
-        notes.append("the background is the ambient light that was measured")
-    if film is None:
-        lines = _compensate_pictures(context, T, paths, out, text, settings, setup)
-    else:
-        lines = _compensate_frames(
-            context, T, film, out, text, settings | {"codes": setup and setup.codes}
-        )
-    return Answer({"folder": out, **text}, [*lines, *notes])
+        scenes.check_pictures(paths)
+    _check_pictures(paths)
+    if has_scenes:
+        return scenes.compensate_scenes(context, paths, out, compensate_pictures)
+    return compensate_pictures(context, transport, paths, out)
 
 
-def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
-    """The folder or video, which must be the only input; None where there are pictures."""
+def _check_pictures(paths: list[Path]) -> None:
     from ltcl.images.frames import is_frames
 
-    films, scenes = [path for path in paths if is_frames(path)], asked["transports"] is not None
-    if asked["mpi"] and (scenes or asked["cluster"] is not None):
-        raise InputError(
-            f"--mpi is given, and --{'transports' if scenes else 'cluster'}; give one of them"
-        )
-    if scenes and paths[0].suffix.lower() in FORMATS:
-        raise InputError(
-            f"{paths[0]}: is a transport, and --transports is given, too; give one of them"
-        )
-    if films and len(paths) > 1:
-        raise InputError(
-            f"{films[0]}: holds frames and must be alone; there are {len(paths) - 1} more"
-        )
-    refused = (
-        ("mpi", "transports") if films else _FRAMES if scenes else (*_FRAMES, "cluster", "workers")
-    )
-    why = (
-        "holds frames; it is for pictures"
-        if films
-        else "is a picture; it is for a folder or a video"
-    )
-    for name in refused:
-        if asked[name] not in (None, False):
-            raise InputError(f"--{name} is given, but {paths[0]} {why}")
-    return films[0] if films else None
+    for path in paths:
+        if is_frames(path):
+            raise InputError(f"{path}: holds frames; 'ltcl film' compensates them")
 
 
-def _compensate_pictures(
-    context: Context,
-    T: Transport,
-    paths: list[Path],
-    out: Path,
-    text: Any,
-    settings: Any,
-    setup: Any,
-) -> list[Any]:
-    """Patterns of all pictures into a folder with their contact sheet; the lines of the answer."""
-    desired = pictures.read_all(context, paths, T.camera_grid, "the camera")
-    text["exposure"] = factor = pictures.exposure(*desired.values())
-    text["pictures"], sheet, rows = [], [], []
-    high, noisy = max(settings["bounds"][1], 0.0) or 1.0, options.shows_noise(T, settings)
-    with pictures.fill(out, text) as folder:
-        for name, path in zip(context.progress.each(list(desired)), paths, strict=True):
+def _check_sharing(context: Context) -> None:
+    """Refuse options that exclude one another."""
+    has_scenes = context.options["transports"] is not None
+    if context.options["mpi"]:
+        for name in ("transports", "cluster"):
+            if context.options[name] is not None:
+                raise InputError(f"--mpi is given, and --{name}; give one of them")
+    for name in ("cluster", "workers"):
+        if context.options[name] is not None and not has_scenes:
+            raise InputError(
+                f"--{name} is given, but --transports is not; workers share many transports, and "
+                "'ltcl film' shares frames"
+            )
+
+
+def compensate_pictures(
+    context: Context, transport: Path, paths: Sequence[Path], out: Path
+) -> Answer:
+    """Write the patterns for all pictures into a folder, with their contact sheet."""
+    job = compensation.prepare(context, transport)
+    desired = pictures.read_all(context, paths, job.T.camera_grid, "the camera")
+    report = CompensateReport(
+        folder=out,
+        **job.heading,
+        pattern_png=job.pattern_codes,
+        exposure=panels.exposure(*desired.values()),
+        pictures=[],
+    )
+    writer = PictureWriter(
+        job=job,
+        factor=report.exposure,
+        white=max(job.settings["bounds"][1], 0.0) or 1.0,
+        has_std=loading.has_std(job.T, job.settings),
+    )
+    sheet = []
+    rows = []
+    with pictures.fill(out) as folder:
+        for name, path in zip(context.progress.each([*desired]), paths, strict=True):
             try:
-                result = compensation.compensate(T, desired[name], **settings)
+                result = compensate_picture(job.T, desired[name], **job.settings)
             except LtclError as error:
                 error.args = (f"{error} (compensating {path})",)
                 raise
-            written, panels = _write(
-                folder / name, desired[name], result, factor, high, setup, noisy
-            )
-            sheet.append(panels)
-            facts = {key: getattr(result, key) for key in _RESULTS}
-            lack = result.out_of_reach
-            facts |= {"too_dark": float(np.mean(lack > 0)), "too_bright": float(np.mean(lack < 0))}
-            facts["channels"], facts["limited"] = map(
-                report.solution, (result.solution, result.limited)
-            )
-            text["pictures"].append({"file": str(path), **facts, **written})
-            solved = facts["channels"] + [
-                each for each in facts["limited"] if each not in facts["channels"]
-            ]
-            methods = ", ".join(dict.fromkeys(each["method"] for each in solved))
-            counts = methods, sum(each["products"] for each in solved), facts["gain"]
-            shares = percent(facts["clipped"]), percent(facts["error"])
-            rows.append((path.name, *counts, *shares, f"{name}_pattern.png"))
-            for what, reason in _REASONS.items():
-                if (share := facts[f"too_{what}"]) > _MANY:
-                    note(f"{path}: {100 * share:.0f} % of it stays too {what}{reason}")
-        pictures.contact_sheet(sheet[:12]).save(folder / "compensate.png")
-    columns = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
-    where = f"\npatterns, appearances and what is out of reach as .exr and .png in {out}"
-    return [table(columns, rows), where, f"look at {out / 'compensate.png'}"]
-
-
-def _write(
-    stem: Path,
-    desired: np.ndarray,
-    result: Any,
-    factor: float,
-    high: float,
-    setup: Any,
-    noisy: bool,
-) -> tuple[dict[str, Any], list[Any]]:
-    """Files of one picture, and its row of the contact sheet."""
-    from ltcl import images
-
-    folder, name, pattern = stem.parent, stem.name, result.pattern
-    units = {
-        "pattern": 1 / high,
-        "appearance": factor / result.gain,
-    }  # to compare with what was asked for
-    seen = pictures.shades(result.appearance, units["appearance"])
-    missing = pictures.mark(seen, result.out_of_reach * units["appearance"])
-    panels = [
-        pictures.panel(desired, f"{name}, desired", factor),
-        pictures.panel(pattern, f"{name}, pattern", units["pattern"]),
-        pictures.panel(seen, f"{name}, as predicted, error {100 * result.error:.2g} %"),
-        pictures.panel(missing, "out of reach: orange too dark, blue too bright"),
+            entry, row_of_panels = writer.write(folder, name, path, desired[name], result)
+            report.pictures.append(entry)
+            sheet.append(row_of_panels)
+            rows.append(_table_row(path, name, entry))
+            _note_out_of_reach(path, entry)
+        panels.contact_sheet(sheet[:MAX_SHEET_ROWS]).save(folder / "compensate.png")
+        pictures.write_report(folder, report)
+    lines = [
+        table(COLUMNS, rows),
+        f"\npatterns, appearances and what is out of reach as .exr and .png in {out}",
+        f"look at {out / 'compensate.png'}",
     ]
-    images.write(folder / f"{name}_pattern.exr", pattern)
-    codes, encoding = (
-        (pattern / high, "srgb") if setup is None else (setup.codes(pattern), "linear")
-    )
-    images.write(folder / f"{name}_pattern.png", codes, encoding=encoding)
-    written: dict[str, Any] = {
-        "pattern": {suffix: f"{name}_pattern.{suffix}" for suffix in ("exr", "png")}
-    }
-    for key, shown in zip(("appearance", "out_of_reach"), panels[2:], strict=True):
-        written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), shown)
-    for key, unit in units.items() if noisy else ():
-        std = getattr(result.std, key)
-        written[key]["std"], shown = pictures.deviation(folder, f"{name}_{key}", std, unit)
-        panels.append(shown)
-    return written, panels
+    return Answer(report, [*lines, *job.notes])
 
 
-def _compensate_frames(
-    context: Context, T: Transport, film: Path, out: Path, text: Any, settings: Any
-) -> list[Any]:
-    """Patterns of all frames of a folder or a video into a folder; the lines of the answer."""
-    from ltcl.batch import compensate_frames
+@dataclass(frozen=True, kw_only=True)
+class PictureWriter:
+    """Writes the files of one picture after the other."""
 
-    asked = {name: context.options[name] for name in (*_FRAMES, "resize", "encoding")} | settings
-    arguments = {
-        name: value for name, value in asked.items() if value is not None and name != "callback"
-    }
-    try:
-        with _cluster(context) as client:
-            result = compensate_frames(
-                T, film, out, progress=context.progress, client=client, **arguments
+    job: compensation.CompensationJob
+    # Exposure of the run.
+    factor: float
+    # Light that is white in the .png of a pattern.
+    white: float
+    has_std: bool
+
+    def write(
+        self, folder: Path, name: str, path: Path, desired: np.ndarray, result: Any
+    ) -> tuple[CompensatedPicture, list[Image.Image]]:
+        """Write all files of a picture; return its report and its row of the contact sheet."""
+        # Appearances are compared with the picture that was asked for.
+        appearance_factor = self.factor / result.gain
+        seen = panels.to_srgb(result.appearance, appearance_factor)
+        missing = panels.mark(seen, result.out_of_reach * appearance_factor)
+        error = f"{100 * result.error:.2g} %"
+        appearance_panel = panels.panel(seen, f"{name}, as predicted, error {error}")
+        missing_panel = panels.panel(missing, "out of reach: orange too dark, blue too bright")
+        row = [
+            panels.linear_panel(desired, f"{name}, desired", self.factor),
+            panels.linear_panel(result.pattern, f"{name}, pattern", 1 / self.white),
+            appearance_panel,
+            missing_panel,
+        ]
+        pattern = self._write_pattern(folder, name, result.pattern)
+        files = panels.write(folder, f"{name}_appearance", result.appearance, appearance_panel)
+        appearance = PictureWithStd(exr=files.exr, png=files.png)
+        if self.has_std:
+            std = result.std
+            pattern.std, panel = panels.write_std(
+                folder, f"{name}_pattern", std.pattern, 1 / self.white
             )
-    except KeyboardInterrupt:
-        count = f"{context.progress.tasks[0].completed:.0f} frame(s) are done and stay in {out}"
-        raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
-    worst, most, records = result.worst, result.most_clipped, result.records
-    names = "video gain solved seconds frames_per_second transport_error worst most_clipped"
-    text |= {
-        "source": film,
-        **{name: getattr(result, name) for name in names.split()},
-        "frames": records,
-    }
-    if most.clipped > _MANY:
-        count = sum(record.clipped > _MANY for record in records)
-        frame = (
-            f"frame {most.number} ({most.name}) most; a lower --gain helps where patterns are at 1"
+            row.append(panel)
+            appearance.std, panel = panels.write_std(
+                folder, f"{name}_appearance", std.appearance, appearance_factor
+            )
+            row.append(panel)
+        entry = CompensatedPicture.from_attributes(
+            result,
+            file=path,
+            too_dark=float(np.mean(result.out_of_reach > 0)),
+            too_bright=float(np.mean(result.out_of_reach < 0)),
+            channels=solves(result.solution),
+            limited=solves(result.limited),
+            pattern=pattern,
+            appearance=appearance,
+            out_of_reach=panels.write(
+                folder, f"{name}_out_of_reach", result.out_of_reach, missing_panel
+            ),
         )
-        note(f"{count} frame(s) ask for light beyond the projector's, {frame}")
-    pace = f"{result.frames_per_second:.1f}" if result.solved else None
-    columns = ("frames", "of this run", "a second", "gain", "worst error", "most clipped")
-    error, clipped = percent(worst.error), percent(most.clipped)
-    frames = f"{error} in frame {worst.number}", f"{clipped} in frame {most.number}"
-    row = (len(records), result.solved, pace, result.gain, *frames)
-    also = "" if result.video is None else f", as a video in {result.video}"
-    return [table(columns, [row]), f"\npatterns and frames.json in {out}{also}"]
+        return entry, row
+
+    def _write_pattern(self, folder: Path, name: str, pattern: np.ndarray) -> PictureWithStd:
+        """Write the light of a pattern, and the codes that the projector has to get."""
+        from ltcl import images
+
+        files = PictureWithStd(exr=f"{name}_pattern.exr", png=f"{name}_pattern.png")
+        images.write(folder / files.exr, pattern)
+        setup = self.job.setup
+        if setup is None:
+            images.write(folder / files.png, pattern / self.white, encoding="srgb")
+        else:
+            images.write(folder / files.png, setup.codes(pattern), encoding="linear")
+        return files
 
 
-def _cluster(context: Context) -> AbstractContextManager[Any]:
-    """The client that was asked for, or None."""
-    cluster, workers, device = (context.options[name] for name in ("cluster", "workers", "device"))
-    if cluster is None and workers is not None:
-        raise InputError(
-            f"--workers is {workers}, but there is no --cluster; it is for --cluster local"
-        )
-    return nullcontext() if cluster is None else connect(cluster, workers, device)
+def _table_row(path: Path, name: str, entry: CompensatedPicture) -> list[Any]:
+    solved = all_solves(entry)
+    methods = dict.fromkeys(solve.method for solve in solved)
+    return [
+        path.name,
+        ", ".join(methods),
+        sum(solve.products for solve in solved),
+        entry.gain,
+        percent(entry.clipped),
+        percent(entry.error),
+        f"{name}_pattern.png",
+    ]
 
 
-def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer:
-    """The pictures on each of many scenes, one task each; those that failed are named at the end."""
-    from ltcl.batch import map as of_each
-
-    pattern = context.options["transports"]
-    scenes = sorted(map(Path, glob.glob(pattern)))
-    if not scenes:
-        raise InputError(f"--transports is {pattern}, and there is no such file or folder")
-    if len({scene.stem for scene in scenes}) < len(scenes):
-        raise InputError(
-            f"--transports is {pattern}: it must mean files or folders of different names"
-        )
-    if {out.resolve(), *((out / each.stem).resolve() for each in scenes)} & {
-        *map(Path.resolve, scenes)
-    }:
-        raise InputError(f"--out is {out}, where transports are; it must be another place")
-    asked = context.options | dict.fromkeys(("transports", "cluster", "workers"))
-    asked |= (
-        {} if context.options["cluster"] is None else {"device": None}
-    )  # workers have their own
-    own = {
-        name: asked.get(name)
-        for name in [*inspect.signature(inspect.unwrap(compensate)).parameters][1:]
-    }
-
-    def files_of(scene: Path) -> dict[str, bytes]:
-        with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
-            place, call = Path(folder) / "scene", Context("compensate", asked, progress)
-            inspect.unwrap(compensate)(
-                call, **own | {"transport": scene, "picture": paths, "out": place}
-            )
-            return {file.name: file.read_bytes() for file in place.iterdir()}
-
-    reports, rows, failed = [], [], None
-    with _cluster(context) as client:
-        try:
-            results = of_each(files_of, scenes, client=client, progress=context.progress)
-        except BatchError as error:
-            results, failed = error.results, error
-    for scene, files in zip(scenes, results, strict=True):
-        if not isinstance(files, LtclError):
-            with fill_folder(out / scene.stem) as folder:
-                for name, content in files.items():
-                    (folder / name).write_bytes(content)
-            reports.append({"folder": out / scene.stem, **json.loads(files["compensate.json"])})
-            shown = reports[-1]["pictures"]
-            rows.append(
-                (scene.stem, shown[0]["gain"], percent(max(each["error"] for each in shown)))
-            )
-    if failed is not None:
-        raise failed
-    lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
-    return Answer({"folder": out, "scenes": reports}, lines)
+def all_solves(entry: CompensatedPicture) -> list[Solve]:
+    """Return the solves without bounds and those within them, each once."""
+    solved = [*entry.channels]
+    for solve in entry.limited:
+        if solve not in entry.channels:
+            solved.append(solve)
+    return solved
 
 
-@command(*options.TASK)
-def separate(
-    context: Context,
-    transport: options.Matrix,
-    picture: options.Pictures,
-    out: options.Out,
-    bounces: Annotated[int, option("Indirect bounces to separate.", min=0)] = 4,
-) -> Answer:
-    """Split PICTURE, taken of the scene under projector light, into direct light and bounces.
-
-    Writes direct, indirect, bounce_1, bounce_2, ... and the rest exactly as .exr (measured ones may
-    be a little negative), and for the eye as .png, all at one exposure, which separate.json names;
-    and separate.png with all of them. Several pictures get a folder each. Standard deviations by
-    the noise of TRANSPORT, where that is known, are direct_std, bounce_1_std, ... and in
-    separate.png.
-    """
-    T = options.load(context, transport)
-    settings = options.solving(context, T, separation.RTOL, bounces + 1)
-    photographs = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
-    noisy, factor = options.shows_noise(T, settings), pictures.exposure(*photographs.values())
-    text = options.heading(context, transport, T, rtol=settings["rtol"])
-    text["exposure"], text["pictures"], sheet, rows, errors = factor, [], [], [], []
-    with pictures.fill(out, text) as folder:
-        for name, path in zip(context.progress.each(list(photographs)), picture, strict=True):
-            result = separation.separate(T, photographs[name], bounces, **settings)
-            numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
-            light = {
-                "direct": result.direct,
-                "indirect": result.indirect,
-                **numbered,
-                "rest": result.rest,
-            }
-            solved = dict(
-                zip(["direct", *numbered], map(report.solution, result.solutions), strict=True)
-            )
-            std = (
-                dict(zip(solved, [result.std.direct, *result.std.bounces], strict=True))
-                if noisy
-                else {}
-            )
-            panels, deviations, parts = [pictures.panel(photographs[name], name, factor)], [], []
-            whole = float(photographs[name].mean(dtype=np.float64))
-            for part, picture_of in light.items():
-                panels.append(pictures.panel(picture_of, part, factor))
-                place = f"{name}/{part}" if len(photographs) > 1 else part
-                mean, solves = float(picture_of.mean(dtype=np.float64)), solved.get(part, [])
-                facts: Any = {"part": part, **pictures.write(folder, place, picture_of, panels[-1])}
-                facts |= {
-                    "lowest": float(picture_of.min()),
-                    "share": mean / whole if whole else None,
-                }
-                facts["channels"] = solves
-                if part in std:
-                    facts["std"], shown = pictures.deviation(folder, place, std[part], factor)
-                    deviations.append(shown)
-                parts.append(facts)
-                residual = max(
-                    (each["residual"] for each in solves if each["error"] is None), default=None
-                )
-                errors += [each["error"] for each in solves if each["error"] is not None]
-                products = sum(each["products"] for each in solves) or None
-                rows.append((path.name, part, percent(facts["share"], 4), products, residual))
-            entry = {"file": str(path), "transport_error": result.transport_error, "parts": parts}
-            text["pictures"].append(entry)
-            brighter = (pictures.amplified(light[part], part, factor) for part in light)
-            dim = [panel for times, panel in brighter if times >= _DIM]
-            sheet += [panels[:3], panels[3:], dim, deviations]
-        pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
-    lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]
-    lines.append(f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}")
-    if errors:
-        worst = 100 * float(checks.upwards(max(errors)))
-        lines.append(f"the relative error of each part by the inverse is at most {worst:.2g} %")
-    lines.append(options.caveat("all of this is", T, context.options["exact"]))
-    return Answer({"folder": out, **text}, lines)
-
-
-@command(options.file_options, options.picture_options)
-def relight(
-    context: Context,
-    transport: options.Matrix,
-    pattern: Annotated[list[Path], argument("PATTERN...", "Pictures of patterns.")],
-    out: options.Out,
-    on_dark: options.OnDark = "mask",
-    device: options.Device = None,
-) -> Answer:
-    """Show what the camera will see when PATTERN is projected.
-
-    With a TRANSPORT of 'ltcl acquire' a PATTERN of integers, as .png, holds the codes for its
-    projector, and the result is what the pattern adds to the ambient light.
-
-    Writes pictures exactly as .exr, and for the eye as .png at one exposure, which relight.json
-    names.
-    """
-    T = options.load(context, transport, dark_note=False)
-    patterns = pictures.read_all(
-        context, pattern, T.grid, "the projector", options.setup(transport)
-    )
-    light = {name: relighting.relight(T, each) for name, each in patterns.items()}
-    factor, text = pictures.exposure(*light.values()), options.heading(context, transport, T)
-    text["exposure"], text["pictures"], rows = factor, [], []
-    with pictures.fill(out, text) as folder:
-        for (name, picture), path in zip(light.items(), pattern, strict=True):
-            panel = pictures.panel(picture, f"{path.name}, relit", factor)
-            entry = {"file": str(path), "brightest": float(picture.max())}
-            entry |= pictures.write(folder, f"{name}_relit", picture, panel)
-            text["pictures"].append(entry)
-            rows.append((path.name, entry["brightest"], entry["exr"]))
-    lines = [table(("pattern", "brightest in picture", "picture"), rows)]
-    lines += [f"\npictures as .exr and .png in {out}", options.caveat("they are", T)]
-    return Answer({"folder": out, **text}, lines)
+def _note_out_of_reach(path: Path, entry: CompensatedPicture) -> None:
+    shares = {"dark": entry.too_dark, "bright": entry.too_bright}
+    for kind, share in shares.items():
+        if share > ADVICE_SHARE:
+            note(f"{path}: {100 * share:.0f} % of it stays too {kind}{ADVICE[kind]}")

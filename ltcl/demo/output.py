@@ -16,7 +16,7 @@ import numpy as np
 
 from ltcl import images, plots
 from ltcl.demo.experiment import ALBEDO, COLOURS, RTOL, Experiment
-from ltcl.scenes import viewer
+from ltcl.scenes import camera
 from ltcl.tasks import report
 
 VIEW_PIXELS = 800  # along the longer side of a view
@@ -61,7 +61,7 @@ def draw_views(results: Experiment, shown: dict[str, Shown]) -> dict[str, np.nda
     """The corner as its viewer sees it, (h, w, 3), under each picture."""
     scene = results.scene
     exposed = [entry.exposure * entry.picture for entry in shown.values()]
-    stacked = viewer.draw(
+    stacked = camera.draw(
         scene.viewer, scene.walls, np.concatenate(exposed, axis=2), VIEW_PIXELS, supersample=2
     )
     views = np.split(stacked, len(shown), axis=2)

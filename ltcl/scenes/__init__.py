@@ -17,5 +17,17 @@ from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import visibility
 from ltcl.scenes.walls import Block
 
-__all__ = ["Block", "FormFactor", "GlossyScene", "Patches", "Scene"]
-__all__ += ["box", "cut", "dihedral", "glossy", "landscape", "trihedral", "visibility"]
+__all__ = [
+    "Block",
+    "FormFactor",
+    "GlossyScene",
+    "Patches",
+    "Scene",
+    "box",
+    "cut",
+    "dihedral",
+    "glossy",
+    "landscape",
+    "trihedral",
+    "visibility",
+]

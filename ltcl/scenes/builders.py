@@ -22,9 +22,9 @@ from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.scenes import exchange
+from ltcl.scenes.camera import SceneCamera
 from ltcl.scenes.patches import cut
 from ltcl.scenes.scene import Scene
-from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.visibility import visibility
 from ltcl.scenes.walls import Block, Wall, spread_albedo, vector
 
@@ -38,10 +38,12 @@ WALLS = (
 )
 """Faces of the unit cube from inside, in the order of `box`; its far upright edge is the z axis."""
 
-_ABOVE = Viewer(eye=(2.6, 2.6, 2.1), target=(0, 0, 0.25))
-_LEVEL = Viewer(eye=(2.6, 2.6, 0.5), target=(0, 0, 0.5))
-_SAMPLES = 16  # along a side: 256 rays
-_TOUCH = 1e-9  # what reaches out of the cube by less is rounding
+FROM_ABOVE = SceneCamera(eye=(2.6, 2.6, 2.1), target=(0, 0, 0.25))
+AT_EYE_LEVEL = SceneCamera(eye=(2.6, 2.6, 0.5), target=(0, 0, 0.5))
+# Points along a patch: 256 rays between two patches past a block.
+BLOCK_SAMPLES = 16
+# A block that reaches out of the cube by less is within it, to rounding.
+CUBE_TOLERANCE = 1e-9
 
 
 def box(
@@ -68,8 +70,8 @@ def box(
         An opaque block inside the cube, which it may touch. It casts shadows; if it has an albedo,
         its faces are part of the picture, except those that lie in a wall.
     device : Device or str, optional
-        What traces rays past the occluder; the best one if omitted. Without an occluder none is
-        opened.
+        The device that traces rays past the occluder; the best one if omitted. Without an occluder
+        none is opened.
 
     Returns
     -------
@@ -103,10 +105,12 @@ def box(
     """
     sides = checks.count("sides", sides, most=len(WALLS))
     # From above a ceiling would show its back, and walls alone look best at eye level.
-    viewer = _ABOVE if sides == 3 else _LEVEL
+    viewer = FROM_ABOVE if sides == 3 else AT_EYE_LEVEL
     if not isinstance(occluder, Block | None):
         raise InputTypeError(f"occluder is {occluder!r}; it must be an ltcl.scenes.Block")
-    name = f"box with {sides} side(s)" + (" and a block" if occluder else "")
+    name = f"box with {sides} side(s)"
+    if occluder is not None:
+        name += " and a block"
     return _assemble(name, WALLS[:sides], n, albedo, viewer, occluder, device)
 
 
@@ -122,7 +126,7 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (2,), one per wall; (3,), one colour; (2, 3), one colour per wall.
     angle : float
-        Between the walls, in degrees, above 0 and below 180. The smaller, the more light stays
+        Angle between the walls, in degrees, above 0 and below 180. The smaller, the more light stays
         inside.
 
     Returns
@@ -152,12 +156,14 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     True
     """
     angle = checks.number("angle", angle, above=0, below=180)
-    viewer = Viewer(eye=(2.2, 2.2, 0.5), target=(0, 0, 0.5))
+    viewer = SceneCamera(eye=(2.2, 2.2, 0.5), target=(0, 0, 0.5))
     if angle == 90:
         return _assemble("dihedral", WALLS[:2], n, albedo, viewer)
     # Both walls are turned about the z axis, away from the viewer's line of sight by the same
     # angle.
-    x, y = math.cos(math.radians(45 - angle / 2)), math.sin(math.radians(45 - angle / 2))
+    azimuth = math.radians(45 - angle / 2)
+    x = math.cos(azimuth)
+    y = math.sin(azimuth)
     walls = (
         Wall("left", corner=(x, y, 1), right=(-x, -y, 0), down=(0, 0, -1)),
         Wall("right", corner=(0, 0, 1), right=(y, x, 0), down=(0, 0, -1)),
@@ -175,7 +181,7 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (1, 3), one colour; (3, 1), one per wall; (3, 3), one colour per wall.
     angle : float
-        Between any two of the three edges, in degrees, above 0 and below 120. 90 gives the corner
+        Angle between any two of the three edges, in degrees, above 0 and below 120. 90 gives the corner
         of a cube, 120 would be a flat hexagon, and towards 0 it becomes a narrow tube.
 
     Returns
@@ -186,7 +192,7 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     Raises
     ------
     InputError, MemoryLimitError
-        As of `dihedral`.
+        Those of `dihedral`.
 
     Examples
     --------
@@ -195,21 +201,26 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     ((4, 12), 2.5981)
     """
     angle = checks.number("angle", angle, above=0, below=120)
-    cos, sin = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-    # Of the edges' horizontal parts, whose length is sin: cos = cos^2 + sin^2 cos(turn).
+    cos = math.cos(math.radians(angle))
+    sin = math.sin(math.radians(angle))
+    # The horizontal parts of the edges have length sin: cos = cos^2 + sin^2 cos(turn).
     turn = math.acos(cos / (1 + cos))
-    left, right = (
-        np.array([sin * math.cos(azimuth), sin * math.sin(azimuth), cos])
-        for azimuth in (math.pi / 4 - turn / 2, math.pi / 4 + turn / 2)
-    )
+
+    def edge(azimuth: float) -> np.ndarray:
+        return np.array([sin * math.cos(azimuth), sin * math.sin(azimuth), cos])
+
+    left = edge(math.pi / 4 - turn / 2)
+    right = edge(math.pi / 4 + turn / 2)
     up = np.array([0.0, 0.0, 1.0])
     walls = (
         Wall("left", corner=vector(left + up), right=vector(-left), down=vector(-up)),
         Wall("right", corner=vector(up), right=vector(right), down=vector(-up)),
         Wall("floor", corner=(0.0, 0.0, 0.0), right=vector(right), down=vector(left)),
     )
-    middle = left + right + up
-    viewer = Viewer(vector(middle / 3 + 3.3 * middle / np.linalg.norm(middle)), vector(middle / 3))
+    diagonal = left + right + up
+    target = diagonal / 3
+    eye = target + 3.3 * diagonal / np.linalg.norm(diagonal)
+    viewer = SceneCamera(vector(eye), vector(target))
     return _assemble(f"trihedral of {angle:g} degrees", walls, n, albedo, viewer)
 
 
@@ -218,51 +229,73 @@ def _assemble(
     walls: tuple[Wall, ...],
     n: int,
     albedo: Any,
-    viewer: Viewer,
+    viewer: SceneCamera,
     occluder: Block | None = None,
     device: Device | str | None = None,
 ) -> Scene:
     """Scene of walls with n x n patches each, and of a block in the unit cube."""
     n = checks.count("n", n)
     faces = () if occluder is None else _lit_faces(occluder)
-    every = (*walls, *faces)
-    pixels = n * n * len(every)
+    surfaces = (*walls, *faces)
+    pixels = n * n * len(surfaces)
     # Form factors, transport, its copy for the device, and room to work.
     checks.fits_host(f"{name}, {pixels} x {pixels}, with its transport,", 4 * 8 * pixels**2)
-    patches = spread_albedo(albedo, len(walls), n)
+    albedos = spread_albedo(albedo, len(walls), n)
     if occluder is None:
         factors = exchange.form_factors(walls, n)
+        blocks = ()
     else:
         factors = _past_block(walls, faces, occluder, n, device)
-    if occluder is not None and faces:
-        of_walls = patches.reshape(len(patches), n, len(walls), n)[:, 0, :, 0].T
-        of_block = np.atleast_1d(np.asarray(occluder.albedo, np.float64))
-        channels = max(len(patches), len(of_block))
-        both = (of_walls, len(walls)), (of_block, len(faces))
-        colours = np.concatenate(
-            [np.broadcast_to(colour, (count, channels)) for colour, count in both]
-        )
-        patches = spread_albedo(colours, len(every), n)
-    areas = np.tile(np.repeat([wall.area / n**2 for wall in every], n), n)
-    blocks = () if occluder is None else (occluder,)
-    return Scene(name, (n, len(every) * n), factors, patches, areas, every, viewer, blocks)
+        blocks = (occluder,)
+        if faces:
+            albedos = _with_block(albedos, len(walls), occluder.albedo, len(faces), n)
+    patch_areas = [surface.area / n**2 for surface in surfaces]
+    return Scene(
+        name=name,
+        grid=(n, len(surfaces) * n),
+        form_factors=factors,
+        albedo=albedos,
+        area=np.tile(np.repeat(patch_areas, n), n),
+        walls=surfaces,
+        viewer=viewer,
+        blocks=blocks,
+    )
+
+
+def _with_block(
+    albedos: np.ndarray, walls: int, block_albedo: Any, faces: int, n: int
+) -> np.ndarray:
+    """Albedos of all patches (channels, n * walls * n), with those of the faces of a block behind."""
+    of_walls = albedos.reshape(len(albedos), n, walls, n)[:, 0, :, 0].T
+    of_block = np.atleast_1d(np.asarray(block_albedo, np.float64))
+    channels = max(len(albedos), len(of_block))
+    colours = [
+        np.broadcast_to(of_walls, (walls, channels)),
+        np.broadcast_to(of_block, (faces, channels)),
+    ]
+    return spread_albedo(np.concatenate(colours), walls + faces, n)
 
 
 def _lit_faces(block: Block) -> tuple[Wall, ...]:
-    """Faces of a block in the unit cube that light can meet: not those on the cube's faces, none if black."""
-    low, high = block.low, block.high
-    if low.min() < -_TOUCH or high.max() > 1 + _TOUCH:
+    """Faces of a block in the unit cube that light can meet: none if black, none on the cube's faces."""
+    low = block.low
+    high = block.high
+    if low.min() < -CUBE_TOLERANCE or high.max() > 1 + CUBE_TOLERANCE:
         raise InputError(
             f"occluder reaches from {vector(low)} to {vector(high)}, out of the room; "
             "it must stay within (0, 0, 0) and (1, 1, 1)"
         )
-    if low.max() < _TOUCH and high.min() > 1 - _TOUCH:
+    if low.max() < CUBE_TOLERANCE and high.min() > 1 - CUBE_TOLERANCE:
         raise InputError("occluder fills the room; it must leave some of it free")
-    faces = () if block.albedo is None else block.faces()
-    free = (
-        np.concatenate([1 - high, low])[[0, 3, 1, 4, 2, 5]] >= _TOUCH
-    )  # in the order of `Block.faces`
-    return tuple(face for face, lit in zip(faces, free, strict=False) if lit)
+    if block.albedo is None:
+        return ()
+    # In the order of `Block.faces`: +x, -x, +y, -y, top, bottom.
+    distances = np.stack([1 - high, low], axis=1).ravel()
+    lit = []
+    for face, distance in zip(block.faces(), distances, strict=True):
+        if distance >= CUBE_TOLERANCE:
+            lit.append(face)
+    return tuple(lit)
 
 
 def _past_block(
@@ -273,13 +306,16 @@ def _past_block(
     device: Device | str | None,
 ) -> np.ndarray:
     """Form factors (N, N) of a room and of the lit faces of a block in it, walls before faces."""
-    every, room = (*walls, *faces), len(walls)
-    matrix = np.zeros((n, len(every), n, n, len(every), n))
-    exchange.fill(matrix, every, itertools.combinations(range(room), 2))
-    exchange.fill(matrix, every, itertools.product(range(room), range(room, len(every))))
-    passed = visibility(cut(walls, n), [(block.low, block.high)], device, samples=_SAMPLES)
-    matrix[:, :room, :, :, :room] *= passed.reshape(n, room, n, n, room, n)
-    matrix = matrix.reshape(n * n * len(every), -1)
+    surfaces = (*walls, *faces)
+    room = len(walls)
+    total = len(surfaces)
+    matrix = np.zeros((n, total, n, n, total, n))
+    exchange.fill(matrix, surfaces, itertools.combinations(range(room), 2))
+    exchange.fill(matrix, surfaces, itertools.product(range(room), range(room, total)))
+    boxes = [(block.low, block.high)]
+    visible = visibility(cut(walls, n), boxes, device, samples=BLOCK_SAMPLES)
+    matrix[:, :room, :, :, :room] *= visible.reshape(n, room, n, n, room, n)
+    matrix = matrix.reshape(n * n * total, -1)
     scale = 1 / np.maximum(matrix.sum(axis=1), 1)
     for row, factor in zip(matrix, scale, strict=True):
         row *= np.minimum(scale, factor)

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.special
@@ -32,29 +33,33 @@ from ltcl import checks
 from ltcl.scenes.patches import Patches
 from ltcl.scenes.walls import Wall
 
-_TIERS = ((20.0, 3), (7.0, 4), (4.0, 5), (3.0, 6), (2.0, 8))
-"""Distance of the centres in radii of both patches from which on so many points a side are enough."""
+# Distance of the centres, in radii of both patches, from which on so many points a side are enough.
+TIERS = ((20.0, 3), (7.0, 4), (4.0, 5), (3.0, 6), (2.0, 8))
+NEAREST_TIER = TIERS[-1][0]
 
-_TOUCHING, _APART = 40, 16  # points on each piece of an edge: nearer than all tiers, and farther
-_FLAT = 1e-12  # of the patches' size: heights above a plane that are rounding errors
-_SLAB = 4096  # pairs of patches at a time, so that temporary arrays stay in the cache
-# where (down, right) of a picture lie after quarter turns, and mirrored: order and signs
-_TURNS = {
-    (turn, mirror): (order[::step], sign[::step])
-    for turn, (order, sign) in enumerate(
-        (((0, 1), (1, 1)), ((1, 0), (1, -1)), ((0, 1), (-1, -1)), ((1, 0), (-1, 1)))
-    )
-    for mirror, step in ((False, 1), (True, -1))
-}
-_AROUND = (
-    np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
-)  # corners of a patch, in edges (down, right)
+# Points on each piece of an edge: of pairs nearer than all tiers, and of others.
+NEAR_EDGE_POINTS = 40
+FAR_EDGE_POINTS = 16
+
+# Heights above a plane up to this part of the patches' size are rounding errors.
+FLAT_TOLERANCE = 1e-12
+
+# Sizes of temporary arrays, so that they stay in the cache: pairs of patches; pairs of points.
+PAIRS_AT_ONCE = 4096
+POINT_PAIRS_AT_ONCE = 1 << 16
+EDGE_POINTS_AT_ONCE = 1 << 18
+
+# Places of (down, right) of a picture after quarter turns, and signs of both.
+QUARTER_TURNS = (((0, 1), (1, 1)), ((1, 0), (1, -1)), ((0, 1), (-1, -1)), ((1, 0), (-1, 1)))
+
+# Corners of a patch, around its front, in edges (down, right).
+CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
 
 
 def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
     """Form factors of all patches of walls, (N, N) float64, N = n * n * len(walls), without occlusion.
 
-    None of the walls may cut through another. MemoryLimitError: the host has no room for the
+    None of the walls may cut through another. MemoryLimitError if the host has no room for the
     matrix.
 
     >>> from ltcl.scenes.builders import WALLS
@@ -73,81 +78,127 @@ def fill(matrix: np.ndarray, walls: Sequence[Wall], pairs: Iterable[tuple[int, i
     n = len(matrix)
     known: dict[bytes, np.ndarray] = {}
     for i, j in pairs:
-        key, turn, other_turn, mirror = _congruent(walls[i], walls[j])
-        axes = (1, 0, 3, 2) if mirror else (0, 1, 2, 3)
-        if key not in known:
-            both = np.rot90(of_walls(walls[i], walls[j], n), -turn, axes=(0, 1))
-            known[key] = np.rot90(both, -other_turn, axes=(2, 3)).transpose(axes)
-        both = np.rot90(
-            np.rot90(known[key].transpose(axes), turn, axes=(0, 1)), other_turn, axes=(2, 3)
-        )
-        matrix[:, i, :, :, j, :] = both * (n**2 / walls[i].area)
-        matrix[:, j, :, :, i, :] = both.transpose(2, 3, 0, 1) * (n**2 / walls[j].area)
+        congruence = _congruence(walls[i], walls[j])
+        if congruence.key not in known:
+            exchanged = exchange_of_walls(walls[i], walls[j], n)
+            known[congruence.key] = congruence.to_common(exchanged)
+        exchanged = congruence.from_common(known[congruence.key])
+        matrix[:, i, :, :, j, :] = exchanged * (n**2 / walls[i].area)
+        matrix[:, j, :, :, i, :] = exchanged.transpose(2, 3, 0, 1) * (n**2 / walls[j].area)
 
 
-def _congruent(first: Wall, second: Wall) -> tuple[bytes, int, int, bool]:
-    """What congruent pairs of walls have in common, and the turns of their pictures that make it so.
+class Congruence(NamedTuple):
+    """The common form of congruent pairs of walls, and the turns of both pictures that lead to it.
 
-    That is the lengths and angles of edges (down, right), normals, and the way from middle to
-    middle, of all quarter turns of both pictures the first in order. Mirror images have rows for
-    columns.
+    Mirror images have rows for columns.
     """
-    edges = [np.array([wall.down, wall.right], np.float64) for wall in (first, second)]
-    offset = (
-        np.subtract(second.corner, first.corner) + (edges[1].sum(axis=0) - edges[0].sum(axis=0)) / 2
-    )
-    vectors = np.array([*edges[0], first.normal, *edges[1], second.normal, offset])
-    vectors[[0, 1, 3, 4, 6]] /= np.linalg.norm(edges[0][0])
+
+    key: bytes
+    first_turn: int
+    second_turn: int
+    is_mirrored: bool
+
+    @property
+    def axes(self) -> tuple[int, int, int, int]:
+        """Order of the axes of an exchange (n, n, n, n) in the common form."""
+        return (1, 0, 3, 2) if self.is_mirrored else (0, 1, 2, 3)
+
+    def to_common(self, exchanged: np.ndarray) -> np.ndarray:
+        """Turn an exchange (n, n, n, n) to the common form."""
+        turned = np.rot90(exchanged, -self.first_turn, axes=(0, 1))
+        turned = np.rot90(turned, -self.second_turn, axes=(2, 3))
+        return turned.transpose(self.axes)
+
+    def from_common(self, exchanged: np.ndarray) -> np.ndarray:
+        """Turn an exchange (n, n, n, n) back from the common form."""
+        turned = np.rot90(exchanged.transpose(self.axes), self.first_turn, axes=(0, 1))
+        return np.rot90(turned, self.second_turn, axes=(2, 3))
+
+
+def _congruence(first: Wall, second: Wall) -> Congruence:
+    """The congruence of a pair of walls.
+
+    Its key is the lengths and angles of edges (down, right), normals, and the way from middle to
+    middle, of all quarter turns of both pictures the first in order.
+    """
+    edges = np.array([first.down, first.right], np.float64)
+    other_edges = np.array([second.down, second.right], np.float64)
+    to_middles = (other_edges.sum(axis=0) - edges.sum(axis=0)) / 2
+    offset = np.subtract(second.corner, first.corner) + to_middles
+    vectors = np.array([*edges, first.normal, *other_edges, second.normal, offset])
+    vectors[[0, 1, 3, 4, 6]] /= np.linalg.norm(edges[0])
     gram = (vectors @ vectors.T).round(9)
-    keys = []
-    for turn, other_turn, mirror in itertools.product(range(4), range(4), (False, True)):
-        (order, sign), (other_order, other_sign) = _TURNS[turn, mirror], _TURNS[other_turn, mirror]
-        places = [*order, 2, *(3 + k for k in other_order), 5, 6]
+    congruences = []
+    for turn, other_turn, is_mirrored in itertools.product(range(4), range(4), (False, True)):
+        order, sign = _turned_edges(turn, is_mirrored)
+        other_order, other_sign = _turned_edges(other_turn, is_mirrored)
+        places = [*order, 2, other_order[0] + 3, other_order[1] + 3, 5, 6]
         signs = np.array([*sign, 1, *other_sign, 1, 1])
         turned = gram[np.ix_(places, places)] * np.outer(signs, signs) + 0.0  # no -0
-        keys.append((turned.tobytes(), turn, other_turn, mirror))
-    return min(keys)
+        congruences.append(Congruence(turned.tobytes(), turn, other_turn, is_mirrored))
+    return min(congruences)
 
 
-def of_walls(first: Wall, second: Wall, n: int) -> np.ndarray:
+def _turned_edges(turn: int, is_mirrored: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Order and signs of (down, right) after quarter turns, mirrored or not."""
+    order, sign = QUARTER_TURNS[turn]
+    if is_mirrored:
+        return order[::-1], sign[::-1]
+    return order, sign
+
+
+def exchange_of_walls(first: Wall, second: Wall, n: int) -> np.ndarray:
     """a_i F_ij between the patches of two walls, (n, n, n, n) float64: rows, columns of both.
 
     It depends on the offset of the patches alone, so each offset is computed once: about 2 n^3 for
     walls that share an edge, 4 n^2 for walls that face each other.
     """
-    edges, others = (
-        np.stack([wall.down, wall.right]).astype(np.float64) / n for wall in (first, second)
-    )
-    index = np.ogrid[:n, :n, :n, :n]
-    steps, counts, free = [], [], {0, 1, 2, 3}
-    for i, j, sign in itertools.product((0, 1), (2, 3), (1, -1)):
-        tolerance = _FLAT * np.linalg.norm(edges[i])
-        alike = np.allclose(edges[i], sign * others[j - 2], rtol=0, atol=tolerance)
-        if (
-            alike and {i, j} <= free
-        ):  # only the difference of the counts along a shared edge matters
-            free -= {i, j}
-            steps.append(others[j - 2])
-            counts.append(index[j] - sign * index[i])
-    steps += [others[k - 2] if k > 1 else -edges[k] for k in sorted(free)]
-    counts += [index[k] for k in sorted(free)]
-    ranges = np.meshgrid(
-        *(np.arange(count.min(), count.max() + 1) for count in counts), indexing="ij"
-    )
-    start = np.subtract(second.corner, first.corner) + (others.sum(axis=0) - edges.sum(axis=0)) / 2
-    offsets = start + np.stack(ranges, axis=-1) @ np.array(steps)
+    edges = np.stack([first.down, first.right]).astype(np.float64) / n
+    others = np.stack([second.down, second.right]).astype(np.float64) / n
+    steps, counts = _offset_steps(edges, others, n)
+    ranges = [np.arange(count.min(), count.max() + 1) for count in counts]
+    places = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
+    to_middles = (others.sum(axis=0) - edges.sum(axis=0)) / 2
+    start = np.subtract(second.corner, first.corner) + to_middles
+    offsets = start + places @ np.array(steps)
     table = exchange(edges, others, offsets.reshape(-1, 3)).reshape(offsets.shape[:-1])
     return table[tuple(count - count.min() for count in counts)]
 
 
-def of_pairs(patches: Patches, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+def _offset_steps(
+    edges: np.ndarray, others: np.ndarray, n: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Steps (3,) of the offset between patches of two walls, and how often each is taken.
+
+    Counts are arrays that broadcast to (n, n, n, n). Along an edge that both walls share only the
+    difference of their counts matters.
+    """
+    index = np.ogrid[:n, :n, :n, :n]
+    steps = []
+    counts = []
+    free = {0, 1, 2, 3}  # axes of the exchange that no shared edge has taken
+    for i, j, sign in itertools.product((0, 1), (2, 3), (1, -1)):
+        tolerance = FLAT_TOLERANCE * np.linalg.norm(edges[i])
+        is_shared = np.allclose(edges[i], sign * others[j - 2], rtol=0, atol=tolerance)
+        if is_shared and {i, j} <= free:
+            free -= {i, j}
+            steps.append(others[j - 2])
+            counts.append(index[j] - sign * index[i])
+    for axis in sorted(free):
+        step = others[axis - 2] if axis > 1 else -edges[axis]
+        steps.append(step)
+        counts.append(index[axis])
+    return steps, counts
+
+
+def form_factors_of_pairs(patches: Patches, i: np.ndarray, j: np.ndarray) -> np.ndarray:
     """F_ij of listed pairs of patches, (P,) float64: shares of the light from patches i that meet patches j.
 
-    For pairs a few sizes apart at most: to 1e-6 of an entry up to 10 sizes.
+    It is meant for pairs a few sizes apart: entries are right to 1e-6 up to 10 sizes.
 
     >>> from ltcl.scenes import box, cut
     >>> patches = cut(box(1, sides=2).walls, 1)
-    >>> round(float(of_pairs(patches, np.array([0]), np.array([1]))[0]), 5)
+    >>> round(float(form_factors_of_pairs(patches, np.array([0]), np.array([1]))[0]), 5)
     0.20004
     """
     edges = np.stack([patches.down, patches.right], axis=1)
@@ -161,76 +212,98 @@ def exchange(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.nd
     outlines only.
     """
     result = np.empty(len(offset))
-    for start in range(0, len(offset), _SLAB):
-        slab = slice(start, start + _SLAB)
-        pair = [edges if edges.ndim == 2 else edges[slab] for edges in (first, second)]
-        result[slab] = _slab(pair[0], pair[1], offset[slab])
+    for start in range(0, len(offset), PAIRS_AT_ONCE):
+        slab = slice(start, start + PAIRS_AT_ONCE)
+        first_edges = first if first.ndim == 2 else first[slab]
+        second_edges = second if second.ndim == 2 else second[slab]
+        result[slab] = _exchange_of_slab(first_edges, second_edges, offset[slab])
     return result
 
 
-def _slab(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    radius = sum(
-        np.linalg.norm(e @ ((1, 1), (1, -1)), axis=-2).max(axis=-1) / 2
-        for e in (first.swapaxes(-1, -2), second.swapaxes(-1, -2))
-    )
-    over, under = _heights(first, second, offset), _heights(second, first, -offset)
-    level = _FLAT * np.asarray(radius)[..., None]
-    over, under = (np.where(np.abs(height) < level, 0.0, height) for height in (over, under))
-    left = (over.max(axis=1) > 0) & (under.max(axis=1) > 0)
-    whole = (over.min(axis=1) >= 0) & (under.min(axis=1) >= 0)
+def _exchange_of_slab(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """`exchange` of a few pairs, each by the method for its distance."""
+    radius = _radius(first) + _radius(second)
+    level = FLAT_TOLERANCE * np.asarray(radius)[..., None]
+    # Heights of the second patch above the plane of the first, and the other way round.
+    over = _flatten(_heights(first, second, offset), level)
+    under = _flatten(_heights(second, first, -offset), level)
+    is_left = (over.max(axis=1) > 0) & (under.max(axis=1) > 0)
+    is_whole = (over.min(axis=1) >= 0) & (under.min(axis=1) >= 0)
     distance = np.linalg.norm(offset, axis=1) / radius
     result = np.zeros(len(offset))
-    for least, points in _TIERS if first.ndim == 2 else ():
-        some = np.flatnonzero(left & whole & (distance >= least))
-        if len(some):
-            result[some] = _quadrature(first, second, offset[some], points)
-            left[some] = False
-    if not left.any():
+    if first.ndim == 2:
+        for least_distance, points in TIERS:
+            some = np.flatnonzero(is_left & is_whole & (distance >= least_distance))
+            if len(some):
+                result[some] = _quadrature(first, second, offset[some], points)
+                is_left[some] = False
+    if not is_left.any():
         return result
-    first, second = (np.broadcast_to(edges, (len(offset), 2, 3)) for edges in (first, second))
-    unit = np.broadcast_to(radius, len(offset))  # logarithms of a closed outline cancel best near 1
+
+    first = np.broadcast_to(first, (len(offset), 2, 3))
+    second = np.broadcast_to(second, (len(offset), 2, 3))
+    # Logarithms of a closed outline cancel best near 1, so radii are the unit.
+    unit = np.broadcast_to(radius, len(offset))
+    is_near = distance < NEAREST_TIER
     for near, clipped in itertools.product((True, False), repeat=2):
-        some = np.flatnonzero(left & ((distance < _TIERS[-1][0]) == near) & (whole != clipped))
-        if len(some):
-            scale = unit[some, None, None, None]
-            outline = _outline(first[some], np.zeros((1, 3))) / scale
-            opposite = _outline(second[some], offset[some]) / scale
-            if clipped:
-                outline, opposite = _clip(outline, under[some]), _clip(opposite, over[some])
-            result[some] = (
-                _stokes(outline, opposite, _TOUCHING if near else _APART) * unit[some] ** 2
-            )
+        some = np.flatnonzero(is_left & (is_near == near) & (is_whole != clipped))
+        if not len(some):
+            continue
+        scale = unit[some, None, None, None]
+        outline = _outline(first[some], np.zeros((1, 3))) / scale
+        opposite = _outline(second[some], offset[some]) / scale
+        if clipped:
+            outline = _clip(outline, under[some])
+            opposite = _clip(opposite, over[some])
+        points = NEAR_EDGE_POINTS if near else FAR_EDGE_POINTS
+        result[some] = _stokes(outline, opposite, points) * unit[some] ** 2
     return result
+
+
+def _radius(edges: np.ndarray) -> np.ndarray:
+    """Half of the longer diagonal of patches with edges (..., 2, 3)."""
+    diagonals = edges.swapaxes(-1, -2) @ ((1, 1), (1, -1))
+    return np.linalg.norm(diagonals, axis=-2).max(axis=-1) / 2
+
+
+def _flatten(height: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Heights without those that are rounding errors."""
+    return np.where(np.abs(height) < level, 0.0, height)
 
 
 def _quadrature(
     first: np.ndarray, second: np.ndarray, offset: np.ndarray, points: int
 ) -> np.ndarray:
-    """By points x points Gauss-Legendre points on each patch."""
+    """The exchange by points x points Gauss-Legendre points on each patch."""
     node, weight = np.polynomial.legendre.leggauss(points)
     place = np.stack(np.meshgrid(node, node, indexing="ij"), axis=-1).reshape(-1, 2) / 2
     weights = np.outer(weight, weight).ravel() / 4  # (Q,)
-    here, there = place @ first, place @ second  # (Q, 3)
-    between = (there[None, :] - here[:, None]).reshape(-1, 3)
-    normal, other = _normal(first), _normal(second)
-    areas = [np.linalg.norm(np.cross(*edges)) for edges in (first, second)]
-    # The height of a point over the first plane is that of its patch's centre and its own from
+    # Points on both patches, from their centres, (Q, 3).
+    first_points = place @ first
+    second_points = place @ second
+    between = (second_points[None, :] - first_points[:, None]).reshape(-1, 3)
+    first_normal = _normal(first)
+    second_normal = _normal(second)
+    first_area = np.linalg.norm(np.cross(*first))
+    second_area = np.linalg.norm(np.cross(*second))
+    # The height of a point above the first plane is that of its patch's centre, and its own from
     # there.
-    moments = np.stack([weights, weights * (there @ normal)], axis=1)
+    moments = np.stack([weights, weights * (second_points @ first_normal)], axis=1)
     result = np.empty(len(offset))
-    step = max(1, (1 << 16) // len(between))
+    step = max(1, POINT_PAIRS_AT_ONCE // len(between))
     for start in range(0, len(offset), step):
         apart = offset[start : start + step]
-        r2 = (2 * apart) @ between.T
-        r2 += np.einsum("ki,ki->k", between, between)
-        r2 += np.einsum("pi,pi->p", apart, apart)[:, None]
-        np.square(r2, out=r2)
-        np.reciprocal(r2, out=r2)
-        inner = (r2.reshape(-1, len(weights)) @ moments).reshape(len(apart), -1, 2)
-        meet = (apart @ normal)[:, None] * inner[..., 0] + inner[..., 1]
-        leave = weights * ((apart @ other)[:, None] - here @ other)
-        result[start : start + step] = -np.einsum("pk,pk->p", leave, meet)
-    return result * (np.prod(areas) / np.pi)
+        # 1 / r^4, computed in place.
+        r = (2 * apart) @ between.T
+        r += np.einsum("ki,ki->k", between, between)
+        r += np.einsum("pi,pi->p", apart, apart)[:, None]
+        np.square(r, out=r)
+        np.reciprocal(r, out=r)
+        inner = (r.reshape(-1, len(weights)) @ moments).reshape(len(apart), -1, 2)
+        arriving = (apart @ first_normal)[:, None] * inner[..., 0] + inner[..., 1]
+        height = (apart @ second_normal)[:, None] - first_points @ second_normal
+        result[start : start + step] = -np.einsum("pk,pk->p", weights * height, arriving)
+    return result * (first_area * second_area / np.pi)
 
 
 def _stokes(first: np.ndarray, second: np.ndarray, points: int) -> np.ndarray:
@@ -238,48 +311,56 @@ def _stokes(first: np.ndarray, second: np.ndarray, points: int) -> np.ndarray:
     product = np.einsum("pai,pbi->pab", first[:, :, 1], second[:, :, 1])
     pair, a, b = np.nonzero(product)
     terms = product[pair, a, b]
-    step = max(1, (1 << 18) // points)
+    step = max(1, EDGE_POINTS_AT_ONCE // points)
     for start in range(0, len(pair), step):
         some = slice(start, start + step)
-        terms[some] *= _mean_log(first[pair[some], a[some]], second[pair[some], b[some]], points)
+        edges = first[pair[some], a[some]]
+        other_edges = second[pair[some], b[some]]
+        terms[some] *= _mean_log(edges, other_edges, points)
     # Patches that hardly see each other may come out a rounding error below zero.
-    return np.maximum(np.bincount(pair, terms, len(first)), 0) / (2 * np.pi)
+    total = np.bincount(pair, terms, len(first))
+    return np.maximum(total, 0) / (2 * np.pi)
 
 
 def _mean_log(p: np.ndarray, q: np.ndarray, points: int) -> np.ndarray:
     """Mean of ln r between points of two segments (P, 2, 3), (P,)."""
-    (start, edge), (other, along) = np.moveaxis(p, 1, 0), np.moveaxis(q, 1, 0)
-    length, offset = np.linalg.norm(along, axis=1), start - other
-    unit = along / length[:, None]
-    cuts = _cuts(edge, along, offset)
-    pair, piece = np.nonzero(np.diff(cuts, axis=1))
-    low, wide = cuts[pair, piece], np.diff(cuts, axis=1)[pair, piece]
+    p_start, p_edge = np.moveaxis(p, 1, 0)
+    q_start, q_edge = np.moveaxis(q, 1, 0)
+    length = np.linalg.norm(q_edge, axis=1)
+    unit = q_edge / length[:, None]
+    offset = p_start - q_start
+    cuts = _cuts(p_edge, q_edge, offset)
+    widths = np.diff(cuts, axis=1)
+    pair, piece = np.nonzero(widths)
+    low = cuts[pair, piece]
+    width = widths[pair, piece]
     node, weight = np.polynomial.legendre.leggauss(points)
     u = (node + 1) / 2
     # s = u^3 (10 - 15 u + 6 u^2) flattens logarithms at both ends.
-    s = low[:, None] + wide[:, None] * (u**3 * (10 - 15 * u + 6 * u**2))  # (pieces, points)
-    # Of a point of p: how far along q, and at which distance from its line.
-    t0, t1 = np.einsum("pi,pi->p", offset, unit), np.einsum("pi,pi->p", edge, unit)
-    across0, across1 = offset - t0[:, None] * unit, edge - t1[:, None] * unit
-    t = t0[pair, None] + t1[pair, None] * s
-    across = across0[pair, None] + across1[pair, None] * s[..., None]
+    s = low[:, None] + width[:, None] * (u**3 * (10 - 15 * u + 6 * u**2))  # (pieces, points)
+    # Place of a point of p along q, and its distance from the line of q: both are linear in s.
+    t_start = np.einsum("pi,pi->p", offset, unit)
+    t_slope = np.einsum("pi,pi->p", p_edge, unit)
+    across_start = offset - t_start[:, None] * unit
+    across_slope = p_edge - t_slope[:, None] * unit
+    t = t_start[pair, None] + t_slope[pair, None] * s
+    across = across_start[pair, None] + across_slope[pair, None] * s[..., None]
     distance = np.sqrt(np.einsum("...i,...i->...", across, across))
     inner = _log_integral(t, distance) - _log_integral(t - length[pair, None], distance)
-    means = wide * (inner @ (weight * 15 * u**2 * (1 - u) ** 2))
+    means = width * (inner @ (weight * 15 * u**2 * (1 - u) ** 2))
     return np.bincount(pair, means, len(p)) / length
 
 
 def _cuts(edge: np.ndarray, along: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Where segments p are cut, (P, 5) ascending from 0 to 1: beside the ends of q and nearest its line."""
+    """Places (P, 5), ascending from 0 to 1, where segments p are cut: at the ends of q and nearest its line."""
     square = np.einsum("pi,pi->p", edge, edge)
-    here = -np.einsum("pi,pi->p", edge, offset) / square
-    there = here + np.einsum("pi,pi->p", edge, along) / square
+    at_start = -np.einsum("pi,pi->p", edge, offset) / square
+    at_end = at_start + np.einsum("pi,pi->p", edge, along) / square
     normal = np.cross(edge, along)
+    distance = np.einsum("pi,pi->p", np.cross(along, offset), normal)
     with np.errstate(divide="ignore", invalid="ignore"):
-        nearest = np.einsum("pi,pi->p", np.cross(along, offset), normal) / np.einsum(
-            "pi,pi->p", normal, normal
-        )
-    inside = np.clip(np.nan_to_num(np.stack([here, there, nearest], axis=1)), 0, 1)
+        nearest = distance / np.einsum("pi,pi->p", normal, normal)
+    inside = np.clip(np.nan_to_num(np.stack([at_start, at_end, nearest], axis=1)), 0, 1)
     return np.pad(np.sort(inside, axis=1), ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
 
 
@@ -290,36 +371,40 @@ def _log_integral(t: np.ndarray, distance: np.ndarray) -> np.ndarray:
 
 def _outline(edges: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Starts and edge vectors around the fronts of patches (P, 2, 3), (P, 4, 2, 3)."""
-    starts = centre[:, None] + _AROUND @ edges
+    starts = centre[:, None] + CORNERS @ edges
     return np.stack([starts, np.roll(starts, -1, axis=1) - starts], axis=2)
 
 
 def _clip(outlines: np.ndarray, height: np.ndarray) -> np.ndarray:
     """The part in front of a plane of outlines (P, E, 2, 3) whose starts are `height` (P, E) above it.
 
-    (P, E + 1, 2, 3): the same edges, shortened, to nothing where they lie behind, and one more
-    along the cut.
+    The result (P, E + 1, 2, 3) has the same edges, shortened, to nothing where they lie behind, and
+    one more along the cut.
     """
-    after = np.roll(height, -1, axis=1)
+    next_height = np.roll(height, -1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cut = np.clip(np.nan_to_num(height / (height - after)), 0, 1)
-    hidden = (height < 0) & (after < 0)
-    first, last = (
-        np.where((height < 0) & ~hidden, cut, 0),
-        np.where(hidden, 0, np.where(after < 0, cut, 1)),
-    )
+        cut = np.clip(np.nan_to_num(height / (height - next_height)), 0, 1)
+    starts_behind = height < 0
+    ends_behind = next_height < 0
+    is_hidden = starts_behind & ends_behind
+    first = np.where(starts_behind & ~is_hidden, cut, 0)
+    last = np.where(is_hidden, 0, np.where(ends_behind, cut, 1))
     starts = outlines[:, :, 0] + first[..., None] * outlines[:, :, 1]
     edges = (last - first)[..., None] * outlines[:, :, 1]
-    # The outline leaves the front along one edge at most; what closes it starts there.
-    leaving, here = np.argmax((height >= 0) & (after < 0), axis=1), np.arange(len(outlines))
-    starts = np.concatenate([starts, (starts + edges)[here, leaving][:, None]], axis=1)
-    edges = np.concatenate([edges, -edges.sum(axis=1, keepdims=True)], axis=1)
+    # The outline leaves the front along one edge at most; the edge that closes it starts there.
+    leaving = np.argmax(~starts_behind & ends_behind, axis=1)
+    row = np.arange(len(outlines))
+    closing_start = (starts + edges)[row, leaving][:, None]
+    closing_edge = -edges.sum(axis=1, keepdims=True)
+    starts = np.concatenate([starts, closing_start], axis=1)
+    edges = np.concatenate([edges, closing_edge], axis=1)
     return np.stack([starts, edges], axis=2)
 
 
 def _heights(plane: np.ndarray, patch: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Signed distances of a patch's corners, around, from another's plane, (P, 4)."""
-    return ((offset[:, None] + _AROUND @ patch) * _normal(plane)[..., None, :]).sum(axis=-1)
+    corners = offset[:, None] + CORNERS @ patch
+    return (corners * _normal(plane)[..., None, :]).sum(axis=-1)
 
 
 def _normal(edges: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@
 Every product computes all N^2 form factors anew, by `kernels/form_factor.cl`: about 20 operations
 each, no memory traffic to speak of, 52 bytes a patch stored. Distant pairs are taken at their
 centres, nearer ones with the curvature between them, still nearer ones at eight pairs of points.
-Within `_NEAR` sizes that is not good enough: there the exact form factors come from the host, and
+Within `NEAR_DISTANCE` sizes that is not good enough: there the exact form factors come from the host, and
 what they differ from the kernel's is added as a sparse matrix.
 
 Measured on boxes of 6 to 131424 patches, and walls at 30, 70 and 130 degrees: for smooth x, F x is
@@ -45,10 +45,19 @@ from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import check_albedo
 
-_NEAR = 5.0  # sizes of a pair, see `squared_size`
-_ERROR = 1e-4
-_LAUNCH = 1 << 28  # pairs in one launch: a fraction of a second, so that no display driver gives up
-_NEAR_SAMPLES = 6  # squared, the rays between near patches
+# Pairs nearer than so many sizes of the pair (see `squared_size`) are corrected by the host.
+NEAR_DISTANCE = 5.0
+# Measured bound on the 2-norm of the error of F.
+RELATIVE_ERROR = 1e-4
+# Pairs in one launch: a fraction of a second, so that no display driver gives up.
+PAIRS_PER_LAUNCH = 1 << 28
+# Points along a patch: its square is the number of rays between near patches.
+NEAR_SAMPLES = 6
+# Heights of a patch above a plane, as a part of its size, that are rounding errors.
+FLAT_TOLERANCE = 1e-6
+BYTES_PER_PATCH = 60
+GROUP_OF_CPU = 16
+GROUP = 64
 
 
 class FormFactor(Operator):
@@ -99,26 +108,33 @@ class FormFactor(Operator):
         blocks: Any = None,
         device: Device | str | None = None,
     ) -> None:
-        patches, blocks = check_patches(patches), check_blocks(blocks)
-        count, shares = len(patches), np.ones(len(patches))
+        patches = check_patches(patches)
+        blocks = check_blocks(blocks)
+        count = len(patches)
+        shares = np.ones(count)
         if albedo is not None:
             value = checks.finite("albedo", checks.real("albedo", albedo)).astype(np.float64)
             check_albedo(checks.shape("albedo", value, (), (count,)))
             shares = np.broadcast_to(value, (count,))
-        super().__init__(
-            device if isinstance(device, Device) else open_device(device), (count, count)
-        )
-        self.device.require(60 * count, f"the geometry of {count} patches")
-        self.error = _ERROR * float(shares.max())
-        placed, self._blocks = scaled(self.device, patches, blocks)
-        vectors = (placed.centre, placed.right, placed.down, placed.normal)
-        rows = np.concatenate(
-            [*(vector.T for vector in vectors), squared_size(placed)[None]]
-        )  # (13, N)
-        self._geometry = padded(self.device, rows)
-        self._defines = {"LANES": lanes(self.device), "BLOCKS": len(blocks)}
-        self._albedo, self._area = self.device.upload(shares), self.device.upload(placed.area)
-        self._near = CSR(self.device, self._correction(patches, blocks, shares, placed.area))
+        if not isinstance(device, Device):
+            device = open_device(device)
+        super().__init__(device, (count, count))
+        device.require(BYTES_PER_PATCH * count, f"the geometry of {count} patches")
+        self.error = RELATIVE_ERROR * float(shares.max())
+        placed, self._blocks = scaled(device, patches, blocks)
+        rows = [
+            placed.centre.T,
+            placed.right.T,
+            placed.down.T,
+            placed.normal.T,
+            squared_size(placed)[None],
+        ]
+        self._geometry = padded(device, np.concatenate(rows))  # (13, N)
+        self._defines = {"LANES": lanes(device), "BLOCKS": len(blocks)}
+        self._albedo = device.upload(shares)
+        self._area = device.upload(placed.area)
+        correction = self._correction(patches, blocks, shares, placed.area)
+        self._near = CSR(device, correction)
         self._parts = (self._geometry, self._blocks, self._albedo, self._area, self._near)
 
     @classmethod
@@ -140,103 +156,139 @@ class FormFactor(Operator):
         >>> A.shape
         (176, 176)
         """
-        n, columns = scene.grid[0], scene.grid[1] // len(scene.walls)
+        n = scene.grid[0]
+        columns = scene.grid[1] // len(scene.walls)
         if n != columns:
             raise InputError(f"scene has walls of {n} x {columns} patches; they must be n x n")
-        patches, blocks = cut(scene.walls, n), [(block.low, block.high) for block in scene.blocks]
-        chosen = device if isinstance(device, Device) else open_device(device)
-        return tuple(cls(patches, albedo, blocks, chosen) for albedo in scene.albedo)
+        patches = cut(scene.walls, n)
+        blocks = [(block.low, block.high) for block in scene.blocks]
+        if not isinstance(device, Device):
+            device = open_device(device)
+        return tuple(cls(patches, albedo, blocks, device) for albedo in scene.albedo)
 
     def diagonal(self) -> np.ndarray:
         """Zeros, (N,): a flat patch does not light itself."""
         return np.zeros(self.shape[0])
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        right, left = (self._albedo, self._area) if transpose else (self._area, self._albedo)
+        right = self._albedo if transpose else self._area
+        left = self._area if transpose else self._albedo
         scale, b, y, c = epilogue
-        count, pitch = self.shape[0], self._geometry.shape[1]
-        rows = max(1, _LAUNCH // (pitch * (1 + self._defines["BLOCKS"])))
+        count = self.shape[0]
+        pitch = self._geometry.shape[1]
+        rows_per_launch = max(1, PAIRS_PER_LAUNCH // (pitch * (1 + self._defines["BLOCKS"])))
+        group = GROUP_OF_CPU if self.device.is_cpu else GROUP
         for offset, width in widths(x.columns):
-            packed = {"PACKED": 1} if width == x.columns else {}
-            weigh, matvec = (
-                self.device.kernel(
-                    "form_factor", f"form_factor_{name}", K=width, **packed, **self._defines
-                )
-                for name in ("weigh", "matvec")
-            )
-            z = self.device.empty((width, pitch))
-            weigh(pitch, 64, count, pitch, x.columns, offset, right, x, z)
-            vectors = (
-                x,
-                out if y is None else y,
-                out,
+            defines = dict(self._defines, K=width)
+            if width == x.columns:
+                defines["PACKED"] = 1
+            weigh = self.device.kernel("form_factor", "form_factor_weigh", **defines)
+            matvec = self.device.kernel("form_factor", "form_factor_matvec", **defines)
+            weighed = self.device.empty((width, pitch))
+            weigh(
                 pitch,
-                self._geometry,
-                self._blocks,
-                left,
-                z,
+                GROUP,
+                count=count,
+                pitch=pitch,
+                stride=x.columns,
+                offset=offset,
+                right=right,
+                x=x,
+                z=weighed,
             )
-            for first in range(0, count, rows):
-                size = min(rows, count - first)
-                place = (size, first, x.columns, offset, scale, b, c)
-                matvec(size, 16 if self.device.is_cpu else 64, *place, *vectors)
+            for first in range(0, count, rows_per_launch):
+                rows = min(rows_per_launch, count - first)
+                matvec(
+                    rows,
+                    group,
+                    rows=rows,
+                    first=first,
+                    stride=x.columns,
+                    offset=offset,
+                    a=scale,
+                    b=b,
+                    c=c,
+                    x=x,
+                    y=out if y is None else y,
+                    out=out,
+                    pitch=pitch,
+                    geometry=self._geometry,
+                    blocks=self._blocks,
+                    left=left,
+                    z=weighed,
+                )
         self._near._queue_product(x, out, Epilogue(scale, 1.0, out), transpose)
 
     def _correction(
         self, patches: Patches, blocks: np.ndarray, albedo: np.ndarray, area: np.ndarray
     ) -> scipy.sparse.csr_array:
-        """A of near pairs less what the kernel takes it for, both ways, (N, N) sparse float64."""
+        """A of near pairs less the kernel's value of it, both ways, (N, N) sparse float64."""
         i, j = _near_pairs(patches)
-        F = exchange.of_pairs(patches, i, j)
+        F = exchange.form_factors_of_pairs(patches, i, j)
         if len(blocks):
-            F = F * Rays(patches, blocks, self.device, _NEAR_SAMPLES).pairs(i, j)
+            rays = Rays(patches, blocks, self.device, NEAR_SAMPLES)
+            F = F * rays.pairs(i, j)
         # Per area and so symmetric, as in the kernel.
         missing = F / area[j] - self._kernel_pairs(i, j)
         values = np.concatenate([albedo[i] * missing * area[j], albedo[j] * missing * area[i]])
-        places = np.concatenate([i, j]), np.concatenate([j, i])
-        return scipy.sparse.csr_array(scipy.sparse.coo_array((values, places), shape=self.shape))
+        rows = np.concatenate([i, j])
+        columns = np.concatenate([j, i])
+        correction = scipy.sparse.coo_array((values, (rows, columns)), shape=self.shape)
+        return scipy.sparse.csr_array(correction)
 
     def _kernel_pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """The kernel's own value per area of listed pairs, (P,) float64."""
         kernel = self.device.kernel(
             "form_factor", "form_factor_pairs", K=1, PACKED=1, **self._defines
         )
-        most = max(1, _LAUNCH // (64 * (1 + self._defines["BLOCKS"])))
+        pairs_per_launch = max(1, PAIRS_PER_LAUNCH // (64 * (1 + self._defines["BLOCKS"])))
         parts = [np.zeros(0)]
-        for start in range(0, len(i), most):
-            ends = [self.device.upload(end[start : start + most], np.int32) for end in (i, j)]
-            out = self.device.empty(ends[0].shape)
+        for start in range(0, len(i), pairs_per_launch):
+            some = slice(start, start + pairs_per_launch)
+            from_patches = self.device.upload(i[some], np.int32)
+            to_patches = self.device.upload(j[some], np.int32)
+            out = self.device.empty(from_patches.shape)
             kernel(
                 out.size,
-                64,
-                out.size,
-                self._geometry.shape[1],
-                *ends,
-                self._geometry,
-                self._blocks,
-                out,
+                GROUP,
+                count=out.size,
+                pitch=self._geometry.shape[1],
+                from_patches=from_patches,
+                to_patches=to_patches,
+                geometry=self._geometry,
+                blocks=self._blocks,
+                out=out,
             )
             parts.append(out.get().astype(np.float64))
         return np.concatenate(parts)
 
 
 def _near_pairs(patches: Patches) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs i < j whose centres are within `_NEAR` of their size and that see each other, boxes aside."""
-    squared, normal = squared_size(patches), patches.normal
+    """Pairs i < j within `NEAR_DISTANCE` of their size that see each other, boxes aside."""
+    squared = squared_size(patches)
     tree = scipy.spatial.KDTree(patches.centre)
-    pairs = tree.query_pairs(_NEAR * np.sqrt(2 * squared.max()), output_type="ndarray")
-    i, j = np.sort(pairs, axis=1).T if len(pairs) else np.zeros((2, 0), int)
+    radius = NEAR_DISTANCE * np.sqrt(2 * squared.max())
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    if not len(pairs):
+        return np.zeros(0, int), np.zeros(0, int)
+    i, j = np.sort(pairs, axis=1).T
     offset = patches.centre[j] - patches.centre[i]
-    close = np.square(offset).sum(axis=1) < _NEAR**2 * (squared[i] + squared[j])
-    for plane, other, sign in (
-        (i, j, 1),
-        (j, i, -1),
-    ):  # does any point of the other rise above the plane?
-        rise = sum(
-            np.abs((edge[other] * normal[plane]).sum(axis=1))
-            for edge in (patches.right, patches.down)
-        )
-        height = sign * (offset * normal[plane]).sum(axis=1) + rise / 2
-        close &= height > 1e-6 * np.sqrt(squared[other])
-    order = np.lexsort((j[close], i[close]))
-    return i[close][order], j[close][order]
+    distance = np.square(offset).sum(axis=1)
+    is_near = distance < NEAR_DISTANCE**2 * (squared[i] + squared[j])
+    is_near &= _rises_above(patches, i, j, offset)
+    is_near &= _rises_above(patches, j, i, -offset)
+    i = i[is_near]
+    j = j[is_near]
+    order = np.lexsort((j, i))
+    return i[order], j[order]
+
+
+def _rises_above(
+    patches: Patches, plane: np.ndarray, patch: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
+    """True where a point of a patch is above the plane of another, whose centre is `offset` below it."""
+    normal = patches.normal[plane]
+    rise = np.abs((patches.right[patch] * normal).sum(axis=1))
+    rise += np.abs((patches.down[patch] * normal).sum(axis=1))
+    height = (offset * normal).sum(axis=1) + rise / 2
+    return height > FLAT_TOLERANCE * np.sqrt(squared_size(patches)[patch])

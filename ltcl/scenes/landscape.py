@@ -8,16 +8,15 @@ detail.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ltcl import checks, images
-from ltcl.scenes.viewer import LONGEST
+from ltcl.scenes.camera import MAX_IMAGE_SIDE
 
-_FILE = Path(__file__).with_name("landscape.jpg")
+FILE = Path(__file__).with_name("landscape.jpg")
 SUN = (0.64, 0.43)
-"""Where the sun stands, in widths and heights, whatever the shape of the picture."""
+"""Place of the sun, in widths and heights, whatever the shape of the picture."""
 
 
 def landscape(h: int, w: int) -> np.ndarray:
@@ -45,12 +44,18 @@ def landscape(h: int, w: int) -> np.ndarray:
     >>> picture.shape, picture.dtype
     ((48, 64, 3), dtype('float32'))
     """
-    h, w = (checks.count(name, side, most=LONGEST) for name, side in (("h", h), ("w", w)))
-    stored = images.read(_FILE)
+    h = checks.count("h", h, most=MAX_IMAGE_SIDE)
+    w = checks.count("w", w, most=MAX_IMAGE_SIDE)
+    stored = images.read(FILE)
     height, width = stored.shape[:2]
-    cut: list[Any] = []
-    for side, ideal, sun in ((height, h * width / w, SUN[1]), (width, w * height / h, SUN[0])):
-        size = min(side, max(1, round(ideal)))
-        start = round(sun * (side - size))
-        cut.append(slice(start, start + size))
-    return np.clip(images.resize(stored[tuple(cut)], (h, w)), 0, 1).astype(np.float32)
+    rows = _around(SUN[1], height, h * width / w)
+    columns = _around(SUN[0], width, w * height / h)
+    picture = images.resize(stored[rows, columns], (h, w))
+    return np.clip(picture, 0, 1).astype(np.float32)
+
+
+def _around(sun: float, side: int, ideal: float) -> slice:
+    """Part of a side, of about the ideal length, in which the sun stands at the same share."""
+    size = min(side, max(1, round(ideal)))
+    start = round(sun * (side - size))
+    return slice(start, start + size)

@@ -20,7 +20,10 @@ from ltcl.device import Array, Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.scenes.walls import Wall
 
-_HAIR = 1e-5  # of the scene's size: above the rounding of coordinates, far below a patch
+# Boxes are shrunk by this part of the scene's size: above the rounding of coordinates, far below a
+# patch.
+BOX_SHRINKAGE = 1e-5
+LANES_OF_CPU = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,7 @@ class Patches:
 def cut(walls: Sequence[Wall], n: int) -> Patches:
     """The n x n patches of each wall, in the order of the picture.
 
-    InputError: there is no wall, or n is not a whole number of at least 1.
+    InputError if there is no wall, or n is not a whole number of at least 1.
 
     Examples
     --------
@@ -75,35 +78,42 @@ def cut(walls: Sequence[Wall], n: int) -> Patches:
     if not walls:
         raise InputError("walls is empty; there must be at least one wall to cut")
     place = (np.arange(n) + 0.5) / n
-    centre = np.stack(
-        [wall.points(place, place[:, None]) for wall in walls], axis=1
-    )  # (n, walls, n, 3)
-    edges = (
-        np.broadcast_to(
-            np.array([getattr(wall, name) for wall in walls], np.float64)[:, None] / n, centre.shape
-        )
-        for name in ("right", "down")
+    centres = [wall.points(place, place[:, None]) for wall in walls]
+    centre = np.stack(centres, axis=1)  # (n, walls, n, 3)
+    right = np.array([wall.right for wall in walls], np.float64) / n
+    down = np.array([wall.down for wall in walls], np.float64) / n
+    return Patches(
+        centre=centre.reshape(-1, 3),
+        right=np.broadcast_to(right[:, None], centre.shape).reshape(-1, 3),
+        down=np.broadcast_to(down[:, None], centre.shape).reshape(-1, 3),
     )
-    return Patches(centre.reshape(-1, 3), *(edge.reshape(-1, 3) for edge in edges))
 
 
 def squared_size(patches: Patches) -> np.ndarray:
-    """(|right|^2 + |down|^2) / 4 of every patch, (N,); the size of a pair is the root of the sum of both."""
-    return (np.square(patches.right).sum(axis=1) + np.square(patches.down).sum(axis=1)) / 4
+    """(|right|^2 + |down|^2) / 4 of every patch, (N,).
+
+    The size of a pair of patches is the root of the sum of both.
+    """
+    right = np.square(patches.right).sum(axis=1)
+    down = np.square(patches.down).sum(axis=1)
+    return (right + down) / 4
 
 
 def check_patches(patches: Any) -> Patches:
-    """Return `patches` if they are some, finite and each with an area."""
+    """Return `patches` if there is at least one, and all are finite and have an area."""
     if not isinstance(patches, Patches):
+        kind = type(patches).__name__
         raise InputTypeError(
-            f"patches is a {type(patches).__name__}; it must be ltcl.scenes.Patches, see ltcl.scenes.cut"
+            f"patches is a {kind}; it must be ltcl.scenes.Patches, see ltcl.scenes.cut"
         )
     count = len(patches)
     if count < 1:
         raise InputError("patches are 0; there must be at least 1")
     for name in ("centre", "right", "down"):
-        value = checks.real(f"patches.{name}", getattr(patches, name))
-        checks.finite(f"patches.{name}", checks.shape(f"patches.{name}", value, (count, 3)))
+        place = f"patches.{name}"
+        value = checks.real(place, getattr(patches, name))
+        checks.shape(place, value, (count, 3))
+        checks.finite(place, value)
     flat = np.flatnonzero(patches.area == 0)
     if len(flat):
         raise InputError(
@@ -114,9 +124,9 @@ def check_patches(patches: Any) -> Patches:
 
 def check_blocks(blocks: Any) -> np.ndarray:
     """Return `blocks` as (B, 2, 3) float64, low and high corners of boxes; None is no box."""
-    value = checks.finite("blocks", checks.real("blocks", () if blocks is None else blocks)).astype(
-        np.float64
-    )
+    if blocks is None:
+        return np.zeros((0, 2, 3))
+    value = checks.finite("blocks", checks.real("blocks", blocks)).astype(np.float64)
     if value.size == 0:
         return np.zeros((0, 2, 3))
     if value.ndim != 3 or value.shape[1:] != (2, 3):
@@ -131,26 +141,36 @@ def check_blocks(blocks: Any) -> np.ndarray:
 
 
 def scaled(device: Device, patches: Patches, blocks: np.ndarray) -> tuple[Patches, Array]:
-    """The same patches in the units of kernels; boxes (B, 2, 3) as centre and half sides, shrunk by a hair.
+    """The patches in the units of kernels, and boxes (B, 2, 3) as centre and half sides, shrunk a little.
 
-    Where there are no boxes, one row that is not used.
+    Where there are no boxes, the array has one row that is not used.
     """
-    half = (np.abs(patches.right) + np.abs(patches.down)) / 2
-    low, high = (patches.centre - half).min(axis=0), (patches.centre + half).max(axis=0)
-    middle, size = (low + high) / 2, float((high - low).max())
-    placed = Patches((patches.centre - middle) / size, patches.right / size, patches.down / size)
-    low, high = ((blocks[:, end] - middle) / size for end in (0, 1))
-    half = (high - low) / 2
-    rows = np.concatenate([(low + high) / 2, half - np.minimum(_HAIR, half / 2)], axis=1)
-    return placed, device.upload(rows if len(rows) else np.zeros((1, 6)))
+    half_extent = (np.abs(patches.right) + np.abs(patches.down)) / 2
+    scene_low = (patches.centre - half_extent).min(axis=0)
+    scene_high = (patches.centre + half_extent).max(axis=0)
+    middle = (scene_low + scene_high) / 2
+    size = float((scene_high - scene_low).max())
+    placed = Patches(
+        centre=(patches.centre - middle) / size,
+        right=patches.right / size,
+        down=patches.down / size,
+    )
+    if not len(blocks):
+        return placed, device.upload(np.zeros((1, 6)))
+    low = (blocks[:, 0] - middle) / size
+    high = (blocks[:, 1] - middle) / size
+    half_sides = (high - low) / 2
+    shrinkage = np.minimum(BOX_SHRINKAGE, half_sides / 2)
+    rows = np.concatenate([(low + high) / 2, half_sides - shrinkage], axis=1)
+    return placed, device.upload(rows)
 
 
 def lanes(device: Device) -> int:
-    """Neighbouring patches that one work-item handles together."""
-    return 8 if device.is_cpu else 1
+    """Number of neighbouring patches that one work-item handles together."""
+    return LANES_OF_CPU if device.is_cpu else 1
 
 
 def padded(device: Device, rows: np.ndarray) -> Array:
-    """Rows (m, N) on the device, with zeros behind each up to whole stretches of lanes."""
-    more = -rows.shape[1] % lanes(device)
-    return device.upload(np.pad(rows, ((0, 0), (0, more))))
+    """Rows (m, N) on the device, each followed by zeros up to whole stretches of lanes."""
+    missing = -rows.shape[1] % lanes(device)
+    return device.upload(np.pad(rows, ((0, 0), (0, missing))))

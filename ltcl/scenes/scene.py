@@ -9,6 +9,7 @@ shows 1. So the transport is T = (I - A)^-1 diag(albedo), (N, N), one per colour
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,15 +19,18 @@ import scipy.linalg
 from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError
-from ltcl.scenes import viewer as viewing
+from ltcl.scenes import camera
+from ltcl.scenes.camera import MAX_IMAGE_SIDE, SceneCamera
 from ltcl.scenes.rays import clear
-from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Block, Wall, check_albedo, point, refuse_crossing
 from ltcl.transport.transport import Transport
 
-_BLOCK = 512  # rows and columns touched at a time where a matrix meets its transpose
-_LIGHT_POINTS = 8  # along a patch
-_TOLERANCE = 1e-6  # form factors found by quadrature or sampling are a little off
+# Rows and columns touched at a time where a matrix meets its transpose.
+BLOCK_SIZE = 512
+# Points along a patch at which a light is tried.
+LIGHT_POINTS = 8
+# Form factors found by quadrature or sampling are a little off.
+FORM_FACTOR_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,22 +40,22 @@ class Scene:
     Parameters
     ----------
     name : str
-        Shown in messages and plots.
+        Name for messages and plots.
     grid : (h, w)
         The patches as a picture, row-major; N = h * w. The walls lie side by side in it.
     form_factors : ndarray, (N, N), float64
-        Entry [i, j]: share of the light leaving patch i that meets patch j. Stored once for all
-        colours.
+        Entry [i, j] is the share of the light leaving patch i that meets patch j. All colours share
+        them.
     albedo : ndarray, (channels, N), float64
         Share of the light a patch gives back, in [0, 1); one channel or three.
     area : ndarray, (N,), float64
         Areas of the patches, any unit; area_i F_ij = area_j F_ji.
     walls : tuple of Wall
-        Where the parts of the picture stand in space, left to right.
-    viewer : Viewer
-        Who looks in `view` and `sample`.
+        The parts of the picture in space, left to right.
+    viewer : SceneCamera
+        The eye of `view` and `sample`.
     blocks : tuple of Block
-        What hides walls from the viewer and from lights; the form factors must know of them
+        Boxes that hide walls from the viewer and from lights; the form factors must know of them
         already.
 
     Raises
@@ -75,7 +79,7 @@ class Scene:
     albedo: np.ndarray
     area: np.ndarray
     walls: tuple[Wall, ...]
-    viewer: Viewer
+    viewer: SceneCamera
     blocks: tuple[Block, ...] = ()
 
     def __post_init__(self) -> None:
@@ -88,23 +92,26 @@ class Scene:
                 f"walls are {len(self.walls)}; they must divide the {w} columns of the grid"
             )
         n = h * w
-        for name, shapes in {
-            "form_factors": [(n, n)],
-            "albedo": [(1, n), (3, n)],
-            "area": [(n,)],
-        }.items():
-            value = checks.real(name, getattr(self, name)).astype(np.float64, copy=False)
-            # A view, so that the caller's own array stays writeable.
-            value = checks.finite(name, checks.shape(name, value, *shapes)).view()
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+        self._set_array("form_factors", (n, n))
+        self._set_array("albedo", (1, n), (3, n))
+        self._set_array("area", (n,))
         check_albedo(self.albedo)
         _check_exchange(self.form_factors, self.area)
         refuse_crossing((*self.walls, *self._screens))
-        viewing.frame(self.viewer, self.walls)
+        camera.frame(self.viewer, self.walls)
+
+    def _set_array(self, name: str, *shapes: tuple[int, ...]) -> None:
+        """Check an array and make it read-only."""
+        value = checks.real(name, getattr(self, name)).astype(np.float64, copy=False)
+        checks.shape(name, value, *shapes)
+        # A view, so that the caller's own array stays writeable.
+        view = checks.finite(name, value).view()
+        view.flags.writeable = False
+        object.__setattr__(self, name, view)
 
     def __repr__(self) -> str:
-        return f"<ltcl Scene {self.name}, grid {self.grid[0]} x {self.grid[1]}, {self.channels} channel(s)>"
+        h, w = self.grid
+        return f"<ltcl Scene {self.name}, grid {h} x {w}, {self.channels} channel(s)>"
 
     @property
     def channels(self) -> int:
@@ -122,7 +129,7 @@ class Scene:
 
         `ltcl.scenes.FormFactor.of` gives it as operators that store no matrix.
         """
-        self._fits(self.channels)
+        self._check_memory(self.channels)
         bounces = tuple(albedo[:, None] * self.form_factors for albedo in self.albedo)
         return bounces[0] if self.channels == 1 else bounces
 
@@ -145,8 +152,11 @@ class Scene:
         >>> T.shape, bool((T.diagonal() >= 0.5).all())
         ((8, 8), True)
         """
-        self._fits(self.channels)
-        return tuple(transport(self.form_factors, albedo, self.area) for albedo in self.albedo)
+        self._check_memory(self.channels)
+        matrices = []
+        for albedo in self.albedo:
+            matrices.append(transport_matrix(self.form_factors, albedo, self.area))
+        return tuple(matrices)
 
     def transport(
         self,
@@ -160,12 +170,12 @@ class Scene:
         Parameters
         ----------
         first_bounce : "diagonal", "exact" or ndarray, (N,) or (3, N)
-            What `Transport` takes as F; `scene.first_bounce` is the truth.
+            F, as `Transport` takes it; `scene.first_bounce` is the truth.
         device : Device or str, optional
             The device that `Transport` computes on; the best one if omitted.
         on_dark : "mask" or "raise"
-            What `Transport` does about patches of albedo 0, or hidden from the camera or projector
-            of a glossy scene: never light them, or refuse.
+            Treatment of patches of albedo 0, or hidden from the camera or projector of a glossy
+            scene: never light them, or refuse.
 
         Examples
         --------
@@ -189,14 +199,15 @@ class Scene:
         >>> scene.picture(scene.first_bounce)[0, 0]
         array([0.9, 0.5, 0.2])
         """
-        values, pixels = np.asarray(patches), len(self.area)
+        values = np.asarray(patches)
+        pixels = len(self.area)
         checks.shape("patches", values, (pixels,), (3, pixels))
-        return np.moveaxis(
-            values.reshape(*values.shape[:-1], *self.grid), 0, -1 if values.ndim == 2 else 0
-        )
+        if values.ndim == 1:
+            return values.reshape(self.grid)
+        return np.moveaxis(values.reshape(3, *self.grid), 0, -1)
 
     def view(self, picture: Any, size: int = 480, supersample: int = 3) -> np.ndarray:
-        """What a viewer who looks into the room sees of a picture on its walls; backs of walls are left out.
+        """Image of a picture on the walls, as the viewer of the room sees it; backs of walls are left out.
 
         Parameters
         ----------
@@ -228,9 +239,9 @@ class Scene:
         """
         picture = checks.finite("picture", checks.real("picture", picture))
         checks.shape("picture", picture, self.grid, (*self.grid, 3))
-        size = checks.count("size", size, most=viewing.LONGEST)
+        size = checks.count("size", size, most=MAX_IMAGE_SIDE)
         supersample = checks.count("supersample", supersample)
-        return viewing.draw(self.viewer, self.walls, picture, size, supersample, self._screens)
+        return camera.draw(self.viewer, self.walls, picture, size, supersample, self._screens)
 
     def sample(self, image: Any) -> np.ndarray:
         """The picture on the walls that looks like a flat image from where the viewer stands.
@@ -260,29 +271,34 @@ class Scene:
         (8, 16, 3)
         """
         image = checks.finite("image", checks.real("image", image))
-        if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
+        is_picture = image.ndim in (2, 3) and image.shape[2:] in ((), (3,))
+        if not is_picture or image.size == 0:
             raise InputError(
                 f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty"
             )
-        checks.count("image", max(image.shape), most=viewing.LONGEST)
-        return viewing.read(self.viewer, self.walls, image, self.grid, self._screens)
+        checks.count("image", max(image.shape), most=MAX_IMAGE_SIDE)
+        return camera.read(self.viewer, self.walls, image, self.grid, self._screens)
 
     def irradiance(self, light: Any) -> np.ndarray:
         """Light that falls on each patch straight from a point, shadows included, largest value 1.
 
-        It serves as a pattern: ``T @ scene.irradiance(light)`` is the room under that light. Of
-        each patch it is the mean of cos(t) / r^2 over 8 x 8 points, 0 where something stands in
-        between: at the edge of a shadow good to 1/64 of a patch's light or so.
+        It serves as a pattern: ``T @ scene.irradiance(light)`` is the room under that light. The
+        value of a patch is the mean of cos(t) / r^2 over 8 x 8 points, 0 where something stands in
+        between: at the edge of a shadow it is good to about 1/64 of a patch's light.
 
         Parameters
         ----------
         light : (x, y, z)
-            Where it stands; it shines alike in all directions.
+            Place of the light, which shines alike in all directions.
 
         Returns
         -------
         ndarray, (h, w), float32
-            An InputError says that the light stands inside a block, or reaches no patch.
+
+        Raises
+        ------
+        InputError
+            If the light stands inside a block, or reaches no patch.
 
         Examples
         --------
@@ -291,21 +307,12 @@ class Scene:
         >>> picture.shape, float(picture.max())
         ((8, 24), 1.0)
         """
-        where, boxes = (
-            np.array(point("light", light)),
-            [(block.low, block.high) for block in self.blocks],
-        )
-        if any(((where > low) & (where < high)).all() for low, high in boxes):
-            raise InputError(f"light is {light}, inside a block; move it out")
-        h, w = self.grid[0], self.grid[1] // len(self.walls)
-        u, v = ((np.arange(n * _LIGHT_POINTS) + 0.5) / (n * _LIGHT_POINTS) for n in (w, h))
-        parts = []
-        for wall in self.walls:
-            points = wall.points(u, v[:, None])
-            ways = where - points
-            arrives = np.maximum(ways @ wall.normal, 0) / np.linalg.norm(ways, axis=-1) ** 3
-            arrives *= clear(self.walls, points.reshape(-1, 3), where, boxes).reshape(arrives.shape)
-            parts.append(arrives.reshape(h, _LIGHT_POINTS, w, _LIGHT_POINTS).mean(axis=(1, 3)))
+        place = np.array(point("light", light))
+        boxes = [(block.low, block.high) for block in self.blocks]
+        for low, high in boxes:
+            if np.all((place > low) & (place < high)):
+                raise InputError(f"light is {light}, inside a block; move it out")
+        parts = [self._wall_irradiance(wall, place, boxes) for wall in self.walls]
         picture = np.concatenate(parts, axis=1)
         if picture.max() <= 0:
             raise InputError(
@@ -313,21 +320,34 @@ class Scene:
             )
         return (picture / picture.max()).astype(np.float32)
 
+    def _wall_irradiance(self, wall: Wall, place: np.ndarray, boxes: Any) -> np.ndarray:
+        """Light from a place on the patches of one wall, (h, w of the wall)."""
+        h = self.grid[0]
+        w = self.grid[1] // len(self.walls)
+        u = (np.arange(w * LIGHT_POINTS) + 0.5) / (w * LIGHT_POINTS)
+        v = (np.arange(h * LIGHT_POINTS) + 0.5) / (h * LIGHT_POINTS)
+        points = wall.points(u, v[:, None])
+        rays = place - points
+        light = np.maximum(rays @ wall.normal, 0) / np.linalg.norm(rays, axis=-1) ** 3
+        light *= clear(self.walls, points.reshape(-1, 3), place, boxes).reshape(light.shape)
+        return light.reshape(h, LIGHT_POINTS, w, LIGHT_POINTS).mean(axis=(1, 3))
+
     @property
     def _screens(self) -> tuple[Wall, ...]:
         """Faces of the blocks that carry no part of the picture: black."""
-        return tuple(
-            face for block in self.blocks for face in block.faces() if face not in self.walls
-        )
+        screens = []
+        for block in self.blocks:
+            screens += [face for face in block.faces() if face not in self.walls]
+        return tuple(screens)
 
-    def _fits(self, matrices: int) -> None:
+    def _check_memory(self, matrices: int) -> None:
         pixels = len(self.area)
         what = f"{matrices} matrix(es) of {pixels} x {pixels} for the scene {self.name}"
         checks.fits_host(what, matrices * 8 * pixels**2)
 
 
-def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """T = (I - A)^-1 diag(r), A = diag(r) F, (N, N) float64, of form factors F, albedos r and areas a (N,).
+def transport_matrix(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """T = (I - A)^-1 diag(r), (N, N) float64, with A = diag(r) F, form factors F, albedos r and areas a (N,).
 
     Reciprocity says that diag(a) F is symmetric. With s = sqrt(r / a) this gives
 
@@ -337,10 +357,10 @@ def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) ->
     of a general inverse and in the memory of the result alone; black patches (r = 0) need no
     special case.
 
-    InputError: the gain of one bounce is 1 or more.
+    InputError if the gain of one bounce is 1 or more.
 
     >>> mirrors = np.array([[0.0, 1.0], [1.0, 0.0]])
-    >>> transport(mirrors, albedo=np.array([0.5, 0.5]), area=np.ones(2)).round(4)
+    >>> transport_matrix(mirrors, albedo=np.array([0.5, 0.5]), area=np.ones(2)).round(4)
     array([[0.6667, 0.3333],
            [0.3333, 0.6667]])
     """
@@ -349,7 +369,7 @@ def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) ->
     matrix *= (s * area)[:, None]
     matrix[np.diag_indices_from(matrix)] += 1
     potrf, potri = scipy.linalg.get_lapack_funcs(("potrf", "potri"), (matrix,))
-    # LAPACK wants columns; of a symmetric matrix the transposed view will do, and saves a copy.
+    # LAPACK wants columns; the transposed view of a symmetric matrix will do, and saves a copy.
     columns, failed = potrf(matrix.T, lower=1, overwrite_a=1)
     if not failed:
         columns, failed = potri(columns, lower=1, overwrite_c=1)
@@ -358,12 +378,12 @@ def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) ->
             "albedo and form_factors give a bounce a gain of 1 or more; lower the albedo"
         )
     # The result stands in the upper triangle of the rows only.
-    for rows, right in _blocks(len(matrix)):
-        block = matrix[rows, right]
-        if rows == right:
+    for rows, columns in _blocks(len(matrix)):
+        block = matrix[rows, columns]
+        if rows == columns:
             block = np.triu(block) + np.triu(block, 1).T
-            matrix[rows, right] = block
-        matrix[right, rows] = block.T
+            matrix[rows, columns] = block
+        matrix[columns, rows] = block.T
     matrix *= s[:, None]
     matrix *= s * area
     return matrix
@@ -378,16 +398,17 @@ def _check_exchange(form_factors: np.ndarray, area: np.ndarray) -> None:
             f"form_factors has the value {form_factors.min():g}; all must be at least 0"
         )
     most = form_factors.sum(axis=1).max()
-    if most > 1 + _TOLERANCE:
+    if most > 1 + FORM_FACTOR_TOLERANCE:
         raise InputError(
             f"form_factors has a row that sums to {most:g}; no patch can send out more than 1"
         )
-    worst, largest = 0.0, (area * form_factors.max(axis=1)).max()
+    largest = (area * form_factors.max(axis=1)).max()
+    worst = 0.0
     for rows, columns in _blocks(len(area)):
-        there = area[rows, None] * form_factors[rows, columns]
-        back = area[columns, None] * form_factors[columns, rows]
-        worst = max(worst, np.abs(there - back.T).max())
-    if worst > _TOLERANCE * largest:
+        forward = area[rows, None] * form_factors[rows, columns]
+        backward = area[columns, None] * form_factors[columns, rows]
+        worst = max(worst, np.abs(forward - backward.T).max())
+    if worst > FORM_FACTOR_TOLERANCE * largest:
         raise InputError(
             f"form_factors breaks reciprocity by {worst / largest:.2g} of the largest exchange; "
             "area_i F_ij must equal area_j F_ji"
@@ -396,5 +417,6 @@ def _check_exchange(form_factors: np.ndarray, area: np.ndarray) -> None:
 
 def _blocks(size: int) -> list[tuple[slice, slice]]:
     """Blocks (rows, columns) that cover the upper triangle of a size x size matrix."""
-    parts = [slice(start, min(start + _BLOCK, size)) for start in range(0, size, _BLOCK)]
-    return [(rows, columns) for i, rows in enumerate(parts) for columns in parts[i:]]
+    starts = range(0, size, BLOCK_SIZE)
+    parts = [slice(start, min(start + BLOCK_SIZE, size)) for start in starts]
+    return list(itertools.combinations_with_replacement(parts, 2))

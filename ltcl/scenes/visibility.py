@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which part of a patch another one sees past opaque boxes: V (N, N), symmetric, 1 where nothing is between.
+"""Visibility V (N, N) of patches past opaque boxes: symmetric, 1 where nothing is between.
 
 V_ij is the share of the rays between the fronts of patches i and j that meet no box. Rays that
 leave or meet a back carry no light and do not count: where the plane of one patch cuts the other, V
-is that of the part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or next
-to it.
+is that of the part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or almost.
 
 Each patch has s x s points, one at random in each cell of a regular division, and ray k joins point
 k of one patch with point partner(k) of the other, where partner is a fixed random exchange: both
@@ -24,33 +23,24 @@ from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.scenes.patches import Patches, check_blocks, check_patches, lanes, padded, scaled
 
-_LAUNCH = (
-    1 << 30
-)  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
+# Tests of a ray and a box in one launch: a fraction of a second, also for slow devices.
+TESTS_PER_LAUNCH = 1 << 30
+MAX_SAMPLES = 64
+# Bytes of a buffer that are kept free beside the rows of V.
+BUFFER_RESERVE = 64
 
 
 class Rays:
     """The samples^2 rays between any two of the patches, past boxes (B, 2, 3), on a device."""
 
     def __init__(self, patches: Patches, blocks: np.ndarray, device: Device, samples: int) -> None:
-        self.device, self.count, self.rays, self.boxes = (
-            device,
-            len(patches),
-            samples**2,
-            len(blocks),
-        )
+        self.device = device
+        self.count = len(patches)
+        self.rays = samples**2
+        self.boxes = len(blocks)
         placed, self._blocks = scaled(device, patches, blocks)
-        cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(
-            -1, 2
-        )
-        place = (
-            cell + np.random.default_rng(1).random(cell.shape)
-        ) / samples - 0.5  # (s^2, 2) in edges
-        edges = np.stack([placed.right, placed.down])  # (2, N, 3)
-        points = (placed.centre + np.tensordot(place, edges, 1)).transpose(0, 2, 1)  # (s^2, 3, N)
-        partner, order = np.arange(self.rays), np.random.default_rng(2).permutation(self.rays)
-        here, there = np.split(order[: self.rays // 2 * 2], 2)
-        partner[here], partner[there] = there, here  # an exchange: partner[partner] is the identity
+        points = _points_on_patches(placed, samples)
+        partner = _partners(self.rays)
         nbytes = (2 * points.size + 3 * self.count) * 4
         device.require(nbytes, f"{samples}^2 points on each of {self.count} patches")
         self._starts = padded(device, points.reshape(-1, self.count))
@@ -58,22 +48,27 @@ class Rays:
         self._normals = padded(device, placed.normal.T)
 
     def all(self) -> np.ndarray:
-        """V of all patches, (N, N) float32, some rows in a launch: as many as one buffer holds."""
-        largest = (self.device.max_allocation - 64) // (4 * self._starts.shape[1])
-        most = max(1, min(_LAUNCH // (self.rays * self.boxes * self.count), largest))
+        """V of all patches, (N, N) float32."""
+        # As many rows in a launch as one buffer holds.
+        row_bytes = 4 * self._starts.shape[1]
+        rows_of_buffer = (self.device.max_allocation - BUFFER_RESERVE) // row_bytes
+        rows_of_launch = TESTS_PER_LAUNCH // (self.rays * self.boxes * self.count)
+        rows = max(1, min(rows_of_launch, rows_of_buffer))
         seen = np.empty((self.count, self.count), np.float32)
-        for i in np.split(np.arange(self.count), range(most, self.count, most)):
+        for i in np.split(np.arange(self.count), range(rows, self.count, rows)):
             seen[i] = self._launch(i, np.zeros_like(i), self.count)[: self.count].T
         return seen
 
     def pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """V of listed pairs, (P,) float32."""
         width = lanes(self.device)
-        most = max(1, _LAUNCH // (self.rays * self.boxes * width))
+        pairs = max(1, TESTS_PER_LAUNCH // (self.rays * self.boxes * width))
         parts = [np.zeros(0, np.float32)]
-        for start in range(0, len(i), most):
-            a, b = i[start : start + most], j[start : start + most]
-            parts.append(self._launch(a, b // width * width, 1)[b % width, np.arange(len(a))])
+        for start in range(0, len(i), pairs):
+            first = i[start : start + pairs]
+            second = j[start : start + pairs]
+            stretches = self._launch(first, second // width * width, 1)
+            parts.append(stretches[second % width, np.arange(len(first))])
         return np.concatenate(parts)
 
     def _launch(self, i: np.ndarray, start: np.ndarray, columns: int) -> np.ndarray:
@@ -84,11 +79,43 @@ class Rays:
         )
         stretches = -(-columns // width)
         out = self.device.empty((stretches * width, len(i)))
-        lists = (self.device.upload(i, np.int32), self.device.upload(start, np.int32))
-        points = (self._starts, self._ends, self._normals, self._blocks)
-        pitch = self._starts.shape[1]
-        kernel((len(i), stretches), (64, 1), len(i), pitch, self.rays, *lists, *points, out)
+        kernel(
+            (len(i), stretches),
+            (64, 1),
+            rows=len(i),
+            pitch=self._starts.shape[1],
+            rays=self.rays,
+            from_patches=self.device.upload(i, np.int32),
+            to_patches=self.device.upload(start, np.int32),
+            starts=self._starts,
+            ends=self._ends,
+            normals=self._normals,
+            blocks=self._blocks,
+            out=out,
+        )
         return out.get()
+
+
+def _points_on_patches(patches: Patches, samples: int) -> np.ndarray:
+    """A random point in each cell of every patch, (samples^2, 3, N)."""
+    cells = np.arange(samples)
+    rows, columns = np.meshgrid(cells, cells, indexing="ij")
+    cell = np.stack([rows, columns], axis=-1).reshape(-1, 2)
+    jitter = np.random.default_rng(1).random(cell.shape)
+    place = (cell + jitter) / samples - 0.5  # (samples^2, 2), in edges
+    edges = np.stack([patches.right, patches.down])  # (2, N, 3)
+    points = patches.centre + np.tensordot(place, edges, 1)
+    return points.transpose(0, 2, 1)
+
+
+def _partners(rays: int) -> np.ndarray:
+    """A random exchange of points, (rays,): partner[partner] is the identity."""
+    partner = np.arange(rays)
+    order = np.random.default_rng(2).permutation(rays)
+    first, second = np.split(order[: rays // 2 * 2], 2)
+    partner[first] = second
+    partner[second] = first
+    return partner
 
 
 def visibility(
@@ -128,12 +155,13 @@ def visibility(
     >>> visibility(cut((walls[1], walls[5]), 1), screen).tolist()
     [[1.0, 0.0], [0.0, 1.0]]
     """
-    patches, blocks = check_patches(patches), check_blocks(blocks)
-    checks.count("samples", samples, most=64)
+    patches = check_patches(patches)
+    blocks = check_blocks(blocks)
+    checks.count("samples", samples, most=MAX_SAMPLES)
     count = len(patches)
     checks.fits_host(f"the visibility of {count} x {count} patches", 4 * count**2)
     if not len(blocks):
         return np.ones((count, count), np.float32)
-    return Rays(
-        patches, blocks, device if isinstance(device, Device) else open_device(device), samples
-    ).all()
+    if not isinstance(device, Device):
+        device = open_device(device)
+    return Rays(patches, blocks, device, samples).all()

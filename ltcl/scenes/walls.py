@@ -15,8 +15,10 @@ from ltcl.errors import InputError, InputTypeError
 
 Vector = tuple[float, float, float]
 
-_TOUCH = 1e-9  # of the larger wall: overlaps that are rounding errors
-_FACES = {
+# Overlaps up to this part of the larger wall are rounding errors.
+OVERLAP_TOLERANCE = 1e-9
+# Names of a block's faces: the axis of the normal, and its sign.
+FACES = {
     "+x": (0, 1),
     "-x": (0, -1),
     "+y": (1, 1),
@@ -33,7 +35,7 @@ class Wall:
     Parameters
     ----------
     name : str
-        What people call it: "left", "floor", ...
+        Name for people: "left", "floor", ...
     corner, right, down : (3,) floats
         Place of the picture's top left corner, and the edges from there along its rows and columns.
 
@@ -72,7 +74,7 @@ class Wall:
 
     @property
     def outline(self) -> np.ndarray:
-        """Its corners (4, 3), around the front."""
+        """The corners (4, 3), around the front."""
         corner, right, down = np.array([self.corner, self.right, self.down], np.float64)
         return np.stack([corner, corner + down, corner + down + right, corner + right])
 
@@ -89,14 +91,14 @@ class Wall:
 
 @dataclass(frozen=True)
 class Block:
-    """An opaque box with sides along the axes: it shades, and hides what is behind it.
+    """An opaque box with sides along the axes: it casts shadows, and hides walls from the viewer.
 
     Parameters
     ----------
     corner, size : (3,) floats
-        Its corner nearest to the origin, and its lengths along x, y and z.
+        The corner nearest to the origin, and the lengths along x, y and z.
     albedo : float or (3,) floats, optional
-        Of all its faces, one number or one colour: they become walls of the picture then, lit and
+        Albedo of all faces, one number or one colour: they become walls of the picture, lit and
         seen. Without it the block is black.
 
     Raises
@@ -121,8 +123,9 @@ class Block:
         if min(self.size) <= 0:
             raise InputError(f"block size is {self.size}; all three lengths must be above 0")
         if self.albedo is not None:
-            value = checks.finite("block albedo", checks.real("block albedo", self.albedo))
-            check_albedo(checks.shape("block albedo", value.astype(np.float64), (), (3,)))
+            albedo = checks.finite("block albedo", checks.real("block albedo", self.albedo))
+            albedo = checks.shape("block albedo", albedo.astype(np.float64), (), (3,))
+            check_albedo(albedo)
 
     @property
     def low(self) -> np.ndarray:
@@ -131,17 +134,24 @@ class Block:
 
     @property
     def high(self) -> np.ndarray:
-        """The corner opposite to it, (3,)."""
+        """The corner farthest from the origin, (3,)."""
         return np.add(self.corner, self.size)
 
     def faces(self) -> tuple[Wall, ...]:
-        """Its six faces as walls that look outwards; side faces stand upright."""
+        """The six faces as walls that look outwards; side faces stand upright."""
         faces = []
-        for name, (axis, sign) in _FACES.items():
+        x_axis, y_axis, z_axis = np.eye(3)
+        for name, (axis, sign) in FACES.items():
             normal = sign * np.eye(3)[axis]
             # Side faces hang from their upper edge; top and bottom lie as floor and ceiling do.
-            down = -np.eye(3)[2] if axis < 2 else np.eye(3)[0 if sign > 0 else 1]
-            right, down = np.cross(normal, down) * self.size, down * self.size
+            if axis < 2:
+                down_axis = -z_axis
+            elif sign > 0:
+                down_axis = x_axis
+            else:
+                down_axis = y_axis
+            right = np.cross(normal, down_axis) * self.size
+            down = down_axis * self.size
             corner = (self.low + self.high + normal * self.size - right - down) / 2
             faces.append(Wall(f"block {name}", vector(corner), vector(right), vector(down)))
         return tuple(faces)
@@ -171,8 +181,8 @@ def point(name: str, value: Any) -> Vector:
 def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
     """Albedo of every patch, (channels, n * walls * n), from one number, one per wall, per colour or both.
 
-    A scalar; (walls,), one per wall; (3,), one colour for all walls; (walls, 3) or (walls, 1) or
-    (1, 3) to say it in full. Three numbers for three walls could be either, and are refused.
+    `albedo` is a scalar; (walls,), one per wall; (3,), one colour for all walls; or (walls, 3),
+    (walls, 1) or (1, 3) in full. Three numbers for three walls could be either, and are refused.
 
     >>> spread_albedo([0.5, 0.2], walls=2, n=1)
     array([[0.5, 0.2]])
@@ -187,17 +197,20 @@ def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
     if value.ndim == 1:
         value = value[:, None] if len(value) == walls else value[None, :]
     check_albedo(value)
-    value = np.broadcast_to(value, (walls, value.shape[-1] if value.ndim else 1))
-    patches = np.broadcast_to(value.T[:, None, :, None], (value.shape[1], n, walls, n))
-    return patches.reshape(value.shape[1], -1)
+    channels = value.shape[-1] if value.ndim else 1
+    of_walls = np.broadcast_to(value, (walls, channels))
+    patches = np.broadcast_to(of_walls.T[:, None, :, None], (channels, n, walls, n))
+    return patches.reshape(channels, -1)
 
 
 def check_albedo(albedo: np.ndarray) -> None:
     """Refuse albedos outside [0, 1): a patch cannot give back all the light it gets, let alone more."""
     bad = ~((albedo >= 0) & (albedo < 1))
     if bad.any():
+        count = np.count_nonzero(bad)
+        first = albedo[bad].flat[0]
         raise InputError(
-            f"albedo has {np.count_nonzero(bad)} value(s) outside [0, 1), the first {albedo[bad].flat[0]:g}; "
+            f"albedo has {count} value(s) outside [0, 1), the first {first:g}; "
             "all must be at least 0 and below 1"
         )
 
@@ -209,37 +222,46 @@ def refuse_crossing(walls: Sequence[Wall]) -> None:
     with its edge in the middle of the other.
     """
     for first, second in itertools.combinations(walls, 2):
-        a, b, problem = first.outline, second.outline, ""
-        touch = _TOUCH * max(np.abs(np.diff(corners, axis=0)).max() for corners in (a, b))
-        over, under = (a - b[0]) @ _normal(b), (b - a[0]) @ _normal(a)
-        if (
-            first.normal @ second.normal > 0
-            and max(np.abs(over).max(), np.abs(under).max()) <= touch
-        ):
-            problem = "lie on top of each other" if overlap(a, b, touch) else ""
-        elif min(-over.min(), over.max(), -under.min(), under.max()) > touch:
-            # Both planes are cut. On their common line each wall fills an interval.
-            line = np.cross(_normal(a), _normal(b))
-            line /= np.linalg.norm(line)
-            (low, high), (other_low, other_high) = _span(a, over, line), _span(b, under, line)
-            problem = (
-                "cut through each other"
-                if min(high, other_high) - max(low, other_low) > touch
-                else ""
-            )
+        problem = _crossing(first, second)
         if problem:
             raise InputError(
                 f"walls {first.name!r} and {second.name!r} {problem}; move or shorten one"
             )
 
 
+def _crossing(first: Wall, second: Wall) -> str:
+    """How two walls cross, empty where they do not."""
+    a = first.outline
+    b = second.outline
+    longest_edge = max(np.abs(np.diff(corners, axis=0)).max() for corners in (a, b))
+    touch = OVERLAP_TOLERANCE * longest_edge
+    # Heights of the corners of each wall above the plane of the other.
+    heights_a = (a - b[0]) @ _normal(b)
+    heights_b = (b - a[0]) @ _normal(a)
+    faces_same_way = first.normal @ second.normal > 0
+    is_same_plane = max(np.abs(heights_a).max(), np.abs(heights_b).max()) <= touch
+    if faces_same_way and is_same_plane:
+        return "lie on top of each other" if overlap(a, b, touch) else ""
+    depths = (-heights_a.min(), heights_a.max(), -heights_b.min(), heights_b.max())
+    if min(depths) <= touch:
+        return ""
+    # Both planes are cut. On their common line each wall fills an interval.
+    line = np.cross(_normal(a), _normal(b))
+    line /= np.linalg.norm(line)
+    low, high = _span(a, heights_a, line)
+    other_low, other_high = _span(b, heights_b, line)
+    common = min(high, other_high) - max(low, other_low)
+    return "cut through each other" if common > touch else ""
+
+
 def overlap(first: np.ndarray, second: np.ndarray, touch: float) -> bool:
-    """Whether convex outlines (4, 3) in one plane overlap: no line along an edge separates them."""
+    """True if convex outlines (4, 3) in one plane overlap: no line along an edge separates them."""
     normal = _normal(first)
     for corners in (first, second):
         for edge in np.roll(corners, -1, axis=0) - corners:
             across = np.cross(normal, edge) / np.linalg.norm(edge)
-            a, b = first @ across, second @ across
+            a = first @ across
+            b = second @ across
             if min(a.max(), b.max()) - max(a.min(), b.min()) <= touch:
                 return False
     return True
@@ -251,9 +273,11 @@ def _normal(corners: np.ndarray) -> np.ndarray:
 
 
 def _span(corners: np.ndarray, height: np.ndarray, line: np.ndarray) -> tuple[float, float]:
-    """Where a wall whose corners are `height` above a plane meets it: from and to along the line."""
-    after, height_after = np.roll(corners, -1, axis=0), np.roll(height, -1)
-    crossing = (height < 0) != (height_after < 0)
-    share = height[crossing] / (height[crossing] - height_after[crossing])
-    along = (corners[crossing] + share[:, None] * (after - corners)[crossing]) @ line
+    """Interval of a line that a wall fills; the line is where a plane, `height` below the corners, cuts it."""
+    next_corners = np.roll(corners, -1, axis=0)
+    next_height = np.roll(height, -1)
+    is_crossing = (height < 0) != (next_height < 0)
+    share = height[is_crossing] / (height[is_crossing] - next_height[is_crossing])
+    steps = (next_corners - corners)[is_crossing]
+    along = (corners[is_crossing] + share[:, None] * steps) @ line
     return float(along.min()), float(along.max())

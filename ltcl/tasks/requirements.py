@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Requirements of several tasks: `inverse` and `exact` of the same T, and a default tolerance."""
+"""Requirements of several tasks: `inverse` and `exact` of the same T, tolerance, progress."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -102,6 +103,21 @@ def resolve_reference(
     check_transport(exact, name="exact")
     check_same_scene("exact", exact, T, "it must be that of T, or T made from exact")
     return exact, exact.systems
+
+
+def check_progress(
+    progress: Callable[[str, float], object] | None,
+) -> Callable[[str, float], object]:
+    """`progress`, or a function that does nothing if it is None."""
+    if progress is None:
+        return _ignore_progress
+    if not callable(progress):
+        raise InputTypeError(f"progress is {progress!r}; it must be callable(text, share), or None")
+    return progress
+
+
+def _ignore_progress(text: str, share: float) -> None:
+    """Report to nobody."""
 
 
 def error_note(error: float) -> str:

@@ -169,7 +169,7 @@ class _Bidiagonalization:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the vectors of every start span all that A does to it."""
+        """True if the vectors of every start span all that A does to it."""
         return not np.any(self.betas[-1])
 
     @property
@@ -178,7 +178,7 @@ class _Bidiagonalization:
         return math.sqrt(max(self.A.shape)) * FLOAT32_ROUNDING * self._size
 
     def step(self) -> None:
-        """One more vector on each side."""
+        """Add a vector on each side."""
         u = _orthogonalize(self._product(self.vs[-1], transpose=False), self.us)
         u, alpha = self._normalize(u)
         self.us.append(u)
@@ -263,7 +263,7 @@ def _bounds(alphas: np.ndarray, betas: np.ndarray, overlap: float) -> tuple[floa
 
 
 def _exceeds(x: float, alphas: list[float], betas: list[float], limit: float) -> bool:
-    """Whether p_0(x)^2 + ... + p_k(x)^2 > `limit`, by the recurrence of orthonormal polynomials."""
+    """True if p_0(x)^2 + ... + p_k(x)^2 > `limit`, by the recurrence of orthonormal polynomials."""
     # p_(j+1) = ((x - a_j^2 - b_(j-1)^2) p_j - a_(j-1) b_(j-1) p_(j-1)) / (a_j b_j)
     previous = 0.0
     current = 1.0

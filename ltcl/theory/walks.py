@@ -95,7 +95,7 @@ def chance_to_go_on(step: Weights, albedo: float | None) -> float:
 
 
 def has_variance(radius: float, q: float) -> bool:
-    """Whether the variance of walks is finite; False if moments overflow, and `radius` is NaN."""
+    """True if the variance of walks is finite; False if moments overflow, and `radius` is NaN."""
     return radius < q <= LONGEST
 
 

@@ -23,7 +23,7 @@ Blocks = tuple[tuple[Any, ...], ...]
 
 
 def split_channels(value: Any) -> tuple[Blocks | None, tuple[Any, ...]]:
-    """The 3 x 3 checked blocks, if there are any, and the matrix of each channel: their diagonal."""
+    """The 3 x 3 checked blocks or None, and the matrix of each channel: their diagonal."""
     blocks = check_blocks(value)
     if blocks is None:
         return None, check_matrices(value)

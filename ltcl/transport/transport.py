@@ -205,7 +205,7 @@ class Transport:
         return self.grid
 
     def _has_underlying_system(self) -> bool:
-        """Whether some channel is an operator S diag(d)."""
+        """True if some channel is an operator S diag(d)."""
         if not self.is_square:
             return False
         return any(underlying_system(T) is not None for T in self.matrices)
@@ -378,12 +378,12 @@ class Transport:
 
     @property
     def is_square(self) -> bool:
-        """Whether S exists: one grid of camera and projector, and no blocks between colours."""
+        """True if S exists: one grid of camera and projector, and no blocks between colours."""
         return self.camera_grid == self.grid and self.blocks is None
 
     @property
     def couples(self) -> bool:
-        """Whether the light of one colour is seen in another."""
+        """True if the light of one colour is seen in another."""
         return self.blocks is not None or self.mixing is not None
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`view`: light transport in the browser, to be touched; `ltcl view` on the command line."""
+"""`view`: light transport in the browser; `ltcl view` on the command line."""
 
 from __future__ import annotations
 
@@ -24,12 +24,32 @@ def view(
 ) -> Viewer:
     """Show T in the browser: probe it, separate bounces, relight, compensate; feed a projector.
 
-    `picture` is linear light (h, w[, 3]), or a dict of such by names, to compensate for, separate
-    or relight with. `host` and `port` are the address: beyond this machine whoever has the URL can
-    look and compute; pages of a viewer that ended find the next one on the same `port`. `setup` is
-    the `ltcl.acquisition.Setup` of a measured T, whose codes projector windows then show, else
-    sRGB. Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame.
-    InputError for an address that cannot be had, or without the extra `view`.
+    Parameters
+    ----------
+    T : Transport
+    picture : array or dict of arrays, optional
+        Linear light (h, w[, 3]), or a dict of such pictures by names, to compensate for, separate
+        or relight with.
+    host, port : str, int
+        Address of the page; by default a free port of this machine. Beyond this machine whoever has
+        the URL can look and compute. A page of a viewer that ended finds the next one on the same
+        port.
+    open_browser : bool
+        Whether to open the page in the browser.
+    setup : ltcl.acquisition.Setup, optional
+        Measured projector of T, whose codes projector windows then show; else they show sRGB.
+    title : str
+        Title of the page.
+
+    Returns
+    -------
+    Viewer
+        It has a `url` and `close()`, and is a context manager; a notebook shows it as a frame.
+
+    Raises
+    ------
+    InputError
+        The address is not available, or the extra `view` is not installed.
 
     Examples
     --------
@@ -39,11 +59,14 @@ def view(
     ...     viewer.url.startswith("http://127.0.0.1:")
     True
     """
-    from ltcl.viewer.answers import Scene
+    from ltcl.viewer.answers import ViewerScene
     from ltcl.viewer.server import Viewer
 
     check_transport(T, square=False)
-    pictures = (
-        picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
-    )
-    return Viewer(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port, open_browser)
+    pictures = {}
+    if isinstance(picture, Mapping):
+        pictures = picture
+    elif picture is not None:
+        pictures = {"picture": picture}
+    scene = ViewerScene(T, title or repr(T).strip("<>"), pictures, setup)
+    return Viewer(scene, host, port, open_browser)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Scene`: what the library answers to the page, with one method for each thing that it may ask."""
+"""`ViewerScene`: the answers of the library to the page, with one method for each question."""
 
 from __future__ import annotations
 
 import inspect
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,166 +23,255 @@ from ltcl.tasks.separation import separate
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import ENTRIES
 
-Reply = tuple[dict[str, Any], dict[str, np.ndarray]]  # facts and pictures
-Callback = Callable[[int, float], None]  # of `ltcl.solve`
-LONG = ("bounces", "compensate")  # solves, which call back
-PICTURES = ("pattern", "appearance", "target", "out_of_reach")  # of a compensation
-LARGEST_FILE, LARGEST_PICTURE = 64 << 20, 3 << 29  # bytes; decoded, 64 million pixels
-UPLOADS = 16  # that are kept
-_BOUNCES = 16
-_STEPS = (
-    65535  # of light between black and white, of which each has a code: a table in place of powers
+# Facts, and pictures by their names.
+Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
+# The callback of `ltcl.solve`: iteration and relative residual.
+Callback = Callable[[int, float], None]
+# Questions that take a solve, which calls back.
+LONG_QUESTIONS = ("bounces", "compensate")
+QUESTIONS = (*LONG_QUESTIONS, "column", "row", "relight", "pictures", "projector")
+# Pictures of a compensation.
+COMPENSATION_PICTURES = ("pattern", "appearance", "target", "out_of_reach")
+COMPENSATION_FACTS = ("error", "gain", "clipped", "gap", "transport_error")
+RESULT_FILES = (
+    "report.json",
+    "pattern.png",
+    "codes.png",
+    *(f"{name}.exr" for name in COMPENSATION_PICTURES),
 )
-_CODES = from_linear(np.linspace(0, 1, _STEPS + 1, dtype=np.float32), "srgb", 8, is_float=False)
+# Bytes of a file, and of a decoded picture: 64 million pixels.
+LARGEST_FILE = 64 << 20
+LARGEST_PICTURE = 3 << 29
+# Uploaded pictures that are kept; an older one is dropped.
+MAX_UPLOADS = 16
+MAX_BOUNCES = 16
+# Steps of light between black and white, each with a code: a table is faster than powers.
+LIGHT_STEPS = 65535
+SRGB_CODES = from_linear(
+    np.linspace(0, 1, LIGHT_STEPS + 1, dtype=np.float32), "srgb", 8, is_float=False
+)
 
 
-class Scene:
-    """T and what is shown of it; methods take what a question holds, and raise LtclError for anything else.
+@dataclass(frozen=True, kw_only=True)
+class KeptPicture:
+    """A picture on the grids of camera and projector."""
 
-    T is None where there is none yet, or only patterns are shown: then nothing is computed. `setup`
-    is the `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the
-    projector has now, of at most `white`, or uint8 codes. `questions` may be asked, the largest of
-    so many `pixels`.
+    name: str
+    for_camera: np.ndarray
+    for_projector: np.ndarray
+
+
+class ViewerScene:
+    """T and what is shown of it.
+
+    Methods take the fields of a question, and raise LtclError for anything else. T is None if there
+    is none yet, or only patterns are shown: then nothing is computed. `setup` is the
+    `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light of the projector,
+    of at most `white`, or uint8 codes. A question has at most so many `pixels`.
     """
 
     page = "index.html"
-    questions: tuple[str, ...] = (*LONG, "column", "row", "relight", "pictures", "projector")
 
     def __init__(self, T: Any, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
-        self.T, self.title, self.setup = T, title, setup
+        self.title = title
+        self.T: Any = None
+        self.setup: Any = None
         self.pattern: Any = None
-        self.white, self.pixels = 1.0, 1
+        self.white = 1.0
+        self.pixels = 1
+        self._has_std = False
+        self._compensation: tuple[Any, dict[str, Any]] | None = None
+        self._pictures: dict[int, KeptPicture] = {}
+        self._picture_count = 0
+        self._first_pictures = len(pictures)
         if T is not None:
-            self.pattern, self.pixels = np.ones(T.grid, np.float32), max(T.shape)
-            entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
-            self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
-        self._pictures: dict[
-            int, tuple[str, np.ndarray, np.ndarray]
-        ] = {}  # for the camera, the projector
-        self._given, self._count = len(pictures), 0
+            self.show_transport(T, setup)
         for name, picture in pictures.items():
             self.add(name, as_picture(name, picture))
-        self._compensation: tuple[Any, dict[str, Any]] | None = None
+
+    def show_transport(self, T: Any, setup: Any) -> None:
+        """Show a transport from now on, while other threads may ask."""
+        has_entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
+        self._has_std = T.is_square and (has_entries or T.measured_noise is not None)
+        self.setup = setup
+        self.pattern = np.ones(T.grid, np.float32)
+        self.white = 1.0
+        self.pixels = max(T.shape)
+        # The last assignment: other threads see nothing of the transport, or all.
+        self.T = T
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """Questions that may be asked now."""
+        return QUESTIONS
 
     def hello(self) -> dict[str, Any]:
-        """What a page has to know; `grid` is None where there is no T."""
-        facts: dict[str, Any] = {name: name in self.questions for name in ("scan", "next")}
-        facts |= {"title": self.title, "grid": None}
-        if (T := self.T) is not None:
+        """Return what a page has to know; `grid` is None if there is no T."""
+        questions = self.questions
+        facts: dict[str, Any] = {
+            "scan": "scan" in questions,
+            "next": "next" in questions,
+            "title": self.title,
+            "grid": None,
+        }
+        T = self.T
+        if T is not None:
             facts |= {
-                name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")
+                "grid": T.grid,
+                "camera_grid": T.camera_grid,
+                "channels": T.channels,
+                "error": T.error,
+                "device": T.device.name,
+                "square": T.is_square,
+                "compressed": T.is_compressed,
             }
-            facts |= {"device": T.device.name, "square": T.is_square, "compressed": T.is_compressed}
         return facts
 
     def answer(self, do: str, asked: dict[str, Any], callback: Callback) -> Reply:
-        """The answer to a question by name; `callback` is called between the steps of a solve."""
+        """Answer a question by name; `callback` is called between the steps of a solve."""
         method = getattr(self, checks.one_of("do", do, self.questions))
+        arguments = {"callback": callback} if do in LONG_QUESTIONS else {}
         try:
-            bound = inspect.signature(method).bind(
-                **asked, **({"callback": callback} if do in LONG else {})
-            )
+            bound = inspect.signature(method).bind(**asked, **arguments)
         except TypeError as error:
             raise InputTypeError(f"{do}: {error}") from None
         return method(*bound.args, **bound.kwargs)
 
     def column(self, pixel: Any) -> Reply:
-        """What one projector pixel lights."""
-        return {}, {"picture": self.T @ _unit(pixel, self.T.grid)}
+        """Return the light of one projector pixel."""
+        return {}, {"picture": self.T @ _unit_picture(pixel, self.T.grid)}
 
     def row(self, pixel: Any) -> Reply:
-        """How much each projector pixel adds to one camera pixel."""
+        """Return the part of each projector pixel in one camera pixel."""
         T = self.T
-        unit = _unit(pixel, T.camera_grid)
+        unit = _unit_picture(pixel, T.camera_grid)
         columns, shape = layout.unpack("pixel", unit, T.camera_grid, T.channels)
-        columns = [np.concatenate(columns)] if T.couples else columns
-        rows = [A.T.matmat(x) for A, x in zip(T.operators, columns, strict=True)]
+        if T.couples:
+            columns = [np.concatenate(columns)]
+        rows = []
+        for operator, column in zip(T.operators, columns, strict=True):
+            rows.append(operator.T.matmat(column))
         return {}, {"pattern": shape.pack(rows, T.grid)}
 
     def relight(self, pattern: Any = None, picture: Any = None) -> Reply:
-        """The picture under a pattern, sRGB codes, or a picture, shown from now on; or the present."""
-        if pattern is None:
-            light = self.pattern if picture is None else self._picture(picture)[2]
+        """Return the picture under a pattern, and let the projector show that.
+
+        The pattern is one of sRGB codes, a kept picture, or the present one.
+        """
+        if pattern is not None:
+            light = self._light_of_codes(pattern)
+        elif picture is not None:
+            light = self._picture(picture).for_projector
         else:
-            codes = checks.shape(
-                "pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3)
-            )
-            if self.T.channels == 1 and codes.ndim == 3 and (codes == codes[..., :1]).all():
-                codes = codes[..., 0]  # a product in place of three
-            light = to_linear(codes, "auto")
-        seen = self.T @ light
+            light = self.pattern
+        shown = {"picture": self.T @ light}
         if light is not self.pattern:
-            self.pattern, self.white = light, 1.0
-        return {}, {"picture": seen} | ({"pattern": light} if pattern is None else {})
+            self.pattern = light
+            self.white = 1.0
+        if pattern is None:
+            shown["pattern"] = light
+        return {}, shown
+
+    def _light_of_codes(self, pattern: Any) -> np.ndarray:
+        grid = self.T.grid
+        codes = checks.real("pattern", pattern)
+        codes = checks.shape("pattern", codes, grid, (*grid, 3))
+        is_grey = codes.ndim == 3 and (codes == codes[..., :1]).all()
+        if self.T.channels == 1 and is_grey:
+            # One product instead of three.
+            codes = codes[..., 0]
+        return to_linear(codes, "auto")
 
     def bounces(self, callback: Callback, picture: Any = None, count: Any = 4) -> Reply:
-        """Direct light and bounces of a picture, or of what the current pattern looks like."""
-        checks.count("count", count, least=0, most=_BOUNCES)
-        image = self.T @ self.pattern if picture is None else self._picture(picture)[1]
+        """Return direct light and bounces of a picture, or of the scene under the pattern."""
+        checks.count("count", count, least=0, most=MAX_BOUNCES)
+        image = self._photograph(picture)
         result = separate(self.T, image, count, callback=callback)
-        numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
-        light = {"direct": result.direct, **numbered, "rest": result.rest}
-        whole = float(np.sum(image, dtype=np.float64)) or 1.0
-        shares = [float(np.sum(part, dtype=np.float64)) / whole for part in light.values()]
-        if self._shows_noise:
-            deviations = zip(
-                ["direct", *numbered], [result.std.direct, *result.std.bounces], strict=True
-            )
-            light |= {f"{name}_std": deviation for name, deviation in deviations}
+        bounces = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
+        light = {"direct": result.direct, **bounces, "rest": result.rest}
+        whole = _sum(image) or 1.0
+        shares = [_sum(part) / whole for part in light.values()]
+        if self._has_std:
+            deviations = [result.std.direct, *result.std.bounces]
+            for name, deviation in zip(["direct", *bounces], deviations, strict=True):
+                light[f"{name}_std"] = deviation
         return {"shares": shares}, light
 
     def compensate(
         self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)
     ) -> Reply:
-        """The pattern under which the scene looks like a picture; the projector shows it from now on."""
-        name, desired, shown = self._picture(picture)
-        asked, start = {"gain": gain, "bounds": bounds}, time.perf_counter()
-        ambient = None if self.setup is None else self.setup.ambient
-        c = compensate(self.T, desired, background=ambient, callback=callback, **asked)
-        facts = {
-            key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")
-        }
-        facts["seconds"], solves = time.perf_counter() - start, report.solution(c.solution)
-        solves += [each for each in report.solution(c.limited) if each not in solves]
+        """Return the pattern for a picture, and let the projector show it."""
+        kept = self._picture(picture)
+        start = time.perf_counter()
+        result = compensate(
+            self.T,
+            kept.for_camera,
+            background=None if self.setup is None else self.setup.ambient,
+            callback=callback,
+            gain=gain,
+            bounds=bounds,
+        )
+        facts = {name: getattr(result, name) for name in COMPENSATION_FACTS}
+        facts["seconds"] = time.perf_counter() - start
+        solves = _all_solves(result)
         facts["method"] = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
         facts["products"] = sum(solve["products"] for solve in solves)
         facts["residuals"] = max((solve["residuals"] for solve in solves), key=len)
-        self.pattern, self.white = c.pattern, max(float(bounds[1]), 0.0) or 1.0
+        self.pattern = result.pattern
+        self.white = max(float(bounds[1]), 0.0) or 1.0
         known = {
             "title": self.title,
             "versions": report.versions(),
             "device": report.device(self.T.device),
+            "picture": kept.name,
+            "gain": gain,
+            "bounds": bounds,
+            **facts,
+            "white": self.white,
+            "solves": solves,
         }
-        known |= {"picture": name, **asked, **facts, "white": self.white, "solves": solves}
-        self._compensation = c, known
-        plain = self.T @ shown  # the picture itself as a pattern, made as bright as the target
-        plain *= np.float32(c.target.mean() / max(plain.mean(), np.finfo(np.float32).tiny))
-        return facts, {name: getattr(c, name) for name in PICTURES} | {"uncompensated": plain}
+        self._compensation = (result, known)
+        pictures = {name: getattr(result, name) for name in COMPENSATION_PICTURES}
+        pictures["uncompensated"] = self._uncompensated(kept, result.target)
+        return facts, pictures
+
+    def _uncompensated(self, picture: KeptPicture, target: np.ndarray) -> np.ndarray:
+        """Return the scene under the picture itself, made as bright as the target."""
+        seen = self.T @ picture.for_projector
+        mean = max(seen.mean(), np.finfo(np.float32).tiny)
+        seen *= np.float32(target.mean() / mean)
+        return seen
 
     def pictures(self) -> Reply:
-        """Names and numbers of the pictures that there are."""
-        return {
-            "pictures": [{"picture": k, "name": name} for k, (name, *_) in self._pictures.items()]
-        }, {}
+        """Return names and numbers of the kept pictures."""
+        kept = []
+        for number, picture in self._pictures.items():
+            kept.append({"picture": number, "name": picture.name})
+        return {"pictures": kept}, {}
 
     def projector(self) -> Reply:
-        """A window that is to show the pattern, or has shown it; the server sends the next one."""
+        """Take note of a projector window that shows the pattern; the server sends the next one."""
         return {}, {}
 
     def add(self, name: str, picture: np.ndarray) -> int:
-        """Keep a picture, on the grids of camera and projector; its number."""
-        grids = (self.T.camera_grid, self.T.grid)
-        sizes = [
-            picture if picture.shape[:2] == grid else images.resize(picture, grid) for grid in grids
-        ]
-        self._count += 1
-        self._pictures[self._count] = name, sizes[0], sizes[1]
-        if self._count > self._given + UPLOADS:
-            del self._pictures[self._count - UPLOADS]
-        return self._count
+        """Keep a picture on both grids; return its number."""
+        kept = KeptPicture(
+            name=name,
+            for_camera=_fit(picture, self.T.camera_grid),
+            for_projector=_fit(picture, self.T.grid),
+        )
+        self._picture_count += 1
+        number = self._picture_count
+        self._pictures[number] = kept
+        if number > self._first_pictures + MAX_UPLOADS:
+            del self._pictures[number - MAX_UPLOADS]
+        return number
 
     def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
-        """Keep the picture of a file; InputError, before it is decoded, where that has too many pixels."""
+        """Keep the picture of a file.
+
+        InputError, before it is decoded, if it has too many pixels.
+        """
         if self.T is None:
             raise InputError(f"{self.title} has no transport, or none yet; pictures are for one")
         suffix = checks.one_of("extension", Path(name).suffix.lower(), BITS)
@@ -192,47 +282,75 @@ class Scene:
                 picture = images.read(path, memory=LARGEST_PICTURE)
             except LtclError as error:
                 raise InputError(str(error).removeprefix(f"{path}: ")) from None
-        shape = [*picture.shape, 1][:3]
+        channels = picture.shape[2] if picture.ndim == 3 else 1
+        shape = [*picture.shape[:2], channels]
         return {"picture": self.add(name, picture), "name": name, "shape": shape}
 
     def result(self, name: str) -> bytes | None:
-        """A file of the last compensation, by its name; None where there is none."""
-        files = ("report.json", "pattern.png", "codes.png", *(f"{each}.exr" for each in PICTURES))
-        if self._compensation is None or name not in files:
+        """Return a file of the last compensation by its name; None if there is none."""
+        if self._compensation is None or name not in RESULT_FILES:
             return None
-        c, facts = self._compensation
+        result, facts = self._compensation
         if name == "report.json":
             return report.dumps(facts).encode()
-        picture, encoding = getattr(c, name[:-4], c.pattern), "auto"
         if name == "codes.png" and self.setup is not None:
-            picture, encoding = self.codes(c.pattern, facts["white"]) / np.float32(255), "linear"
-        elif name.endswith(".png"):
-            picture = c.pattern / np.float32(facts["white"])
-        with TemporaryDirectory() as folder:
-            images.write(path := Path(folder) / name, picture, encoding=encoding)
-            return path.read_bytes()
+            codes = self.codes(result.pattern, facts["white"])
+            return _picture_file(name, codes / np.float32(255), "linear")
+        if name.endswith(".png"):
+            return _picture_file(name, result.pattern / np.float32(facts["white"]), "auto")
+        return _picture_file(name, getattr(result, name.removesuffix(".exr")), "auto")
 
     def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
-        """What a projector has to show, uint8 on its pixels: codes of the measured one, else sRGB."""
-        if pattern.dtype == np.uint8:  # they are such
+        """Return the uint8 codes for a projector: by its measured response, else sRGB."""
+        if pattern.dtype == np.uint8:
             return pattern
-        if self.setup is None:
-            steps = np.clip(pattern * np.float32(_STEPS / white) + np.float32(0.5), 0, _STEPS)
-            return _CODES[steps.astype(np.uint16)]
-        return from_linear(self.setup.codes(pattern), "linear", 8, is_float=False)
+        if self.setup is not None:
+            return from_linear(self.setup.codes(pattern), "linear", 8, is_float=False)
+        steps = pattern * np.float32(LIGHT_STEPS / white) + np.float32(0.5)
+        return SRGB_CODES[np.clip(steps, 0, LIGHT_STEPS).astype(np.uint16)]
 
-    def _picture(self, number: Any) -> tuple[str, np.ndarray, np.ndarray]:
+    def _photograph(self, number: Any) -> np.ndarray:
+        """Return a kept picture on the camera's grid, or the scene under the pattern."""
+        if number is None:
+            return self.T @ self.pattern
+        return self._picture(number).for_camera
+
+    def _picture(self, number: Any) -> KeptPicture:
         return self._pictures[checks.one_of("picture", number, self._pictures)]
 
 
-def _unit(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
-    """Light, or sight, of one pixel."""
+def _unit_picture(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
+    """Return a picture of 1 at one pixel and 0 at all others."""
     if not isinstance(pixel, list) or len(pixel) != 2:
         raise InputError(f"pixel is {checks.shown(pixel)}; it must be [row, column]")
-    place = tuple(
-        checks.count("pixel", n, least=0, most=size - 1)
-        for n, size in zip(pixel, grid, strict=True)
-    )
+    row, column = pixel
+    height, width = grid
+    checks.count("pixel", row, least=0, most=height - 1)
+    checks.count("pixel", column, least=0, most=width - 1)
     unit = np.zeros(grid, np.float32)
-    unit[place] = 1.0
+    unit[row, column] = 1.0
     return unit
+
+
+def _fit(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    return picture if picture.shape[:2] == grid else images.resize(picture, grid)
+
+
+def _sum(picture: np.ndarray) -> float:
+    return float(np.sum(picture, dtype=np.float64))
+
+
+def _all_solves(result: Any) -> list[dict[str, Any]]:
+    """Return the solves without bounds and those within them, each once."""
+    solves = report.solution(result.solution)
+    for solve in report.solution(result.limited):
+        if solve not in solves:
+            solves.append(solve)
+    return solves
+
+
+def _picture_file(name: str, picture: np.ndarray, encoding: Any) -> bytes:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        images.write(path, picture, encoding=encoding)
+        return path.read_bytes()

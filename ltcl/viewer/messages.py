@@ -23,57 +23,92 @@ from ltcl import checks
 from ltcl.errors import InputError, LtclError
 from ltcl.tasks import report
 
-LARGEST_HEADER = 4096  # bytes of a question
+# Bytes of the header of a question.
+LARGEST_HEADER = 4096
+# Bytes of the length of a header, and multiple at which arrays begin.
+LENGTH_BYTES = 4
+ALIGNMENT = 4
+# Channels of a canvas: red, green, blue, alpha.
+CANVAS_CHANNELS = 4
+MAX_SIDE = 1 << 24
 
 
-def largest(pixels: int) -> int:
-    """Bytes of the largest question about a grid of so many pixels."""
-    return 4 * pixels + LARGEST_HEADER
+def largest_question(pixels: int) -> int:
+    """Return the bytes of the largest question about a grid of so many pixels."""
+    return CANVAS_CHANNELS * pixels + LARGEST_HEADER
 
 
 def encode(
     header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
 ) -> str | bytes:
-    """A message of pictures (h, w[, 3]): uint8 ones as they are, others as float32."""
-    entries, parts = [], []
-    for name, array in (arrays or {}).items():
+    """Make a message with pictures (h, w[, 3]): uint8 ones as they are, others as float32."""
+    if not arrays:
+        return _dump(header)
+    entries = []
+    parts = []
+    for name, array in arrays.items():
         dtype = "u1" if array.dtype == np.uint8 else "f4"
-        values = checks.finite(name, array.reshape(*array.shape[:2], -1).astype(dtype, copy=False))
+        values = array.reshape(*array.shape[:2], -1).astype(dtype, copy=False)
+        checks.finite(name, values)
         entries.append({"name": name, "shape": values.shape, "dtype": dtype})
-        parts += [values.tobytes(), bytes(-values.nbytes % 4)]
-    text = json.dumps(
-        report.plain({**header, "arrays": entries} if entries else header), allow_nan=False
-    )
-    if not entries:
-        return text
-    text += " " * (-len(text) % 4)
-    return b"".join([len(text).to_bytes(4, "little"), text.encode(), *parts])
+        parts.append(values.tobytes())
+        parts.append(bytes(_padding(values.nbytes)))
+    text = _dump({**header, "arrays": entries})
+    text += " " * _padding(len(text))
+    length = len(text).to_bytes(LENGTH_BYTES, "little")
+    return b"".join([length, text.encode(), *parts])
+
+
+def _dump(header: Mapping[str, Any]) -> str:
+    return json.dumps(report.plain(dict(header)), allow_nan=False)
+
+
+def _padding(size: int) -> int:
+    return -size % ALIGNMENT
 
 
 def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of codes, (h, w[, c]) uint8, of a question; InputError where it is none."""
-    data = b"" if isinstance(message, str) else message
-    start = 4 + int.from_bytes(data[:4], "little") if data else 0
-    text = message if isinstance(message, str) else data[4:start]
+    """Return header and arrays of codes, (h, w[, c]) uint8, of a question; InputError if invalid."""
+    if isinstance(message, str):
+        text: str | bytes = message
+        data = b""
+        start = 0
+    else:
+        data = message
+        start = LENGTH_BYTES + int.from_bytes(data[:LENGTH_BYTES], "little") if data else 0
+        text = data[LENGTH_BYTES:start]
     checks.count("length of the header", len(text), most=LARGEST_HEADER)
     try:
-        header, arrays = json.loads(text), {}
+        header = json.loads(text)
         checks.one_of("type of do", type(header["do"]), [str])
         checks.number("id", header["id"])
-        for entry in header.pop("arrays", []):
-            checks.one_of("dtype", entry["dtype"], ["u1"])
-            h, w, c = (checks.count("shape", n, most=1 << 24) for n in entry["shape"])
-            codes = np.frombuffer(data, np.uint8, h * w * c, start).reshape(h, w, c)
-            arrays[str(entry["name"])] = (
-                codes[..., 0] if c == 1 else codes[..., : 3 if c == 4 else c]
-            )
-            start += codes.nbytes + -codes.nbytes % 4
+        arrays, end = _decode_arrays(header.pop("arrays", []), data, start)
     except LtclError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"message is none: {type(error).__name__}: {error}") from None
-    if start != len(data):
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"message is not a question: {reason}") from None
+    if end != len(data):
         raise InputError(
-            f"message has {len(data)} bytes; header and arrays must have as many: {start}"
+            f"message has {len(data)} bytes; header and arrays must have as many: {end}"
         )
     return header, arrays
+
+
+def _decode_arrays(entries: Any, data: bytes, start: int) -> tuple[dict[str, np.ndarray], int]:
+    """Return the arrays from byte `start` on, and the byte after them."""
+    arrays = {}
+    for entry in entries:
+        checks.one_of("dtype", entry["dtype"], ["u1"])
+        height, width, channels = (
+            checks.count("shape", size, most=MAX_SIDE) for size in entry["shape"]
+        )
+        codes = np.frombuffer(data, np.uint8, height * width * channels, start)
+        start += codes.nbytes + _padding(codes.nbytes)
+        codes = codes.reshape(height, width, channels)
+        if channels == 1:
+            codes = codes[..., 0]
+        elif channels == CANVAS_CHANNELS:
+            codes = codes[..., :3]
+        arrays[str(entry["name"])] = codes
+    return arrays, start

@@ -1,217 +1,316 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Scan`: the folder of an acquisition as it grows, and its transport once that is finished.
 
-What is new is read when a page asks, the newest first, for a while only. A rig that a person works
-by hand has all photographs in the folder. Of others those of the calibration are there until it has
-ended; then come batches of the scan, columns of T or pictures of an adaptive scan, in units of
-light.
+New files are read when a page asks, the newest first, for a limited time only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ltcl import checks, images
+from ltcl import checks
 from ltcl.acquisition import Calibration, Project, Setup
 from ltcl.acquisition.agreement import find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
-from ltcl.acquisition.rig import to_unit
-from ltcl.acquisition.rigs.photographs import read_photograph
 from ltcl.acquisition.rigs.shooting_list import Shot
-from ltcl.acquisition.session import calibration_folder
 from ltcl.errors import LtclError
-from ltcl.store import ArrayLog, BlockStore, load
-from ltcl.viewer.answers import Reply, Scene
+from ltcl.store import BlockStore, load
+from ltcl.viewer import scan_files
+from ltcl.viewer.answers import QUESTIONS, Reply, ViewerScene
+from ltcl.viewer.scan_files import PhotographReader, ScanFile
 
-_BUDGET, _PERIOD = 0.5, 0.9  # seconds of reading in a look, and from one to the next
-_SIDE, _BINS, _SHOWN = (
-    160,
-    32,
-    24,
-)  # pixels of a preview; of a histogram; photographs that a page has
-_PACE = 32  # of the newest files: by them the time that is left is estimated
-_FULL, _SATURATED = 0.999, 0.02  # of full scale; part of a photograph
+# Seconds of reading in one look at the folder, and from one look to the next.
+READING_SECONDS = 0.5
+LOOK_PERIOD = 0.9
+# Pixels along the longer side of a preview.
+PREVIEW_SIDE = 160
+HISTOGRAM_BINS = 32
+# Rows of a photograph that its histogram counts, about.
+HISTOGRAM_ROWS = 1000
+# Previews that are kept; the oldest photograph is dropped.
+MAX_PREVIEWS = 24
+# The newest files, by which the time left is estimated.
+PACE_FILES = 32
+# Share of full scale from which a pixel is saturated, and share of a photograph that may be.
+SATURATION_LEVEL = 0.999
+MAX_SATURATED_SHARE = 0.02
 
 
-class _File(NamedTuple):
-    """Of a photograph, or of batch `number` of a scan; `shot` of those taken by hand."""
+@dataclass(frozen=True, kw_only=True)
+class Preview:
+    """A photograph or batch on a page."""
 
-    path: Path
-    time: float
-    number: int = 0
-    shot: Shot | None = None
+    # Number of the preview among all that were ever shown.
+    number: int
+    facts: dict[str, Any]
+    picture: np.ndarray
 
 
-class Scan(Scene):
-    """A folder with an acquisition.toml; `T` is None, and only `scan` may be asked, until it is finished."""
+class Scan(ViewerScene):
+    """A folder with an acquisition.toml.
 
-    questions = ("scan", "pictures")
+    `T` is None, and only `scan` and `pictures` may be asked, until it is finished.
+    """
 
     def __init__(self, folder: Path, device: Any) -> None:
         super().__init__(None, folder.name, {}, None)
-        self.project, self._device = Project.open(folder), device
-        self._looked = 0.0
-        self._read: dict[Path, float] = {}  # when files that were read had been written
-        self._shown: dict[str, tuple[int, dict[str, Any], np.ndarray]] = {}  # photographs in order
-        self._count = 0  # of those that were ever shown
+        self.project = Project.open(folder)
+        self._device = device
+        self._looked_at = 0.0
+        # When files that have been read had been written.
+        self._times_read: dict[Path, float] = {}
+        self._previews: dict[str, Preview] = {}
+        self._preview_count = 0
         self._warnings: dict[str, str] = {}
-        self._facts: dict[str, Any] = {}
-        self._kind: Any = None  # shape and type of the first photograph
-        self._samples: defaultdict[str, dict[int, tuple[float, np.ndarray]]] = defaultdict(dict)
-        self._calibration: Calibration | None = None
-        self._total = 0
+        self._progress: dict[str, Any] = {}
+        self._reader = PhotographReader(self.project.table.get("bits"))
+        self.agreement = PhotographAgreement()
+        self._calibration_photographs = 0
         if self.project.state == "final":
-            self._finish()
+            self._show_result()
         else:
-            settings, facts = self.project.outlook()
-            ways = {
-                "aligned": settings.geometry == "aligned",
-                "by_hand": self.project.kind == "folder",
-            }
-            self._total = expected_photographs(
-                facts["grid"], facts["channels"], settings.frames, **ways
-            )
-            self.pixels = int(np.prod(facts["grid"]))
+            self._expect()
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """Questions that may be asked now."""
+        return ("scan", "pictures") if self.T is None else (*QUESTIONS, "scan")
 
     def scan(self, seen: Any) -> Reply:
-        """How far it is and what is wrong, and photographs of which a page has `seen` so many."""
+        """Return progress, warnings, and the previews after the first `seen` ones."""
         checks.count("seen", seen, least=0)
-        if time.monotonic() > self._looked + _PERIOD:
+        if time.monotonic() > self._looked_at + LOOK_PERIOD:
             try:
                 self._look()
-            except (LtclError, OSError) as error:  # files that change just now
-                self._warnings["folder"] = " ".join(str(error).split())
-            self._looked = time.monotonic()
-        new = [(f, preview) for number, f, preview in self._shown.values() if number > seen]
-        facts = self._facts | {
+            except (LtclError, OSError) as error:
+                # Files may change just now.
+                self._warnings["folder"] = _one_line(error)
+            self._looked_at = time.monotonic()
+        new = [preview for preview in self._previews.values() if preview.number > seen]
+        facts = {
+            **self._progress,
             "warnings": [*self._warnings.values()],
-            "photographs": [f for f, _ in new],
+            "photographs": [preview.facts for preview in new],
+            "seen": self._preview_count,
+            "finished": self.T is not None,
         }
-        facts |= {"seen": self._count, "finished": self.T is not None}
-        return facts, {str(k): preview for k, (_, preview) in enumerate(new)}
+        pictures = {str(k): preview.picture for k, preview in enumerate(new)}
+        return facts, pictures
+
+    def _expect(self) -> None:
+        """Find out how many photographs the calibration takes."""
+        settings, facts = self.project.outlook()
+        self._calibration_photographs = expected_photographs(
+            facts["grid"],
+            facts["channels"],
+            settings.frames,
+            aligned=settings.geometry == "aligned",
+            by_hand=self.project.kind == "folder",
+        )
+        height, width = facts["grid"]
+        self.pixels = height * width
+
+    def _show_result(self) -> None:
+        """Show the transport of a finished scan."""
+        T = load(self.project.store, on_dark="mask", device=self._device)
+        self.show_transport(T, Setup.of(self.project.store))
 
     def _look(self) -> None:
+        """Read new files for a while, and take note of the state of the scan."""
         self._warnings.pop("folder", None)
-        state, store, kind = self.project.state, None, self.project.kind
+        state = self.project.state
+        store = None
         if state != "new":
             store = BlockStore.open(self.project.store)
-            self._calibration = self._calibration or Calibration.of(store)
-        files = list(self._by_hand() if kind == "folder" else self._in_store(store))
-        done, total, what = len(files), self._total, "photographs of the calibration"
-        if store and kind == "folder":
-            total, what = int(store.attributes["plan"]["photographs"]), "photographs"
-        elif store:
-            batches, total = (
-                store.layout.blocks("columns"),
-                int(store.attributes["plan"]["patterns"]),
-            )
-            done, what = round(total * done / batches), "patterns"
-        if store and store.final:
-            done = total = int(store.attributes["patterns"])
-        total, newest = max(total, done), sorted(files, key=lambda file: -file.time)
-        times = [file.time for file in newest[:_PACE]]
-        self._facts = {"state": state, "done": done, "total": total, "what": what, "left": None}
-        if total > done and len(times) > 1:  # each file has as many on average
-            each = (times[0] - times[-1]) / (len(times) - 1) * len(files) / done
-            self._facts["left"] = each * (total - done)
-        if c := self._calibration:
-            self._facts["coverage"] = float(np.mean(c.resampling.coverage > 0))
-            self._facts["saturated"] = 1.0 - float(np.mean(c.white.valid))
-        end = time.monotonic() + _BUDGET
-        for file in [
-            *newest[-1:],
-            *newest[:-1],
-        ]:  # the first photograph says what the others have to be
-            if self._read.get(file.path) != file.time and time.monotonic() < end:
-                self._read[file.path] = file.time
-                self._open(file, store)
+            self.agreement.set_calibration(store)
+        with self._open_rig() as rig:
+            files = list(self._list_files(rig, store))
+            self._progress = self._measure_progress(state, files, store)
+            self._read_new(files, rig, store)
         if state == "final" and self.T is None:
-            self._finish()
+            self._show_result()
 
-    def _by_hand(self) -> Iterator[_File]:
-        """Photographs by their numbers."""
-        with self.project.rig() as self._camera:
-            self._camera.missing()  # which looks for them
-            for shot in self._camera.shots:
-                if file := self._camera.file_name(shot.number):
-                    path = self._camera.folder / "photographs" / file
-                    yield _File(path, path.stat().st_mtime, shot.number, shot)
+    def _open_rig(self) -> contextlib.AbstractContextManager[Any]:
+        """Open a rig that is worked by hand; others may be in use."""
+        if self.project.kind == "folder":
+            return self.project.rig()
+        return contextlib.nullcontext()
 
-    def _in_store(self, store: BlockStore | None) -> Iterator[_File]:
-        """Photographs of the calibration in the order in which they were taken, or batches of the scan."""
-        place = calibration_folder(self.project.store) if store is None else store.path / "log"
-        paths = place.glob("shot_*.npz" if store is None else "columns_0.*.npz")
-        times = sorted((path.stat().st_mtime, path) for path in paths)
-        for number, (written, path) in enumerate(times, 1):
-            yield _File(path, written, number if store is None else int(path.stem[10:]))
+    def _list_files(self, rig: Any, store: BlockStore | None) -> Iterator[ScanFile]:
+        if rig is not None:
+            return scan_files.photographs_by_hand(rig)
+        if store is None:
+            return scan_files.photographs_of_calibration(self.project.store)
+        return scan_files.batches(store)
 
-    def _open(self, file: _File, store: BlockStore | None) -> None:
-        """Read a photograph or a batch: its preview, its histogram and what is wrong with it."""
-        name, facts = f"photograph {file.number}", dict[str, Any]()
+    def _measure_progress(
+        self, state: str, files: list[ScanFile], store: BlockStore | None
+    ) -> dict[str, Any]:
+        """Return how much is done, of what, and the estimated seconds left."""
+        done = len(files)
+        total = self._calibration_photographs
+        unit = "photographs of the calibration"
+        if store is not None:
+            plan = store.attributes["plan"]
+            if self.project.kind == "folder":
+                total = int(plan["photographs"])
+                unit = "photographs"
+            else:
+                total = int(plan["patterns"])
+                unit = "patterns"
+                done = round(total * done / store.layout.blocks("columns"))
+            if store.final:
+                done = int(store.attributes["patterns"])
+                total = done
+        total = max(total, done)
+        progress: dict[str, Any] = {
+            "state": state,
+            "done": done,
+            "total": total,
+            "what": unit,
+            "left": _seconds_left(files, done, total),
+        }
+        calibration = self.agreement.calibration
+        if calibration is not None:
+            progress["coverage"] = float(np.mean(calibration.resampling.coverage > 0))
+            progress["saturated"] = 1.0 - float(np.mean(calibration.white.valid))
+        return progress
+
+    def _read_new(self, files: list[ScanFile], rig: Any, store: BlockStore | None) -> None:
+        """Read files that are new or have changed, the newest first, for a while."""
+        end = time.monotonic() + READING_SECONDS
+        newest_first = _newest_first(files)
+        # The first photograph decides on the shape and type of all others.
+        for file in [*newest_first[-1:], *newest_first[:-1]]:
+            is_read = self._times_read.get(file.path) == file.time
+            if not is_read and time.monotonic() < end:
+                self._times_read[file.path] = file.time
+                self._read(file, rig, store)
+
+    def _read(self, file: ScanFile, rig: Any, store: BlockStore | None) -> None:
+        """Read a photograph or a batch, and show it."""
+        name = f"photograph {file.number}"
         self._warnings.pop(name, None)
         if file.shot is None and store is not None:
-            light = store.block(0, file.number).matrix.sum(axis=0)
-            light = np.reshape(light, store.layout.camera_grid or store.layout.grid)
-            codes = images.to_srgb(light / max(light.max(), 1e-30))
-            name = f"batch {file.number + 1}"
-        else:
-            try:
-                codes = self._codes(name, file)
-            except LtclError as error:
-                self._warnings[name] = " ".join(str(error).split())
-                return
-            counts, _ = np.histogram(codes[:: 1 + codes.shape[0] // 1000], _BINS, (0.0, 1.0))
-            facts = {"histogram": counts / counts.sum(), "seconds": file.shot and file.shot.seconds}
-            if file.shot is not None:
-                self._check(name, file.shot, codes)
-        step = -(-max(codes.shape[:2]) // _SIDE)
-        preview = np.rint(255 * codes[::step, ::step].clip(0, 1)).astype(np.uint8)
-        self._count += 1
-        self._shown[name] = self._count, {"name": name, "time": file.time, **facts}, preview
-        if len(self._shown) > _SHOWN:
-            del self._shown[min(self._shown, key=lambda name: self._shown[name][1]["time"])]
-
-    def _codes(self, name: str, file: _File) -> np.ndarray:
-        """A photograph in [0, 1] of full scale; AcquisitionError, as `acquire` raises it."""
-        if file.shot is None:
-            image = ArrayLog(file.path.parent).get(file.path.stem)["image"]
-            bits = self.project.table.get("bits")
-            camera: Any = SimpleNamespace(channels=1 if image.ndim == 2 else 3, bits=bits)
-        else:
-            camera = self._camera
-            image = read_photograph(name, file.path, camera.channels, file.shot.seconds)
-        codes = to_unit(name, image, camera, self._kind)
-        self._kind = image.shape, image.dtype
-        return codes
+            codes = scan_files.read_batch(store, file.number)
+            self._add_preview(f"batch {file.number + 1}", file, codes, {})
+            return
+        try:
+            codes = self._reader.read(name, file, rig)
+        except LtclError as error:
+            self._warnings[name] = _one_line(error)
+            return
+        facts = {"histogram": _histogram(codes), "seconds": None}
+        if file.shot is not None:
+            self._check(name, file.shot, codes)
+            facts["seconds"] = file.shot.seconds
+        self._add_preview(name, file, codes, facts)
 
     def _check(self, name: str, shot: Shot, codes: np.ndarray) -> None:
-        """Compare a photograph with the others of its pattern, once the camera is known."""
-        self._samples[shot.pattern][shot.number] = shot.seconds, sample(codes)
-        if (c := self._calibration) is None:
-            return
-        saturated = float(np.mean(codes >= _FULL))
-        if saturated > _SATURATED and shot.seconds <= c.exposures[0]:
-            self._warnings[name] = f"{name}: {saturated:.0%} are saturated in the shortest exposure"
-        numbers, taken = zip(*sorted(self._samples[shot.pattern].items()), strict=True)
-        seconds, samples = zip(*taken, strict=True)
+        """Compare a photograph with the others of its pattern."""
         self._warnings.pop(shot.pattern, None)
-        if len({*seconds}) > 1 and (found := find_deviation(samples, seconds, c.camera)):
-            self._warnings[shot.pattern] = found.describe(numbers)
+        self.agreement.add(shot, codes)
+        saturation = self.agreement.saturation(name, shot, codes)
+        if saturation:
+            self._warnings[name] = saturation
+        deviation = self.agreement.deviation(shot.pattern)
+        if deviation:
+            self._warnings[shot.pattern] = deviation
 
-    def _finish(self) -> None:
-        """The transport is there: all that a Scene has, in one assignment, as pages ask meanwhile."""
-        T, setup = (
-            load(self.project.store, on_dark="mask", device=self._device),
-            Setup.of(self.project.store),
+    def _add_preview(
+        self, name: str, file: ScanFile, codes: np.ndarray, facts: dict[str, Any]
+    ) -> None:
+        # Ceiling of the quotient.
+        step = -(-max(codes.shape[:2]) // PREVIEW_SIDE)
+        picture = np.rint(255 * codes[::step, ::step].clip(0, 1)).astype(np.uint8)
+        self._preview_count += 1
+        self._previews[name] = Preview(
+            number=self._preview_count,
+            facts={"name": name, "time": file.time, **facts},
+            picture=picture,
         )
-        questions = (*Scene.questions, "scan")
-        self.__dict__ = (
-            vars(self) | vars(Scene(T, self.title, {}, setup)) | {"questions": questions}
-        )
+        if len(self._previews) > MAX_PREVIEWS:
+            oldest = min(self._previews, key=self._time_of)
+            del self._previews[oldest]
+
+    def _time_of(self, name: str) -> float:
+        return self._previews[name].facts["time"]
+
+
+class PhotographAgreement:
+    """Photographs by hand against the others of their patterns, once the camera is calibrated."""
+
+    def __init__(self) -> None:
+        self.calibration: Calibration | None = None
+        # Seconds and sampled codes, by pattern and by number of the photograph.
+        self._samples: defaultdict[str, dict[int, tuple[float, np.ndarray]]] = defaultdict(dict)
+
+    def set_calibration(self, store: BlockStore) -> None:
+        """Read the calibration of a store, once."""
+        if self.calibration is None:
+            self.calibration = Calibration.of(store)
+
+    def add(self, shot: Shot, codes: np.ndarray) -> None:
+        """Take a photograph, which may replace an earlier one."""
+        self._samples[shot.pattern][shot.number] = (shot.seconds, sample(codes))
+
+    def saturation(self, name: str, shot: Shot, codes: np.ndarray) -> str | None:
+        """Return a warning if much of a photograph is saturated in the shortest exposure."""
+        if self.calibration is None:
+            return None
+        share = float(np.mean(codes >= SATURATION_LEVEL))
+        is_shortest = shot.seconds <= self.calibration.exposures[0]
+        if share > MAX_SATURATED_SHARE and is_shortest:
+            return f"{name}: {share:.0%} are saturated in the shortest exposure"
+        return None
+
+    def deviation(self, pattern: str) -> str | None:
+        """Return a warning if the photographs of a pattern contradict each other."""
+        calibration = self.calibration
+        if calibration is None:
+            return None
+        numbers = []
+        seconds = []
+        samples = []
+        for number, (exposure, codes) in sorted(self._samples[pattern].items()):
+            numbers.append(number)
+            seconds.append(exposure)
+            samples.append(codes)
+        if len({*seconds}) < 2:
+            return None
+        deviation = find_deviation(samples, seconds, calibration.camera)
+        return deviation.describe(numbers) if deviation else None
+
+
+def _newest_first(files: list[ScanFile]) -> list[ScanFile]:
+    return sorted(files, key=lambda file: -file.time)
+
+
+def _seconds_left(files: list[ScanFile], done: int, total: int) -> float | None:
+    """Estimate the seconds left by the pace of the newest files; None if it is unknown."""
+    times = [file.time for file in _newest_first(files)[:PACE_FILES]]
+    if not 0 < done < total or len(times) < 2:
+        return None
+    seconds_of_file = (times[0] - times[-1]) / (len(times) - 1)
+    # A file is a photograph, or a batch of several patterns.
+    seconds_of_unit = seconds_of_file * len(files) / done
+    return seconds_of_unit * (total - done)
+
+
+def _histogram(codes: np.ndarray) -> np.ndarray:
+    """Return shares of pixels, by code."""
+    step = 1 + codes.shape[0] // HISTOGRAM_ROWS
+    counts, _ = np.histogram(codes[::step], HISTOGRAM_BINS, (0.0, 1.0))
+    return counts / counts.sum()
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

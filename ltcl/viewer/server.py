@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The viewer's server: who may ask, and what is sent to whom.
+"""`Viewer`: the server of the page; it decides who may ask.
 
 Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another
-host's name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. Each
-kind of question has a thread, so that a product does not wait for a solve; what a page asks again
-takes the place of what it has waiting. A page that does not read its answers is closed, and delays
-nobody.
+host's name (DNS rebinding), gets 403 for any address. A page asks through one WebSocket (`client`).
 """
 
 from __future__ import annotations
@@ -21,9 +18,6 @@ import socket
 import threading
 import time
 import webbrowser
-from collections import defaultdict
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +33,8 @@ try:
     from starlette.responses import JSONResponse, Response
     from starlette.websockets import WebSocket, WebSocketDisconnect
     from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    from ltcl.viewer.client import READ_SECONDS, Client, Threads
 except ImportError as error:
     raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
 
@@ -47,193 +43,112 @@ TYPES = {
     ".css": "text/css",
     ".js": "text/javascript",
     ".json": "application/json",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".exr": "image/x-exr",
 }
-TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
-PAGES, CONNECTIONS = 32, 256
-PATIENCE = 5.0  # seconds for a page to read an answer
-_BUFFER = 1 << 21  # bytes to a page: a picture is handed over at once
-_PERIOD = 0.1  # seconds between two reports of progress
-_KEPT = 86400.0  # seconds that a token on a named port serves
-_logger = logging.getLogger(__name__)
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob:; media-src blob:; connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'self' http://127.0.0.1:* http://localhost:*",  # notebooks
+MAX_PAGES = 32
+# Connections that are no page yet.
+MAX_CONNECTIONS = 256
+# Bytes to a page: a picture is handed over at once.
+SEND_BUFFER = 1 << 21
+# Seconds for which the token of a named port is kept: a day.
+TOKEN_SECONDS = 86400.0
+TOKEN_BYTES = 24
+MIN_TOKEN_LENGTH = 32
+MAX_NAME_LENGTH = 255
+# Codes by which a WebSocket is closed (RFC 6455): bad data; try again later.
+POLICY_VIOLATION = 1008
+TRY_AGAIN_LATER = 1013
+PAGE_FOLDER = Path(__file__).parent / "page"
+HEADERS = {
+    # The last line allows the frames of notebooks.
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+        "media-src blob:; connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'self' http://127.0.0.1:* http://localhost:*"
+    ),
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+_logger = logging.getLogger(__name__)
 
 
-class _Superseded(Exception):
-    """Nobody waits for what is computed any more."""
+class _Connection(H11Protocol):
+    """A connection that is no socket yet.
 
-
-class _Client:
-    """A page's socket, and of each kind of question the newest that waits."""
-
-    def __init__(self, socket: WebSocket, viewer: Viewer) -> None:
-        self.socket, self.viewer, self.scene = socket, viewer, viewer._scene
-        self.loop, self.changed = asyncio.get_running_loop(), asyncio.Event()
-        self.waiting: dict[str, tuple[float, dict[str, Any]]] = {}
-        self.tasks: dict[str, asyncio.Task[None]] = {}
-
-    async def serve(self) -> None:
-        """Take questions until the page goes; InputError for what is none."""
-        await self.send(messages.encode({"do": "hello", **self.scene.hello()}))
-        async with asyncio.TaskGroup() as group:
-            while (event := await self.socket.receive())["type"] == "websocket.receive":
-                header, arrays = messages.decode(event.get("text") or event.get("bytes") or b"")
-                do = checks.one_of("do", header.pop("do"), self.scene.questions)
-                self.waiting[do] = header.pop("id"), header | arrays
-                if do not in self.tasks or self.tasks[do].done():
-                    self.tasks[do] = group.create_task(self.answer(do))
-                if do == "projector" and "show" not in self.tasks:
-                    self.tasks["show"] = group.create_task(self.show())
-            raise WebSocketDisconnect
-
-    async def answer(self, do: str) -> None:
-        """Answer questions of a kind while there are any; projector windows look for a new pattern."""
-        while do in self.waiting:
-            message = await self.viewer._run(do, self._compute, do, *self.waiting.pop(do))
-            if message is not None:
-                await self.send(message)
-            for client in self.viewer._clients:
-                client.changed.set()
-
-    async def show(self) -> None:
-        """Send the codes of every new pattern to a projector window."""
-        shown = None
-        while True:
-            if shown is not (pattern := self.scene.pattern):
-                codes = await self.viewer._run("show", self.scene.codes, pattern, self.scene.white)
-                await self.send(
-                    messages.encode({"do": "show", "title": self.scene.title}, {"codes": codes})
-                )
-                shown = pattern
-            await self.changed.wait()
-            self.changed.clear()
-
-    async def send(self, message: str | bytes) -> None:
-        """TimeoutError where the other side does not read."""
-        kind = "text" if isinstance(message, str) else "bytes"
-        await asyncio.wait_for(
-            self.socket.send({"type": "websocket.send", kind: message}), PATIENCE
-        )
-
-    def _compute(self, do: str, number: float, asked: dict[str, Any]) -> str | bytes | None:
-        """The message that answers; None where it came too late. In a thread."""
-        reported = time.monotonic()
-
-        def between(iteration: int, residual: float) -> None:
-            nonlocal reported
-            if self not in self.viewer._clients or do in self.waiting:
-                raise _Superseded
-            if (now := time.monotonic()) > reported + _PERIOD:
-                facts = {
-                    "id": number,
-                    "step": do,
-                    "done": iteration,
-                    "total": None,
-                    "residual": residual,
-                }
-                message = messages.encode({"do": "progress", **facts})
-                asyncio.run_coroutine_threadsafe(self.send(message), self.loop)
-                reported = now
-
-        try:
-            facts, pictures = self.scene.answer(do, asked, between)
-            return messages.encode({"id": number, "do": do, **facts}, pictures)
-        except _Superseded:
-            return None
-        except Exception as error:  # noqa: BLE001 - the next question may go well
-            kind = (
-                "" if isinstance(error, LtclError) else f"internal error: {type(error).__name__}: "
-            )
-            line = kind + " ".join(str(error).split())
-            return messages.encode({"id": number, "do": do, "error": line})
-
-
-class _Http(H11Protocol):
-    """A connection that is no socket yet: of too many the oldest gives way, first one that asked nothing."""
+    Of too many the oldest gives way, first of all one without a request.
+    """
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self.app_state = {
-            "abort": transport.abort
-        }  # of its socket, too: close would wait for a reader
+        # The socket of the page is aborted by this, too: closing would wait for a reader.
+        self.app_state = {"abort": transport.abort}
         self.since = time.monotonic()
-        plain = [each for each in self.connections if isinstance(each, _Http)]
-        plain = [each for each in plain if not each.transport.is_closing()]
-        if len(plain) > CONNECTIONS:
-            min(plain, key=lambda each: (each.scope is not None, each.since)).transport.abort()
+        open_connections = []
+        for connection in self.connections:
+            if isinstance(connection, _Connection) and not connection.transport.is_closing():
+                open_connections.append(connection)
+        if len(open_connections) > MAX_CONNECTIONS:
+            oldest = min(open_connections, key=_Connection._order)
+            oldest.transport.abort()
+
+    def _order(self) -> tuple[bool, float]:
+        has_request = self.scope is not None
+        return has_request, self.since
 
 
-def _token(port: int) -> str:
-    """The token of the last viewer on a port that was named, for a day: pages of that find the next one."""
+def _new_token() -> str:
+    return secrets.token_urlsafe(TOKEN_BYTES)
+
+
+def _token_of_port(port: int) -> str:
+    """Return the token of the last viewer on a port that was named, for a day.
+
+    A page of that viewer finds the next one.
+    """
     file = tuning.make_folder() / f"viewer-{port}"
-    if file.exists() and time.time() > file.stat().st_mtime + _KEPT:
+    if file.exists() and time.time() > file.stat().st_mtime + TOKEN_SECONDS:
         file.unlink()
     if not file.exists():
         file.touch(0o600, exist_ok=False)
-        file.write_text(secrets.token_urlsafe(24), "ascii")
-    others_read = os.name == "posix" and file.stat().st_mode & 0o077  # elsewhere the folder decides
-    if len(token := file.read_text("latin-1")) < 32 or others_read:
+        file.write_text(_new_token(), "ascii")
+    # On Windows the permissions of the folder decide.
+    is_public = os.name == "posix" and bool(file.stat().st_mode & 0o077)
+    token = file.read_text("latin-1")
+    if is_public or len(token) < MIN_TOKEN_LENGTH:
         raise OSError(f"{file} is no token, or others can read it; delete it")
     return token
 
 
 class Viewer(contextlib.AbstractContextManager):
-    """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
+    """A viewer in threads of its own, until `close` or the end of a with block.
+
+    `url` is the address of its page.
+    """
 
     def __init__(
         self, scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True
     ) -> None:
-        try:
-            if not host:  # which would be anywhere
-                raise OSError("it is empty")
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            place = host, checks.count("port", port, least=0, most=65535)
-            self._token = _token(port) if port else secrets.token_urlsafe(24)
-            listening = socket.create_server(place, family=family)
-        except OSError as error:
-            raise InputError(
-                f"host is {host!r}, port {port}: {error}; they must be free here"
-            ) from None
-        own = ipaddress.ip_address(listening.getsockname()[0])
-        if not own.is_loopback:  # where it travels unencrypted
-            self._token = secrets.token_urlsafe(24)
-        # Connections have these, too. Without the first one an answer after another waits 40 ms.
-        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-        name, self._port = (
-            socket.gethostname() if own.is_unspecified else host,
-            listening.getsockname()[1],
-        )
-        self._names = "127.0.0.1", "localhost", name
+        self._scene = scene
+        self._clients: list[Client] = []
+        self._threads = Threads()
+        self._files = _read_page()
+        listening = self._listen(host, port)
+        address = ipaddress.ip_address(listening.getsockname()[0])
+        if not address.is_loopback:
+            # The token travels unencrypted, so that it must not be used again.
+            self._token = _new_token()
+        name = socket.gethostname() if address.is_unspecified else host
+        self._port = listening.getsockname()[1]
+        self._names = ("127.0.0.1", "localhost", name)
         self.url = f"http://{_in_url(name)}:{self._port}/{self._token}/"
-        page = (Path(__file__).parent / "page").iterdir()
-        self._files = {file.name: file.read_bytes() for file in page if file.suffix in TYPES}
-        self._scene, self._clients = scene, list[_Client]()
-        self._threads = defaultdict[str, ThreadPoolExecutor](lambda: ThreadPoolExecutor(1))
-        settings: dict[str, Any] = {"interface": "asgi3", "lifespan": "off", "http": _Http}
-        settings |= {"ws": "websockets-sansio", "ws_max_size": messages.largest(scene.pixels)}
-        settings |= {
-            "ws_per_message_deflate": False,
-            "timeout_graceful_shutdown": 1,
-            "proxy_headers": False,
-        }
-        settings |= {
-            "log_config": None,
-            "log_level": "critical",
-            "access_log": False,
-            "server_header": False,
-        }
-        self._uvicorn = uvicorn.Server(uvicorn.Config(self._application, **settings))
+        self._uvicorn = uvicorn.Server(self._configuration())
         self._thread = threading.Thread(target=self._uvicorn.run, args=([listening],), daemon=True)
         self._thread.start()
-        if not own.is_loopback:
+        if not address.is_loopback:
             _logger.warning(
                 "%s is open to the network, unencrypted: whoever has it can compute", self.url
             )
@@ -243,15 +158,16 @@ class Viewer(contextlib.AbstractContextManager):
     def refresh(self) -> None:
         """Let projector windows look for a new pattern; from any thread."""
         for client in [*self._clients]:
-            client.loop.call_soon_threadsafe(client.changed.set)
+            client.refresh()
 
     def wait(self) -> None:
-        """Until the viewer is closed."""
+        """Wait until the viewer is closed."""
         while self._thread.is_alive():
-            self._thread.join(0.5)  # which Ctrl-C interrupts on any system
+            # Ctrl-C interrupts a wait with a limit on any system.
+            self._thread.join(0.5)
 
     def close(self) -> None:
-        """End it; pages say that they lost it."""
+        """Close the viewer; pages show that they lost it."""
         self._uvicorn.should_exit = True
         self._thread.join()
 
@@ -262,76 +178,132 @@ class Viewer(contextlib.AbstractContextManager):
         return f"<ltcl Viewer at {self.url}>"
 
     def _repr_html_(self) -> str:
-        return f'<iframe src="{html.escape(self.url)}" style="width:100%;height:720px;border:0"></iframe>'
+        style = "width:100%;height:720px;border:0"
+        return f'<iframe src="{html.escape(self.url)}" style="{style}"></iframe>'
 
-    async def _run(self, kind: str, call: Callable[..., Any], *arguments: Any) -> Any:
-        """What a call returns, in the thread for its kind, one after the other."""
-        return await asyncio.get_running_loop().run_in_executor(
-            self._threads[kind], call, *arguments
+    def _listen(self, host: str, port: int) -> socket.socket:
+        """Open the port, and set the token."""
+        try:
+            if not host:
+                # An empty host would be any address.
+                raise OSError("it is empty")
+            checks.count("port", port, least=0, most=65535)
+            self._token = _token_of_port(port) if port else _new_token()
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            listening = socket.create_server((host, port), family=family)
+        except OSError as error:
+            raise InputError(
+                f"host is {host!r}, port {port}: {error}; they must be free here"
+            ) from None
+        # Connections inherit these. Without the first an answer after another waits 40 ms.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        return listening
+
+    def _configuration(self) -> uvicorn.Config:
+        return uvicorn.Config(
+            self._application,
+            interface="asgi3",
+            lifespan="off",
+            http=_Connection,
+            ws="websockets-sansio",
+            ws_max_size=messages.largest_question(self._scene.pixels),
+            ws_per_message_deflate=False,
+            timeout_graceful_shutdown=1,
+            proxy_headers=False,
+            log_config=None,
+            log_level="critical",
+            access_log=False,
+            server_header=False,
         )
 
     async def _application(self, scope: Any, receive: Any, send: Any) -> None:
-        """All requests pass here; those that may not get 403 and no word about what there is."""
-        headers = HTTPConnection(scope).headers
-        host, origins = headers.get("host", ""), headers.getlist("origin")
-        names = (
-            *self._names,
-            scope["server"][0],
-        )  # the last was connected to: no other site can have it
+        """Answer a request; one that is not allowed gets 403 whatever it asks for."""
         token, slash, path = scope["path"].removeprefix("/").partition("/")
-        reads = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
-        is_allowed = secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode())
-        is_allowed &= host.lower() in [f"{_in_url(name)}:{self._port}".lower() for name in names]
-        is_allowed &= origins == [f"http://{host}"] or (reads and not origins)
+        is_reading = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
+        is_allowed = self._is_allowed(scope, token, is_reading)
         if scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)
-            await (self._serve(websocket) if is_allowed and path == "socket" else websocket.close())
+            if is_allowed and path == "socket":
+                await self._serve(websocket)
+            else:
+                await websocket.close()
             return
         response = Response("forbidden", 403)
         if is_allowed:
-            response = await self._respond(Request(scope, receive), path if slash else "/", reads)
-            response.headers.update({name: value.format(host) for name, value in _HEADERS.items()})
+            request = Request(scope, receive)
+            response = await self._respond(request, path if slash else "/", is_reading)
+            host = request.headers.get("host", "")
+            for name, value in HEADERS.items():
+                response.headers[name] = value.format(host)
         await response(scope, receive, send)
 
-    async def _respond(self, request: Request, path: str, reads: bool) -> Response:
+    def _is_allowed(self, scope: Any, token: str, is_reading: bool) -> bool:
+        """Whether token, host and origin are those of the viewer's own page."""
+        headers = HTTPConnection(scope).headers
+        host = headers.get("host", "")
+        origins = headers.getlist("origin")
+        # The address that was connected to is the last name: no other site can have it.
+        names = (*self._names, scope["server"][0])
+        hosts = [f"{_in_url(name)}:{self._port}".lower() for name in names]
+        has_token = secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode())
+        has_host = host.lower() in hosts
+        has_origin = origins == [f"http://{host}"] or (is_reading and not origins)
+        return has_token and has_host and has_origin
+
+    async def _respond(self, request: Request, path: str, is_reading: bool) -> Response:
+        """Answer a request for a file, or take a picture."""
         if path == "picture" and request.method == "POST":
-            name, length = (
-                request.query_params.get("name", ""),
-                request.headers.get("content-length", ""),
-            )
-            try:
-                checks.count(
-                    "length", int(length) if length.isdecimal() else None, most=LARGEST_FILE
-                )
-                content = await request.body()
-                return JSONResponse(
-                    await self._run("picture", self._scene.upload, name[:255], content)
-                )
-            except LtclError as error:
-                return JSONResponse({"error": " ".join(str(error).split())}, 400)
-        name = {"": self._scene.page, "projector": "projector.html"}.get(path, path)
+            return await self._take_picture(request)
+        pages = {"": self._scene.page, "projector": "projector.html"}
+        name = pages.get(path, path)
         content = self._files.get(name)
         if path.startswith("result/"):
             name = path.removeprefix("result/")
-            content = await self._run("result", self._scene.result, name)
-        if content is None or not reads:
+            content = await self._threads.run("result", self._scene.result, name)
+        if content is None or not is_reading:
             return Response("not found", 404)
         return Response(content, media_type=TYPES[Path(name).suffix])
 
+    async def _take_picture(self, request: Request) -> Response:
+        name = request.query_params.get("name", "")[:MAX_NAME_LENGTH]
+        length = request.headers.get("content-length", "")
+        try:
+            size = int(length) if length.isdecimal() else None
+            checks.count("length", size, most=LARGEST_FILE)
+            content = await request.body()
+            facts = await self._threads.run("picture", self._scene.upload, name, content)
+        except LtclError as error:
+            return JSONResponse({"error": " ".join(str(error).split())}, 400)
+        return JSONResponse(facts)
+
     async def _serve(self, websocket: WebSocket) -> None:
+        """Serve a page until it goes."""
         await websocket.accept()
-        if len(self._clients) >= PAGES:
-            await websocket.close(1013, f"{PAGES} pages are open here, and there may be no more")
+        if len(self._clients) >= MAX_PAGES:
+            reason = f"{MAX_PAGES} pages are open here, and there may be no more"
+            await websocket.close(TRY_AGAIN_LATER, reason)
             return
-        self._clients.append(client := _Client(websocket, self))
+        client = Client(websocket, self._scene, self._threads, self._clients)
+        self._clients.append(client)
         try:
             await client.serve()
         except* InputError as errors:
-            await asyncio.wait_for(websocket.close(1008, f"{errors.exceptions[0]}"[:100]), PATIENCE)
+            reason = str(errors.exceptions[0])[:100]
+            await asyncio.wait_for(websocket.close(POLICY_VIOLATION, reason), READ_SECONDS)
         except* (TimeoutError, WebSocketDisconnect):
             websocket.state.abort()
         finally:
             self._clients.remove(client)
+
+
+def _read_page() -> dict[str, bytes]:
+    """Read all files of the page, by their names."""
+    files = {}
+    for file in PAGE_FOLDER.iterdir():
+        if file.suffix in TYPES:
+            files[file.name] = file.read_bytes()
+    return files
 
 
 def _in_url(address: str) -> str:

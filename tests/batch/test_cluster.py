@@ -276,7 +276,7 @@ sys.exit(main(sys.argv[2:]))
 
 def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path):
     words = [
-        "compensate",
+        "film",
         *map(str, (film / "T.npz", film / "in")),
         "--rtol",
         "0.01",
@@ -373,7 +373,7 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
     for name in ("a", "b"):
         for picture in tmp_path.glob("one/*.exr"):
             assert (out / name / picture.name).read_bytes() == picture.read_bytes()
-    frames = ["compensate", str(film / "T.npz"), str(film / "in"), "--rtol", "0.01", "--batch", "4"]
+    frames = ["film", str(film / "T.npz"), str(film / "in"), "--rtol", "0.01", "--batch", "4"]
     frames += ["--appearance", "--out", str(tmp_path / "frames")]
     assert main([*frames, "--cluster", "local", "--workers", "1", "--frames", "4"]) == 0
     assert main([*frames, "--cluster", address, "--resume"]) == 0
@@ -397,10 +397,7 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
 def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, options, text):
     out = str(tmp_path / "out")
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        assert (
-            main(["compensate", *map(str, (film / "T.npz", film / "in")), "--out", out, *options])
-            == 1
-        )
+        assert main(["film", *map(str, (film / "T.npz", film / "in")), "--out", out, *options]) == 1
     error = capsys.readouterr().err
     assert (text in error, error.count("\n")) == (True, 1), error
     assert not (tmp_path / "out").exists()

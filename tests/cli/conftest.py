@@ -24,7 +24,7 @@ from tests import json_schema
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run of `ltcl` ended and what it printed."""
+    """Exit code and output of a run of `ltcl`."""
 
     code: int
     out: str
@@ -32,20 +32,27 @@ class Outcome:
 
     @property
     def json(self) -> Any:
-        """Of a run that ended well."""
+        """The JSON document of a run that succeeded."""
         assert self.code == 0, self.err
         return self.document
 
     @property
     def document(self) -> Any:
-        """The one JSON document on stdout."""
-        return json.loads(self.out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+        """The JSON document on stdout."""
+        return json.loads(self.out, parse_constant=_refuse_constant)
 
     def refused(self, *parts: str, code: int = 1) -> None:
-        """One line on stderr with these parts, nothing on stdout."""
-        assert (self.code, self.out, self.err.count("\n")) == (code, "", 1), self.err
+        """Expect one line on stderr with these parts, and nothing on stdout."""
+        assert self.code == code, self.err
+        assert self.out == ""
+        assert self.err.count("\n") == 1, self.err
         assert self.err.startswith("ltcl: error: ")
-        assert [part for part in parts if part not in self.err] == [], self.err
+        for part in parts:
+            assert part in self.err
+
+
+def _refuse_constant(name: str) -> None:
+    pytest.fail(f"{name} is not JSON")
 
 
 Program = Callable[..., Outcome]
@@ -53,15 +60,17 @@ Program = Callable[..., Outcome]
 
 @pytest.fixture(scope="session")
 def program() -> Program:
-    """`ltcl` with these arguments; what --json prints is held against its schema."""
+    """`ltcl` with these arguments; the output of --json is checked against its schema."""
 
     def run(*arguments: object) -> Outcome:
-        out, err = io.StringIO(), io.StringIO()
+        out = io.StringIO()
+        err = io.StringIO()
+        words = [str(argument) for argument in arguments]
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            code = main([str(argument) for argument in arguments])
+            code = main(words)
         outcome = Outcome(code, out.getvalue(), err.getvalue())
-        if "--json" in arguments:
-            json_schema.check(arguments, outcome.document)
+        if "--json" in words:
+            json_schema.check(words, outcome.document)
         return outcome
 
     return run
@@ -69,7 +78,7 @@ def program() -> Program:
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Holds the input files; nothing is written there by the program."""
+    """Folder of the input files; the program writes nothing there."""
     return tmp_path_factory.mktemp("inputs")
 
 
@@ -77,17 +86,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def transport(folder: Path, device: Device) -> Path:
     """A corner of two walls, grey, grid 5 x 10."""
     scene = scenes.dihedral(5, albedo=0.6)
-    ltcl.save(
-        folder / "corner.npz", scene.transport(first_bounce=scene.first_bounce, device=device)
-    )
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    ltcl.save(folder / "corner.npz", T)
     return folder / "corner.npz"
 
 
 @pytest.fixture(scope="session")
 def colour_transport(folder: Path, device: Device) -> Path:
     """A corner of three walls in colour, grid 4 x 12."""
-    scene = scenes.box(4, sides=3, albedo=[(0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.7, 0.7, 0.7)])
-    ltcl.save(folder / "room.npz", scene.transport(first_bounce=scene.first_bounce, device=device))
+    albedo = [(0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.7, 0.7, 0.7)]
+    scene = scenes.box(4, sides=3, albedo=albedo)
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    ltcl.save(folder / "room.npz", T)
     return folder / "room.npz"
 
 
@@ -100,20 +110,21 @@ def compressed(folder: Path, transport: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def inverse(folder: Path, transport: Path) -> Path:
-    ltcl.save_inverse(
-        folder / "inverse.npz", ltcl.invert(ltcl.load(transport), 1e-3, basis="pixels")
-    )
+    """The inverse of the corner of two walls."""
+    inverse = ltcl.invert(ltcl.load(transport), 1e-3, basis="pixels")
+    ltcl.save_inverse(folder / "inverse.npz", inverse)
     return folder / "inverse.npz"
 
 
 def write(path: Path, picture: Any) -> Path:
+    """Write a picture, and return its path."""
     images.write(path, np.asarray(picture, np.float32))
     return path
 
 
 @pytest.fixture(scope="session")
 def picture(folder: Path) -> Path:
-    """Within reach of `transport`: 5 x 10, linear, between 0.3 and 0.4."""
+    """A picture within reach of `transport`: 5 x 10, linear, between 0.3 and 0.4."""
     return write(folder / "sky.exr", np.random.default_rng(1).uniform(0.3, 0.4, (5, 10)))
 
 
@@ -127,36 +138,38 @@ def large_picture(folder: Path) -> Path:
 def results(
     program: Program, transport: Path, picture: Path, large_picture: Path, folder: Path
 ) -> Any:
-    """The folder and the JSON of compensate, separate and relight on two pictures, all in one folder."""
-    out, report = folder.with_name("results"), {}
+    """Folder and reports of compensate, separate and relight on two pictures, all in one folder."""
+    out = folder.with_name("results")
     out.mkdir()
     (out / "mine.txt").write_text("mine")
-    common = f"--on-dark mask --encoding linear --grid 5x10 --resize --json --out {out}".split()
     solving = ["--first-bounce", "exact", "--rtol", "1e-4", "--method", "chebyshev"]
-    for command, more in (
-        ("compensate", solving),
-        ("separate", [*solving, "--bounces", 2]),
-        ("relight", []),
-    ):
-        report[command] = program(command, transport, picture, large_picture, *common, *more).json
-    return out, report
+    options = {
+        "compensate": solving,
+        "separate": [*solving, "--bounces", 2],
+        "relight": [],
+    }
+    common = ["--on-dark", "mask", "--encoding", "linear", "--grid", "5x10", "--resize", "--json"]
+    reports = {}
+    for command, more in options.items():
+        arguments = [transport, picture, large_picture, *common, *more, "--out", out]
+        reports[command] = program(command, *arguments).json
+    return out, reports
 
 
 @pytest.fixture(scope="session")
 def simulated(program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A corner of two walls, 4 x 8, in a room that is not dark; nothing is photographed here."""
+    """A folder with a corner of two walls, 4 x 8, in a room that is not dark; not to be changed."""
     out = tmp_path_factory.mktemp("simulated") / "scan"
-    options = ["--size", 4, "--strategy", "pixel", "--response", "film", "--ambient", 0.05]
-    assert (
-        program("simulate", "dihedral", "--out", out, *options, "--projector-response", "film").code
-        == 0
-    )
+    curves = ["--response", "film", "--projector-response", "film"]
+    options = ["--size", 4, "--strategy", "pixel", "--ambient", 0.05, *curves]
+    assert program("simulate", "dihedral", "--out", out, *options).code == 0
     return out
 
 
 @pytest.fixture(scope="session")
 def acquired(program: Program, simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same, all photographed; not to be changed."""
-    scan = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("acquired") / "scan"))
+    """The same folder with all photographs; not to be changed."""
+    scan = tmp_path_factory.mktemp("acquired") / "scan"
+    shutil.copytree(simulated, scan)
     assert program("acquire", "run", scan).code == 0
     return scan

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl compensate`, `separate` and `relight`: what they make of pictures and of films."""
+"""`ltcl compensate`, `separate` and `relight`: results of pictures, files and reports."""
 
 from __future__ import annotations
 
 import json
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,21 @@ from PIL import Image
 
 import ltcl
 from ltcl import images
-from ltcl.batch import frames
 from ltcl.files import locked
-from ltcl.images.frames import open_frames, write_video
 
 from .conftest import write
 
-WEIGHTS = np.where(np.arange(50).reshape(5, 10) == 23, 0.0, 1.0)
-SAMPLING = {"method": "monte_carlo", "samples": 300, "seed": 2**64 - 1}
-EXACT, INVERSE = {"exact": "transport", "rtol": 1e-5}, {"inverse": "inverse"}
-CALLS: list[
-    tuple[str, dict[str, Any], str]
-] = [  # options, the same of the library, and what is printed
+GRID = (5, 10)
+WEIGHTS = np.where(np.arange(50).reshape(GRID) == 23, 0.0, 1.0)
+SEED = 2**64 - 1
+SAMPLING = {"method": "monte_carlo", "samples": 300, "seed": SEED}
+EXACT = {"exact": "transport", "rtol": 1e-5}
+INVERSE = {"inverse": "inverse"}
+# Smallest width of a picture for viewing.
+PANEL_WIDTH = 512
+
+# A command line, the same options of the library, and what is printed.
+CALLS: list[tuple[str, dict[str, Any], str]] = [
     ("compensate {transport}", {}, ""),
     ("compensate {transport} --gain auto --loss 0.05", {"gain": "auto", "loss": 0.05}, ""),
     ("compensate {transport} --weights {weights} --gain 4", {"weights": WEIGHTS, "gain": 4}, ""),
@@ -36,7 +38,7 @@ CALLS: list[
         "",
     ),
     (
-        f"compensate {{transport}} --method monte_carlo --samples 300 --seed {2**64 - 1}",
+        f"compensate {{transport}} --method monte_carlo --samples 300 --seed {SEED}",
         SAMPLING,
         "",
     ),
@@ -50,127 +52,128 @@ CALLS: list[
     ("relight {transport}", {}, ""),
     ("relight {compressed}", {}, "compressed transport"),
 ]
+DEFAULT_RTOL = {"compensate": 1e-2, "separate": 1e-3}
+FACTS = ("gain", "error", "clipped", "gap", "transport_error")
 
 
-def written_by(command: str, result: Any) -> dict[str, np.ndarray]:
-    """The .exr files of a command, by their names, from what the library gives."""
+def light_files(command: str, result: Any) -> dict[str, np.ndarray]:
+    """Return the content of a command's .exr files by their names, from the library's result."""
     if command == "relight":
         return {"sky_relit": result}
     if command == "compensate":
         return {
-            f"sky_{name}": getattr(result, name)
-            for name in ("pattern", "appearance", "out_of_reach")
+            "sky_pattern": result.pattern,
+            "sky_appearance": result.appearance,
+            "sky_out_of_reach": result.out_of_reach,
         }
-    parts = {name: getattr(result, name) for name in ("direct", "indirect", "rest")}
-    return parts | {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
+    parts = {"direct": result.direct, "indirect": result.indirect, "rest": result.rest}
+    for number, bounce in enumerate(result.bounces, 1):
+        parts[f"bounce_{number}"] = bounce
+    return parts
 
 
-def deviations_of(command: str, std: Any) -> dict[str, np.ndarray]:
-    """What is in files of standard deviations, by their names."""
+def std_files(command: str, std: Any) -> dict[str, np.ndarray]:
+    """Return the content of the files of standard deviations by their names."""
     if command == "compensate":
-        return {"sky_pattern": std.pattern, "sky_appearance": std.appearance}
-    return {"direct": std.direct} | {
-        f"bounce_{k}": bounce for k, bounce in enumerate(std.bounces, 1)
-    }
+        return {"sky_pattern_std": std.pattern, "sky_appearance_std": std.appearance}
+    deviations = {"direct_std": std.direct}
+    for number, bounce in enumerate(std.bounces, 1):
+        deviations[f"bounce_{number}_std"] = bounce
+    return deviations
 
 
 @pytest.mark.parametrize(("line", "arguments", "printed"), CALLS)
 def test_a_command_does_what_the_library_does(
     program, transport, compressed, inverse, picture, tmp_path, line, arguments, printed
 ):
-    files = {"transport": transport, "compressed": compressed, "inverse": inverse}
-    files["weights"], out = write(tmp_path / "weights.exr", WEIGHTS), tmp_path / "out"
+    out = tmp_path / "out"
+    files = {
+        "transport": transport,
+        "compressed": compressed,
+        "inverse": inverse,
+        "weights": write(tmp_path / "weights.exr", WEIGHTS),
+    }
     command, path, *options = line.format(**files).split()
     outcome = program(command, path, picture, *options, "--out", out)
-    assert (outcome.code, printed in outcome.out) == (0, True)
-    report, T = json.loads((out / f"{command}.json").read_text()), ltcl.load(path)
-    read = {"exact": lambda: ltcl.load(transport), "inverse": lambda: ltcl.load_inverse(inverse)}
-    arguments = arguments | {name: read[name]() for name in arguments if name in read}
+    assert outcome.code == 0
+    assert printed in outcome.out
+    T = ltcl.load(path)
+    arguments = dict(arguments)
+    if "exact" in arguments:
+        arguments["exact"] = ltcl.load(transport)
+    if "inverse" in arguments:
+        arguments["inverse"] = ltcl.load_inverse(inverse)
     result = getattr(ltcl, command)(T, images.read(picture), **arguments)
-    for name, light in written_by(command, result).items():
+    for name, light in light_files(command, result).items():
         np.testing.assert_allclose(images.read(out / f"{name}.exr"), light, rtol=1e-6, atol=1e-7)
     if path == str(transport) and command != "relight":
-        for name, deviation in deviations_of(command, result.std).items():
-            seen = images.read(out / f"{name}_std.exr")
-            np.testing.assert_allclose(seen, deviation, rtol=1e-3, atol=1e-3 * deviation.max())
-    for name in ("gain", "error", "clipped", "gap", "transport_error"):
+        for name, std in std_files(command, result.std).items():
+            seen = images.read(out / f"{name}.exr")
+            np.testing.assert_allclose(seen, std, rtol=1e-3, atol=1e-3 * std.max())
+    report = json.loads((out / f"{command}.json").read_text())
+    for name in FACTS:
         if hasattr(result, name):
-            assert report["pictures"][0][name] == pytest.approx(
-                getattr(result, name), rel=1e-5, abs=1e-7
-            )
-    if command != "relight":
-        default = max(T.error, 1e-2 if command == "compensate" else 1e-3)
+            expected = pytest.approx(getattr(result, name), rel=1e-5, abs=1e-7)
+            assert report["pictures"][0][name] == expected
+    if command in DEFAULT_RTOL:
+        default = max(T.error, DEFAULT_RTOL[command])
         assert report["options"]["rtol"] == arguments.get("rtol", default)
-    assert (report["transport"]["compressed"], report["transport"]["error"]) == (
-        T.is_compressed,
-        T.error,
-    )
-    if command == "compensate":  # pixel for pixel, white at the upper bound
-        white, codes = (
-            arguments.get("bounds", (0, 1))[1],
-            images.read_codes(out / "sky_pattern.png"),
-        )
-        np.testing.assert_allclose(
-            codes / 255, images.to_srgb(result.pattern / white), atol=0.6 / 255
-        )
+    assert report["transport"]["compressed"] == T.is_compressed
+    assert report["transport"]["error"] == T.error
+    if command == "compensate":
+        # Pixel for pixel, white at the upper bound.
+        _, white = arguments.get("bounds", (0, 1))
+        codes = images.read_codes(out / "sky_pattern.png")
+        expected = images.to_srgb(result.pattern / white)
+        np.testing.assert_allclose(codes / 255, expected, atol=0.6 / 255)
 
 
 def test_reports_have_every_option_as_it_was_resolved(results):
+    _, reports = results
     shared = {"on_dark": "mask", "encoding": "linear", "grid": [5, 10], "resize": True}
-    solving = shared | {"first_bounce": "exact", "rtol": 1e-4, "method": "chebyshev"}
-    asked = {
-        "compensate": solving | {"low": 0, "high": 1, "gain": 1},
+    solving = {**shared, "first_bounce": "exact", "rtol": 1e-4, "method": "chebyshev"}
+    expected = {
+        "compensate": {**solving, "low": 0, "high": 1, "gain": 1},
         "separate": solving,
         "relight": shared,
     }
-    for command, options in asked.items():
-        report = results[1][command]
-        assert options.items() <= report["options"].items()
-        assert report["versions"]["ltcl"] == ltcl.__version__
-        entries = [part for entry in report["pictures"] for part in entry.get("parts", [entry])]
-        methods = {solve["method"] for entry in entries for solve in entry.get("channels", [])}
-        assert methods <= {"chebyshev"}
-    shares = [part["share"] for part in results[1]["separate"]["pictures"][0]["parts"]]
-    assert sum(shares[:2]) == pytest.approx(1, abs=1e-5)
+    for command, options in expected.items():
+        assert options.items() <= reports[command]["options"].items()
+        assert reports[command]["versions"]["ltcl"] == ltcl.__version__
+    methods = set()
+    for picture in reports["compensate"]["pictures"]:
+        methods |= {solve["method"] for solve in picture["channels"]}
+    for picture in reports["separate"]["pictures"]:
+        for part in picture["parts"]:
+            methods |= {solve["method"] for solve in part["channels"]}
+    assert methods == {"chebyshev"}
+    direct, indirect, *_ = reports["separate"]["pictures"][0]["parts"]
+    assert direct["share"] + indirect["share"] == pytest.approx(1, abs=1e-5)
 
 
-COUNT = 10
-
-
-@pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten 16-bit PNG of 5 x 10, within reach of `transport`."""
-    folder, light = (
-        tmp_path_factory.mktemp("film"),
-        np.random.default_rng(5).uniform(0.33, 0.4, (COUNT, 5, 10)),
-    )
-    for number, picture in enumerate(light, 1):
-        images.write(folder / f"f{number}.png", picture, bits=16)
-    return folder
-
-
-def test_a_second_run_in_a_folder_is_refused_at_once(program, transport, picture, film, tmp_path):
-    for source in (picture, film):
-        arguments = ["compensate", transport, source, "--out", tmp_path / "out"]
-        with locked(tmp_path / "out"):  # as the first one does
-            program(*arguments).refused("out: another run")
-        assert not (tmp_path / "out").exists()
+def test_a_second_run_in_a_folder_is_refused_at_once(program, transport, picture, tmp_path):
+    arguments = ["compensate", transport, picture, "--out", tmp_path / "out"]
+    with locked(tmp_path / "out"):
+        program(*arguments).refused("out: another run")
+    assert not (tmp_path / "out").exists()
     assert program(*arguments).code == 0
 
 
-def shown(path: Path) -> np.ndarray:
+def read_shown(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         return np.asarray(image.convert("RGB")) / 255
 
 
-def content(path: Path, grid: tuple[int, int] = (5, 10)) -> np.ndarray:
-    """The pixels of a labelled picture, (h, w, 3), each of which must be a square of one colour."""
-    picture = shown(path)
-    side = picture.shape[1] // grid[1]
-    assert side * grid[1] >= 512
-    squares = picture[len(picture) - side * grid[0] :].reshape(grid[0], side, grid[1], side, 3)
+def read_panel(path: Path) -> np.ndarray:
+    """Return the pixels of a labelled picture, (h, w, 3); each must be a square of one colour."""
+    picture = read_shown(path)
+    height, width = GRID
+    side = picture.shape[1] // width
+    assert side * width >= PANEL_WIDTH
+    label = picture[: -side * height]
+    assert np.ptp(label) > 0.5
+    squares = picture[-side * height :].reshape(height, side, width, side, 3)
     assert np.ptp(squares, axis=(1, 3)).max() == 0
-    assert np.ptp(picture[: -side * grid[0]]) > 0.5  # the label
     return squares[:, 0, :, 0]
 
 
@@ -178,57 +181,76 @@ def files_in(out: Path) -> set[str]:
     return {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
 
 
-def test_what_is_for_the_eye_is_the_linear_picture_at_the_exposure_of_the_run(results):
-    out, report = results
-    for text in report.values():
-        for entry in text["pictures"]:
-            for part in entry.get("parts", [entry.get("appearance", entry)]):
-                light = images.read(out / part["exr"]) * text["exposure"] / entry.get("gain", 1.0)
-                exact, seen = images.to_srgb(np.clip(light, 0, 1)), content(out / part["png"])
-                exact = np.broadcast_to(exact.reshape(5, 10, -1), seen.shape)
-                np.testing.assert_allclose(seen, exact, atol=1.1 / 255)
-    assert shown(out / "separate.png").shape[1] > 3 * 512
-    assert shown(out / "compensate.png").shape[1] > 4 * 512
+def shown_parts(report: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
+    """Return all pictures of a report for viewing, and their gains."""
+    parts = []
+    for picture in report["pictures"]:
+        if "appearance" in picture:
+            parts.append((picture["appearance"], picture["gain"]))
+        elif "parts" in picture:
+            parts += [(part, 1.0) for part in picture["parts"]]
+        else:
+            parts.append((picture, 1.0))
+    return parts
+
+
+def test_a_picture_for_viewing_is_the_linear_one_at_the_exposure_of_the_run(results):
+    out, reports = results
+    for report in reports.values():
+        for part, gain in shown_parts(report):
+            light = images.read(out / part["exr"]) * report["exposure"] / gain
+            expected = images.to_srgb(np.clip(light, 0, 1)).reshape(*GRID, -1)
+            seen = read_panel(out / part["png"])
+            expected = np.broadcast_to(expected, seen.shape)
+            np.testing.assert_allclose(seen, expected, atol=1.1 / 255)
+
+
+def test_contact_sheets_have_all_panels(results):
+    out, _ = results
+    assert read_shown(out / "separate.png").shape[1] > 3 * PANEL_WIDTH
+    assert read_shown(out / "compensate.png").shape[1] > 4 * PANEL_WIDTH
 
 
 @pytest.mark.parametrize(
-    ("value", "low", "colour", "advice"),
+    ("value", "low", "colour", "share"),
     [(5.0, 0, [1.0, 0.55, 0.0], "too_dark"), (0.0, 0.5, [0.1, 0.45, 1.0], "too_bright")],
 )
-def test_what_is_out_of_reach_is_named_and_seen(
-    program, transport, tmp_path, value, low, colour, advice
+def test_pixels_out_of_reach_are_named_and_seen(
+    program, transport, tmp_path, value, low, colour, share
 ):
     """Orange where it stays too dark, blue where too bright, and the picture in grey elsewhere."""
-    desired = np.full((5, 10), 0.6)
+    desired = np.full(GRID, 0.6)
     desired[2, 3] = value
-    spot, out = write(tmp_path / "spot.exr", desired), tmp_path / "out"
+    spot = write(tmp_path / "spot.exr", desired)
+    out = tmp_path / "out"
     arguments = ["compensate", transport, spot, "--low", low, "--out", out]
     (entry,) = program(*arguments, "--json").json["pictures"]
-    assert f"spot.exr: {100 * entry[advice]:.0f} % " in program(*arguments).err
+    assert f"spot.exr: {100 * entry[share]:.0f} % " in program(*arguments).err
     assert program(*arguments, "--quiet").err == ""
     missing = images.read(out / entry["out_of_reach"]["exr"])
-    seen = content(out / entry["out_of_reach"]["png"])
+    assert entry["too_dark"] == np.mean(missing > 0)
+    assert entry["too_bright"] == np.mean(missing < 0)
+    seen = read_panel(out / entry["out_of_reach"]["png"])
     np.testing.assert_allclose(seen[2, 3], colour, atol=0.15)
     assert np.ptp(seen[missing == 0], axis=-1).max(initial=0) == 0
     assert seen.min(axis=(0, 1)).max() > 0.05
-    assert (entry["too_dark"], entry["too_bright"]) == (np.mean(missing > 0), np.mean(missing < 0))
 
 
 def test_commands_share_a_folder_and_list_their_files(results):
-    out, report = results
-    listed = [file for text in report.values() for file in text["files"]]
-    assert {*listed, "mine.txt"} == files_in(out)
-    for command, text in report.items():
-        assert {"folder": str(out), **json.loads((out / f"{command}.json").read_text())} == text
-        assert text["files"][-1] == f"{command}.json"
+    out, reports = results
+    listed = {"mine.txt"}
+    for command, report in reports.items():
+        written = json.loads((out / f"{command}.json").read_text())
+        assert {"folder": str(out), **written} == report
+        assert report["files"][-1] == f"{command}.json"
+        listed |= {*report["files"]}
+    assert listed == files_in(out)
 
 
 def test_many_transports_get_a_folder_each(program, transport, picture, tmp_path):
     pattern = str(transport.with_name("corne[r].npz"))
-    report = program(
-        "compensate", "--transports", pattern, picture, "--out", tmp_path, "--json"
-    ).json
-    (scene,) = report["scenes"]
+    arguments = ["--transports", pattern, picture, "--out", tmp_path]
+    (scene,) = program("compensate", *arguments, "--json").json["scenes"]
     assert scene["folder"] == str(tmp_path / "corner")
     assert {*scene["files"]} == files_in(tmp_path / "corner")
 
@@ -236,59 +258,7 @@ def test_many_transports_get_a_folder_each(program, transport, picture, tmp_path
 def test_a_failed_run_changes_nothing(program, transport, picture, tmp_path):
     assert program("compensate", transport, picture, "--out", tmp_path).code == 0
     before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
-    black = write(tmp_path.with_name("black.exr"), np.zeros((5, 10)))
+    black = write(tmp_path.with_name("black.exr"), np.zeros(GRID))
     arguments = [transport, picture, "--weights", black, "--gain", "auto", "--out", tmp_path]
     program("compensate", *arguments).refused("weights", "0 to 0", "sky.exr")
     assert {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)} == before
-
-
-def test_patterns_of_a_folder_are_listed_and_kept_after_ctrl_c(
-    program, transport, film, tmp_path, monkeypatch
-):
-    solve, solves = frames.compensate, iter(range(2))
-
-    def end_at_the_third(*arguments: Any, **options: Any) -> Any:
-        if next(solves, None) is None:
-            signal.raise_signal(signal.SIGINT)
-        return solve(*arguments, **options)
-
-    common, listed = (
-        ["compensate", transport, film, "--out", tmp_path, "--batch", "3"],
-        tmp_path / "frames.json",
-    )
-    with monkeypatch.context() as patch:
-        patch.setattr(frames, "compensate", end_at_the_third)
-        program(*common).refused("6 frame(s)", str(tmp_path), "--resume", code=130)
-    assert (
-        len(json.loads(listed.read_text())["frames"]) == len([*tmp_path.glob("pattern_*.png")]) == 6
-    )
-    program(*common).refused(f"{tmp_path}: ", "6 frame(s)", "resume=True")
-    program(*common, "--resume", "--rtol", "1e-3").refused("rtol=0.01", "0.001")
-    report = program(*common, "--resume", "--json").json
-    assert (report["source"], report["solved"], report["options"]["rtol"]) == (
-        str(film),
-        COUNT - 6,
-        1e-2,
-    )
-    assert [frame["name"] for frame in report["frames"]] == [
-        f"f{number}.png" for number in range(1, COUNT + 1)
-    ]
-    assert report["worst"]["error"] == max(frame["error"] for frame in report["frames"])
-    assert json.loads(listed.read_text())["frames"] == report["frames"]
-    assert program(*common, "--resume").out.splitlines()[1].split()[:3] == [str(COUNT), "0", "-"]
-    advice = program("compensate", transport, film, "--out", tmp_path / "b", "--gain", "2").err
-    assert all(part in advice for part in (f"{COUNT} frame(s)", "--gain"))
-
-
-def test_a_video_comes_back_as_one(program, colour_transport, tmp_path):
-    film, out, video = tmp_path / "film.avi", tmp_path / "out", tmp_path / "made.mkv"
-    write_video(film, np.random.default_rng(6).uniform(0.05, 0.08, (3, 4, 12)), fps=12.0)
-    common = ["compensate", colour_transport, film, "--out", out, "--batch", "2", "--video", video]
-    outcome = program(*common, "--high", "9", "--gain", "auto", "--appearance", "--format", "exr")
-    assert str(video) in outcome.out
-    source = open_frames(video)
-    assert (source.count, source.fps) == (3, pytest.approx(12.0))
-    for frame in source:
-        codes = images.to_srgb(images.read(out / f"pattern_{frame.number:06}.exr") / 9.0)
-        np.testing.assert_allclose(images.to_srgb(frame.picture()), codes, atol=0.6 / 255)
-        assert images.read(out / f"appearance/appearance_{frame.number:06}.exr").shape == (4, 12, 3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl compensate` with an acquired transport: the codes for its projector, and what is seen then."""
+"""`ltcl compensate` with a measured transport: codes for its projector, and the scene under them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from ltcl.images.frames import open_frames
 from .conftest import write
 
 y, x = np.mgrid[:4, :8] / 8
-DESIRED = (0.6 + 0.3 * np.sin(7 * x + 4 * y)).astype(np.float32)  # bright enough for this room
+# Bright enough for this room.
+DESIRED = (0.6 + 0.3 * np.sin(7 * x + 4 * y)).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -40,101 +41,97 @@ def waves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def compensated(program, store: Path, waves: Path) -> Any:
-    """The folder, and what was printed."""
+    """The folder, and the printed text."""
     out = waves.parent / "out"
     return out, program("compensate", store, waves, "--out", out, "--rtol", "1e-3").out
 
 
-def codes_in(path: Path) -> np.ndarray:
-    """Codes of a projector in a picture file."""
+def read_codes(path: Path) -> np.ndarray:
+    """Read the codes of a projector from a picture file, in [0, 1]."""
     stored = images.read_codes(path)
     return stored / np.float32(np.iinfo(stored.dtype).max)
 
 
-def error_of(codes: np.ndarray, rig: Any) -> float:
-    """Of what is seen under these codes, at the brightness at which it comes closest to the picture."""
+def relative_error(codes: np.ndarray, rig: Any) -> float:
+    """Return the error of the scene under these codes, at the brightness with the least error."""
     seen = rig.radiance(codes)
     scale = np.vdot(seen, DESIRED) / np.vdot(seen, seen)
     return float(np.linalg.norm(scale * seen - DESIRED) / np.linalg.norm(DESIRED))
 
 
-def test_what_is_projected_looks_like_the_picture(
-    program, store, waves, compensated, tmp_path, rig
-):
-    """In the room with its light; a pattern in sRGB, or without the ambient light, would not."""
+def test_the_scene_under_the_pattern_looks_like_the_picture(store, compensated, rig):
+    """The room has light of its own; a pattern in sRGB would fail."""
     out, printed = compensated
     report = json.loads((out / "compensate.json").read_text())
+    assert report["options"]["gain"] == "auto"
+    assert report["options"]["background"] == "measured"
+    for text in ("codes of the measured projector", "background"):
+        assert text in printed
     (entry,) = report["pictures"]
-    assert (report["options"]["gain"], report["options"]["background"]) == ("auto", "measured")
-    assert all(text in printed for text in ("codes of the measured projector", "background"))
-    pattern, codes = (
-        images.read(out / entry["pattern"]["exr"]),
-        codes_in(out / entry["pattern"]["png"]),
-    )
-    assert (entry["clipped"], pattern.max()) == (
-        0,
-        pytest.approx(1.0, abs=1e-3),
-    )  # as bright as can be
-    assert error_of(codes, rig) < 0.015
-    assert error_of(images.to_srgb(pattern), rig) > 0.05
+    pattern = images.read(out / entry["pattern"]["exr"])
+    codes = read_codes(out / entry["pattern"]["png"])
+    assert entry["clipped"] == 0
+    # The gain is the largest.
+    assert pattern.max() == pytest.approx(1.0, abs=1e-3)
+    assert relative_error(codes, rig) < 0.015
+    assert relative_error(images.to_srgb(pattern), rig) > 0.05
     np.testing.assert_allclose(codes, Setup.of(store).codes(pattern), atol=0.6 / 255)
-    none = write(tmp_path / "none.exr", np.zeros((4, 8)))
-    assert (
-        "background"
-        not in program("compensate", store, waves, "--out", tmp_path, "--background", none).out
-    )
-    assert error_of(codes_in(tmp_path / "waves_pattern.png"), rig) > 0.02
+
+
+def test_a_background_replaces_the_measured_one(program, store, waves, tmp_path, rig):
+    black = write(tmp_path / "black.exr", np.zeros((4, 8)))
+    arguments = [store, waves, "--out", tmp_path, "--background", black]
+    assert "the background is" not in program("compensate", *arguments).out
+    assert relative_error(read_codes(tmp_path / "waves_pattern.png"), rig) > 0.02
 
 
 def test_codes_of_a_pattern_are_relit_as_its_light(program, store, compensated, tmp_path):
-    seen, (out, _) = [], compensated
+    out, _ = compensated
+    relit = {}
     for extension in ("exr", "png"):
-        arguments = [store, out / f"waves_pattern.{extension}", "--out", tmp_path / extension]
-        assert program("relight", *arguments).code == 0
-        seen.append(images.read(tmp_path / extension / "waves_pattern_relit.exr"))
-    np.testing.assert_allclose(seen[1], seen[0], rtol=0.02)
+        folder = tmp_path / extension
+        pattern = out / f"waves_pattern.{extension}"
+        assert program("relight", store, pattern, "--out", folder).code == 0
+        relit[extension] = images.read(folder / "waves_pattern_relit.exr")
+    np.testing.assert_allclose(relit["png"], relit["exr"], rtol=0.02)
     appearance = images.read(out / "waves_appearance.exr")
-    np.testing.assert_allclose(seen[0] + Setup.of(store).ambient, appearance, rtol=1e-4)
+    np.testing.assert_allclose(relit["exr"] + Setup.of(store).ambient, appearance, rtol=1e-4)
 
 
 def test_frames_and_videos_hold_codes(program, store, tmp_path, rig):
     write(tmp_path / "frames" / "0.exr", DESIRED)
-    arguments = [
-        store,
-        tmp_path / "frames",
-        "--out",
-        tmp_path / "out",
-        "--video",
-        tmp_path / "out.mkv",
-    ]
-    assert program("compensate", *arguments).code == 0
-    codes = codes_in(tmp_path / "out" / "pattern_000001.png")
-    assert error_of(codes, rig) < 0.015
-    shown = next(iter(open_frames(tmp_path / "out.mkv", encoding="linear"))).picture()
+    out = tmp_path / "out"
+    video = tmp_path / "out.mkv"
+    assert program("film", store, tmp_path / "frames", "--out", out, "--video", video).code == 0
+    codes = read_codes(out / "pattern_000001.png")
+    assert relative_error(codes, rig) < 0.015
+    shown = next(iter(open_frames(video, encoding="linear"))).picture()
     np.testing.assert_allclose(shown, codes, atol=1.1 / 255)
 
 
-def test_a_copy_is_told_where_its_calibration_is(program, store, waves, transport, tmp_path, rig):
-    for name, command in {
-        "compress": ["compress", store, "--out"],
-        "convert": ["convert", store],
-    }.items():
-        copy = tmp_path / f"{name}.npz"
-        assert f"--calibration {store}" in program(*command, copy, "--json").err
-        out = ["--calibration", store, "--rtol", "0.02", "--out", tmp_path / "out"]
-        assert program("compensate", copy, waves, *out).code == 0
-        assert error_of(codes_in(tmp_path / "out" / "waves_pattern.png"), rig) < 0.04
-    arguments = [waves, "--out", tmp_path / "no", "--calibration"]
-    program("compensate", transport, *arguments, store).refused("(4, 8)", "(5, 10)")
-    program("compensate", tmp_path / "convert.npz", *arguments, tmp_path / "none.zarr").refused(
-        "none.zarr: "
-    )
+@pytest.mark.parametrize("name", ["compress", "convert"])
+def test_a_copy_takes_the_calibration_of_its_store(program, store, waves, tmp_path, rig, name):
+    copy = tmp_path / "copy.npz"
+    target = ["--out", copy] if name == "compress" else [copy]
+    assert f"--calibration {store}" in program(name, store, *target, "--json").err
+    options = ["--calibration", store, "--rtol", "0.02", "--out", tmp_path / "out"]
+    assert program("compensate", copy, waves, *options).code == 0
+    codes = read_codes(tmp_path / "out" / "waves_pattern.png")
+    assert relative_error(codes, rig) < 0.04
+
+
+def test_a_wrong_calibration_is_refused(program, store, waves, transport, tmp_path):
+    common = [waves, "--out", tmp_path / "no", "--calibration"]
+    program("compensate", transport, *common, store).refused("(4, 8)", "(5, 10)")
+    nowhere = tmp_path / "none.zarr"
+    program("compensate", transport, *common, nowhere).refused("none.zarr: ")
 
 
 def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
-    """Without having to be asked for, since nobody could change it."""
-    T, store = 0.5 * np.eye(32), tmp_path / "T.zarr"
+    """Nobody has to ask for it, since nobody could change it."""
+    T = 0.5 * np.eye(32)
     T[5, 5] = 0.0
+    store = tmp_path / "T.zarr"
     rig = ltcl.acquisition.VirtualRig(T, (4, 8), bits=12, ambient=0.01)
     ltcl.acquire(rig, geometry="aligned", strategy="pixel", store=store)
     grey = write(tmp_path / "grey.exr", np.full((4, 8), 0.5))

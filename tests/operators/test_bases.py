@@ -143,6 +143,7 @@ assert abs(Tiles(device, scipy.sparse.csr_array(A)) @ x - A @ x).max() < 0.01
 """
 
 
+@pytest.mark.slow
 def test_small_work_groups_will_do_in_the_shape_of_a_gpu():
     environment = {
         **os.environ,

@@ -77,8 +77,17 @@ def three_times_as_fast(device: Device, *_: Any) -> float:
     return 1.0 if device.description.index == "all" else 3.0
 
 
-@pytest.mark.parametrize("kind", MATRICES)
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(
+    ("kind", "channels"),
+    [
+        ("dense", 3),
+        ("sparse", 1),
+        ("stored", 1),
+        pytest.param("dense", 1, marks=pytest.mark.slow),
+        pytest.param("sparse", 3, marks=pytest.mark.slow),
+        pytest.param("stored", 3, marks=pytest.mark.slow),
+    ],
+)
 def test_all_devices_give_the_answer_of_one(two, monkeypatch, kind, channels):
     monkeypatch.setattr(tuning, "seconds", three_times_as_fast)
     make = MATRICES[kind]

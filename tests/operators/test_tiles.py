@@ -112,7 +112,9 @@ def _fewest(places: list[int], width: int) -> int:
     if not places:
         return 0
     counts = []
-    for first in (places[0] - 1, places[0]):
+    # The last two stretches that hold the first place.
+    firsts = range(places[0] - width + 1, places[0] + 1)
+    for first in firsts[-2:]:
         left = [place for place in places if place >= first + width]
         counts.append(_fewest(left, width))
     return 1 + min(counts)

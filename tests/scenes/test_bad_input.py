@@ -13,8 +13,8 @@ import pytest
 from ltcl.errors import InputError, InputTypeError
 from ltcl.scenes import Block, FormFactor, box, cut, dihedral, glossy, trihedral, visibility
 from ltcl.scenes.builders import WALLS
-from ltcl.scenes.scene import transport
-from ltcl.scenes.viewer import Viewer, frame
+from ltcl.scenes.camera import SceneCamera, frame
+from ltcl.scenes.scene import transport_matrix
 from ltcl.scenes.walls import Wall, refuse_crossing
 
 FLOOR, SCREEN = WALLS[2], Wall("screen", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1))
@@ -45,7 +45,7 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: box(2, occluder=Block((0.8, 0, 0), (0.3, 0.1, 0.1))), "reaches from .* out of"),
     (lambda: box(2, occluder=Block((0, 0, 0), (1, 1, 1))), "occluder fills the room"),
     (lambda: box(2, occluder=(0.1, 0.1)), "occluder is .*ltcl.scenes.Block"),  # pyright: ignore[reportArgumentType]
-    (lambda: transport(ONE, np.full(2, 1 - 1e-9), np.ones(2)), "gain of 1 or more"),
+    (lambda: transport_matrix(ONE, np.full(2, 1 - 1e-9), np.ones(2)), "gain of 1 or more"),
     (
         lambda: replace(CORNER, grid=(4, 15)),
         r"form_factors has shape \(75, 75\); it must be \(60, 60\)",
@@ -56,7 +56,7 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: SHADED.irradiance((0.5, 0.5)), r"light is \(0.5, 0.5\)"),
     (lambda: SHADED.irradiance((0.5, -0.5, 0.5)), "reaches no patch"),  # behind the left wall
     (lambda: SHADED.irradiance((0.45, 0.45, 0.45)), "inside a block; move it out"),
-    (lambda: frame(Viewer((1, 1, 3), (1, 1, 0)), [SCREEN]), "straight up or down"),
+    (lambda: frame(SceneCamera((1, 1, 3), (1, 1, 0)), [SCREEN]), "straight up or down"),
     (lambda: Wall("flat", (0, 0, 0), (1, 0, 0), (2, 0, 0)), "wall 'flat' .* no area"),
     (lambda: Block((0, 0, 0), (0.1, 0, 0.1)), r"block size is \(0.1, 0.0, 0.1\)"),
     (lambda: shine(gloss=-0.1), "gloss is -0.1"),

@@ -8,7 +8,7 @@ import pytest
 
 from ltcl.scenes import cut
 from ltcl.scenes.builders import WALLS
-from ltcl.scenes.exchange import form_factors, of_pairs, of_walls
+from ltcl.scenes.exchange import exchange_of_walls, form_factors, form_factors_of_pairs
 from ltcl.scenes.walls import Vector, Wall
 from tests.scenes.closed_forms import closed_room, parallel, perpendicular, sampled, slope
 
@@ -35,10 +35,10 @@ def test_faces_of_the_cube_meet_the_closed_forms(n: int) -> None:
 @pytest.mark.parametrize("angle", [1, 20, 60, 89.999, 135, 179])
 def test_coarse_patches_average_fine_ones(angle: float) -> None:
     """6 x 6 patches add up to 2 x 2 and to whole walls, though other formulas serve other pairs."""
-    fine = of_walls(slope(angle), FLOOR, 6)
+    fine = exchange_of_walls(slope(angle), FLOOR, 6)
     for n in (1, 2):
         coarse = fine.reshape(4 * [n, 6 // n]).sum(axis=(1, 3, 5, 7))
-        np.testing.assert_allclose(coarse, of_walls(slope(angle), FLOOR, n), rtol=1e-7)
+        np.testing.assert_allclose(coarse, exchange_of_walls(slope(angle), FLOOR, n), rtol=1e-7)
 
 
 TEN_TIMES = [X, (0, 0.1, 0), (0.1, 0, 1)]  # patches ten times as long as wide
@@ -57,7 +57,9 @@ def test_closed_rooms_lose_no_light(edges: list[Vector], n: int) -> None:
     np.testing.assert_allclose(area[:, None] * F, (area[:, None] * F).T, rtol=1e-14)
     if n < 9:  # pairs of a list take outlines, however far
         i, j = np.nonzero(F)
-        np.testing.assert_allclose(of_pairs(cut(walls, n), i, j), F[i, j], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            form_factors_of_pairs(cut(walls, n), i, j), F[i, j], rtol=1e-6, atol=1e-12
+        )
 
 
 # No edge in common with the others, cut by their planes and not square.
@@ -69,7 +71,7 @@ SCREEN = Wall("screen", (0.2, 0.3, 0.9), (0.3, 0.5, -0.2), (0.1, -0.1, -0.6))
 )
 def test_walls_at_any_angle_agree_with_sampling(walls: tuple[Wall, Wall]) -> None:
     mean, error = sampled(*walls, samples=400_000)
-    assert of_walls(*walls, 2).sum() == pytest.approx(mean, abs=5 * error)
+    assert exchange_of_walls(*walls, 2).sum() == pytest.approx(mean, abs=5 * error)
 
 
 def test_a_long_wedge_takes_what_its_opening_lets_go() -> None:
@@ -79,7 +81,8 @@ def test_a_long_wedge_takes_what_its_opening_lets_go() -> None:
     ]
     for angle in (20, 60, 90, 150):
         short, long = (
-            of_walls(slope(angle, width=f.right[1]), f, 1).item() / f.right[1] for f in floors
+            exchange_of_walls(slope(angle, width=f.right[1]), f, 1).item() / f.right[1]
+            for f in floors
         )
         edge = 2 * long - short
         assert edge == pytest.approx(1 - np.sin(np.radians(angle / 2)), abs=2e-4)

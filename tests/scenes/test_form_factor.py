@@ -123,8 +123,8 @@ def test_launches_in_slabs_give_the_same(device, monkeypatch):
     patches = cut(WALLS, 3)
     A, x = FormFactor(patches, 0.5, device=device), device.upload(gallery.vectors(54, 5))
     whole, seen = A.apply(x).get(), visibility(patches, BLOCK, device)
-    monkeypatch.setattr("ltcl.scenes.form_factor._LAUNCH", 7 * 56)
-    monkeypatch.setattr(sys.modules[Rays.__module__], "_LAUNCH", 54 * 16 * 7)
+    monkeypatch.setattr("ltcl.scenes.form_factor.PAIRS_PER_LAUNCH", 7 * 56)
+    monkeypatch.setattr(sys.modules[Rays.__module__], "TESTS_PER_LAUNCH", 54 * 16 * 7)
     helpers.same_rows(
         device, whole, A.apply(x).get(), reference.product_error(A.to_dense(), x.get())
     )

@@ -8,15 +8,15 @@ import pytest
 
 from ltcl.scenes import Block, box, cut, trihedral
 from ltcl.scenes.builders import WALLS
+from ltcl.scenes.camera import SceneCamera, draw, frame, read
 from ltcl.scenes.rays import cast, clear, sight
-from ltcl.scenes.viewer import Viewer, draw, frame, read
 from ltcl.scenes.walls import Wall
 from tests import reference
 
 FLOOR = WALLS[2]
 # A unit screen one unit in front of an eye that looks along +y: x to the right, z up.
 SCREEN = Wall("screen", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1))
-EYE = Viewer(eye=(0.5, 0, 0.5), target=(0.5, 1, 0.5))
+EYE = SceneCamera(eye=(0.5, 0, 0.5), target=(0.5, 1, 0.5))
 
 
 def test_blocks_stop_rays_as_the_twin_says() -> None:
@@ -58,7 +58,9 @@ def test_sight_is_in_the_frame_of_each_patch_and_keeps_to_shadows() -> None:
 
 def test_a_pinhole_shows_a_screen_as_it_is() -> None:
     """Seen straight, one patch a pixel: drawing reproduces the picture inside a margin of 3 %."""
-    near, far = (frame(eye, [SCREEN]).size for eye in (EYE, Viewer((0.5, -3, 0.5), EYE.target)))
+    near, far = (
+        frame(eye, [SCREEN]).size for eye in (EYE, SceneCamera((0.5, -3, 0.5), EYE.target))
+    )
     assert far == pytest.approx(near / 4)
     picture = np.random.default_rng(0).random((100, 100)).astype(np.float32)
     image = draw(EYE, [SCREEN], picture, size=106, supersample=1)
@@ -77,7 +79,10 @@ def test_a_pinhole_shows_a_screen_as_it_is() -> None:
 @pytest.mark.parametrize("size", [61, 200])
 def test_reading_undoes_drawing_of_smooth_pictures(size: int) -> None:
     """Also seen at an angle and for any rounding of the image's height; negative values pass."""
-    oblique, (y, x) = Viewer(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5)), np.mgrid[:16, :16] / 16
+    oblique, (y, x) = (
+        SceneCamera(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5)),
+        np.mgrid[:16, :16] / 16,
+    )
     picture = np.stack([np.sin(3 * x) - 0.5, x * y, 1 - y], axis=-1).astype(np.float32)
     seen = read(
         oblique, [SCREEN], draw(oblique, [SCREEN], picture, size, supersample=4), grid=(16, 16)

@@ -17,7 +17,7 @@ from ltcl.device import Device
 from ltcl.errors import MemoryLimitError
 from ltcl.scenes import Block, Scene, box, cut, dihedral, landscape, trihedral
 from ltcl.scenes.builders import WALLS
-from ltcl.scenes.scene import transport
+from ltcl.scenes.scene import transport_matrix
 from ltcl.scenes.walls import spread_albedo
 from ltcl.transport.diagnostics import other_grid
 from tests.scenes.closed_forms import sampled
@@ -58,7 +58,7 @@ def test_transport_of_unequal_patches(size: int) -> None:
     albedo = rng.uniform(0, 0.99, size)
     albedo[:: max(1, size // 3)] = 0
     before = F.copy()
-    T = transport(F, albedo, area)
+    T = transport_matrix(F, albedo, area)
     np.testing.assert_allclose(T - albedo[:, None] * (F @ T), np.diag(albedo), rtol=0, atol=1e-13)
     np.testing.assert_allclose(area[:, None] * T, (area[:, None] * T).T, rtol=0, atol=1e-13)
     assert not T[albedo == 0].any()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Forecasts against closed forms."""
+"""Forecasts of products against closed forms."""
 
 from __future__ import annotations
 

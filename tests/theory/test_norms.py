@@ -61,7 +61,7 @@ def test_a_few_steps_bring_the_bounds_together(device, spectrum):
 
 
 def test_the_bound_fails_as_often_as_it_may(device):
-    """One step of one start and even odds: the bound is sharp where one value stands alone."""
+    """The bound of one step and one start is sharp if one value is far above all others."""
     n = 40
     runs = 400
     A = Dense(device, np.diag(np.r_[1.0, np.zeros(n - 1) + 1e-3]))

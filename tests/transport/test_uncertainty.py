@@ -42,7 +42,7 @@ def within(ratios: Any) -> np.ndarray:
 
 
 def calibrated(ratios: Any, rtol: float = 1.0) -> bool:
-    """Whether 68 % and 95 % of errors are within one and two deviations, as of normal errors."""
+    """True if 68 % and 95 % of errors are within one and two deviations, as of normal errors."""
     return bool((np.abs(within(ratios) - (0.68, 0.95)) < rtol * np.array([0.07, 0.04])).all())
 
 

@@ -14,7 +14,7 @@ TYPES = {"f4": "<f4", "u1": "u1"}
 
 
 def question(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str | bytes:
-    """A frame; arrays (h, w, c), numbers as they are."""
+    """Make a frame with arrays (h, w, c), their numbers as they are."""
     if not arrays:
         return json.dumps(header)
     kinds = {name: f"{array.dtype.kind}{array.dtype.itemsize}" for name, array in arrays.items()}
@@ -30,7 +30,7 @@ def question(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str | byt
 
 
 def answer(message: str | bytes) -> dict[str, Any]:
-    """A header with its arrays, float64, by their names."""
+    """Return a header with its arrays, float64, by their names."""
     if isinstance(message, str):
         return json.loads(message)
     start = 4 + int.from_bytes(message[:4], "little")
@@ -45,12 +45,13 @@ def answer(message: str | bytes) -> dict[str, Any]:
 
 
 class Page:
-    """A socket to a viewer, with what it said first."""
+    """A socket to a viewer, with its first message."""
 
     def __init__(self, url: str, **settings: Any) -> None:
         origin = "/".join(url.split("/")[:3])
         settings = {"origin": origin, "max_size": None, "compression": None, **settings}
-        self.url, self.origin = url, origin
+        self.url = url
+        self.origin = origin
         self._opened = contextlib.ExitStack()
         opening = connect(url.replace("http", "ws", 1) + "socket", **settings)
         self.socket: ClientConnection = self._opened.enter_context(opening)
@@ -64,17 +65,17 @@ class Page:
         self._opened.close()
 
     def send(self, do: str, arrays: dict[str, np.ndarray] | None = None, **fields: Any) -> int:
-        """Ask without waiting; the number of the question."""
+        """Ask without waiting; return the number of the question."""
         self.asked += 1
         self.socket.send(question({"id": self.asked, "do": do, **fields}, arrays or {}))
         return self.asked
 
     def next(self) -> dict[str, Any]:
-        """What comes next."""
+        """Return the next message."""
         return answer(self.socket.recv(timeout=60))
 
     def ask(self, do: str, arrays: Any = None, **fields: Any) -> dict[str, Any]:
-        """The answer to a question; what comes before it is left out."""
+        """Return the answer to a question, without the messages before it."""
         number = self.send(do, arrays, **fields)
         while (found := self.next()).get("id") != number or found["do"] != do:
             pass

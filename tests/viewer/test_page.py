@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import threading
 import time
@@ -21,38 +20,18 @@ from ltcl.images import to_srgb
 from ltcl.images.encoding import to_linear
 from ltcl.show.window import Window
 from ltcl.viewer import server
+from ltcl.viewer.answers import ViewerScene
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.server import Viewer
 
 pytest.importorskip("playwright", reason='playwright is not installed: pip install "ltcl[test]"')
 
-from playwright.sync_api import Browser, Locator, Page, sync_playwright
+from playwright.sync_api import Browser, Locator, Page
 
-FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-FLAGS += [
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-]
+pytestmark = pytest.mark.slow
 PATIENCE = 20.0  # seconds
 VIEWS = ("probe", "bounces", "relight", "compensate")
 ALBEDO = (0.8, 0.5, 0.3)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    chromium = (
-        shutil.which("chromium")
-        or shutil.which("chromium-browser")
-        or shutil.which("google-chrome")
-    )
-    if chromium is None:
-        pytest.skip("Chromium is not installed (Debian: apt install chromium)")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -71,15 +50,21 @@ def picture(corner: ltcl.scenes.Scene) -> np.ndarray:
 
 
 @pytest.fixture
-def viewer(T: ltcl.Transport, picture: np.ndarray) -> Iterator[Any]:
-    with ltcl.view(T, {"landscape": picture}, open_browser=False) as viewer:
+def scene(T: ltcl.Transport, picture: np.ndarray) -> ViewerScene:
+    return ViewerScene(T, "corner", {"landscape": picture}, None)
+
+
+@pytest.fixture
+def viewer(scene: ViewerScene) -> Iterator[Viewer]:
+    with Viewer(scene, open_browser=False) as viewer:
         yield viewer
 
 
 @pytest.fixture
 def page(browser: Browser, viewer: Any) -> Iterator[Page]:
     with browser.new_context(viewport={"width": 1280, "height": 800}) as context:
-        page, wrong = context.new_page(), []
+        page = context.new_page()
+        wrong: list[str] = []
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on(
             "console",
@@ -97,7 +82,7 @@ def visit(page: Page, viewer: Any, view: str) -> None:
 
 
 def pixels(page: Page, name: str) -> tuple[np.ndarray, float]:
-    """Codes of a canvas, (h, w, 3), and the light that is shown as white."""
+    """Return the codes of a canvas, (h, w, 3), and the light that is shown as white."""
     canvas(page, name).wait_for(state="attached")
     codes, shape, white = page.evaluate(
         """(name) => { const c = document.getElementById(name + "-canvas");
@@ -113,7 +98,9 @@ def shows(
 ) -> None:
     """Wait until a canvas has these pixels, to `atol` codes; fail with the difference."""
     light = np.broadcast_to(light if light.ndim == 3 else light[..., None], (*light.shape[:2], 3))
-    deadline, codes, expected = time.monotonic() + PATIENCE, np.inf, np.zeros(1)
+    deadline = time.monotonic() + PATIENCE
+    codes: Any = np.inf
+    expected = np.zeros(1)
     while time.monotonic() < deadline:
         codes, white = pixels(page, name)
         value = light / white
@@ -133,12 +120,13 @@ def canvas(page: Page, name: str) -> Locator:
 
 
 def at(page: Page, name: str, row: int, col: int, grid: tuple[int, int]) -> tuple[float, float]:
-    """The middle of a pixel of a canvas, on the page."""
+    """Return the middle of a pixel of a canvas, on the page."""
     box = canvas(page, name).bounding_box()
     assert box is not None
-    return box["x"] + (col + 0.5) / grid[1] * box["width"], box["y"] + (row + 0.5) / grid[0] * box[
-        "height"
-    ]
+    height, width = grid
+    x = box["x"] + (col + 0.5) / width * box["width"]
+    y = box["y"] + (row + 0.5) / height * box["height"]
+    return x, y
 
 
 def unit(grid: tuple[int, int], row: int, col: int) -> np.ndarray:
@@ -148,7 +136,7 @@ def unit(grid: tuple[int, int], row: int, col: int) -> np.ndarray:
 
 
 def row_of(T: ltcl.Transport, row: int, col: int) -> np.ndarray:
-    """What each projector pixel adds to a camera pixel, (h, w, 3)."""
+    """Return the light of each projector pixel in a camera pixel, (h, w, 3)."""
     i = row * T.camera_grid[1] + col
     return np.stack([np.reshape(np.asarray(matrix)[i], T.grid) for matrix in T.matrices], axis=-1)
 
@@ -176,7 +164,9 @@ def test_probe_by_pointer_shows_columns_and_rows(page: Page, T: ltcl.Transport) 
 
 def test_probe_by_keys(page: Page, T: ltcl.Transport) -> None:
     canvas(page, "probe-projector").focus()
-    row, col = T.grid[0] // 2, T.grid[1] // 2
+    height, width = T.grid
+    row = height // 2
+    col = width // 2
     shows(page, "probe-camera", T @ unit(T.grid, row, col))
     for key in ("ArrowDown", "ArrowLeft", "ArrowLeft"):
         page.keyboard.press(key)
@@ -267,11 +257,13 @@ def test_film_builds_the_picture_bounce_by_bounce(
 def test_uncertainty_is_an_overlay(
     browser: Browser, corner: ltcl.scenes.Scene, picture: np.ndarray
 ) -> None:
-    random, clean = np.random.default_rng(5), corner.transport()
-    noisy = [
-        np.asarray(matrix) + 2e-3 * random.standard_normal(clean.shape) for matrix in clean.matrices
-    ]
-    T = ltcl.Transport([matrix.astype(np.float32) for matrix in noisy], grid=corner.grid)
+    random = np.random.default_rng(5)
+    clean = corner.transport()
+    noisy = []
+    for matrix in clean.matrices:
+        entries = np.asarray(matrix) + 2e-3 * random.standard_normal(clean.shape)
+        noisy.append(entries.astype(np.float32))
+    T = ltcl.Transport(noisy, grid=corner.grid)
     b = ltcl.separate(T, picture, 1)
     with browser.new_context() as context, ltcl.view(T, picture, open_browser=False) as viewer:
         page = context.new_page()
@@ -285,8 +277,11 @@ def test_uncertainty_is_an_overlay(
         page.locator("#bounces-uncertain").check()
         page.wait_for_timeout(200)
         pink = pixels(page, "bounces-mix")[0]
-    light, sigma = b.bounces[0] / white, np.max(b.std.bounces[0] / white, axis=2)
-    size = np.where(-light.min(axis=2) > light.max(axis=2), light.min(axis=2), light.max(axis=2))
+    light = b.bounces[0] / white
+    sigma = np.max(b.std.bounces[0] / white, axis=2)
+    lowest = light.min(axis=2)
+    highest = light.max(axis=2)
+    size = np.where(-lowest > highest, lowest, highest)
     strength = 0.9 * np.clip(sigma / np.maximum(abs(size), 1e-4), 0, 1)[..., None]
     assert strength.max() > 0.2
     expected = plain * (1 - strength) + 255 * np.array([1.0, 0.2, 0.75]) * strength
@@ -332,7 +327,8 @@ def test_painting_by_keys(page: Page, T: ltcl.Transport) -> None:
     page.keyboard.press("ArrowRight")
     page.keyboard.up(" ")
     page.keyboard.press("ArrowDown")
-    light, (h, w) = painted(page), T.grid
+    light = painted(page)
+    h, w = T.grid
     assert (light[h // 2 - 1, w // 2 : w // 2 + 3] > 0.5).all()
     assert not light[h // 2 :].any()
     shows(page, "relight-seen", T @ light)
@@ -368,7 +364,8 @@ def test_a_video_relights_as_it_plays(page: Page, T: ltcl.Transport, tmp_path: P
     (tmp_path / "broken.mp4").write_bytes(b"no video")
     page.locator("#tab-relight").click()
     page.locator("#relight-file").set_input_files(tmp_path / "v.webm")
-    seen, deadline = set[int](), time.monotonic() + PATIENCE
+    seen: set[int] = set()
+    deadline = time.monotonic() + PATIENCE
     while len(seen) < 4:
         assert time.monotonic() < deadline
         light = painted(page)
@@ -382,16 +379,14 @@ def test_a_video_relights_as_it_plays(page: Page, T: ltcl.Transport, tmp_path: P
 
 
 class Late:
-    """The first answer of a kind comes when `come` is set; `asked` is set when it has been computed."""
+    """The first answer of a kind waits for `come`; `asked` is set when it has been computed."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, viewer: Any, do: str) -> None:
-        self.come, self.asked, self._answer = (
-            threading.Event(),
-            threading.Event(),
-            viewer._scene.answer,
-        )
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, scene: ViewerScene, do: str) -> None:
+        self.come = threading.Event()
+        self.asked = threading.Event()
         self._do = do
-        monkeypatch.setattr(viewer._scene, "answer", self)
+        self._answer = scene.answer
+        monkeypatch.setattr(scene, "answer", self)
 
     def __call__(self, do: str, asked: dict[str, Any], callback: Any) -> Any:
         reply = self._answer(do, asked, lambda *_: None)
@@ -402,15 +397,19 @@ class Late:
 
 
 def settle(page: Page) -> None:
-    """All is answered, and nothing is asked because of it."""
+    """Wait until all questions are answered, and no answer has led to another question."""
     page.wait_for_timeout(300)
     page.wait_for_selector("body[data-state=ready]")
 
 
 def test_a_late_pattern_of_the_server_replaces_nothing(
-    page: Page, viewer: Any, T: ltcl.Transport, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    page: Page,
+    scene: ViewerScene,
+    T: ltcl.Transport,
+    picture: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    late = Late(monkeypatch, viewer, "relight")
+    late = Late(monkeypatch, scene, "relight")
     page.locator("#tab-relight").click()
     assert late.asked.wait(PATIENCE)
     page.locator("#relight-source").select_option("landscape")
@@ -418,19 +417,20 @@ def test_a_late_pattern_of_the_server_replaces_nothing(
     shows(page, "relight-seen", T @ picture)
     settle(page)
     shows(page, "relight-seen", T @ picture)
-    np.testing.assert_allclose(viewer._scene.pattern, picture, atol=1e-6)
+    np.testing.assert_allclose(scene.pattern, picture, atol=1e-6)
 
-    viewer._scene.pattern = white = np.ones(T.grid, np.float32)
+    white = np.ones(T.grid, np.float32)
+    scene.pattern = white
     page.locator("#tab-probe").click()
     settle(page)
-    late = Late(monkeypatch, viewer, "relight")
+    late = Late(monkeypatch, scene, "relight")
     page.locator("#tab-relight").click()
     assert late.asked.wait(PATIENCE)
     page.locator("#tab-probe").click()  # where nothing is to be painted
     late.come.set()
     settle(page)
-    assert viewer._scene.pattern is white
-    late = Late(monkeypatch, viewer, "relight")
+    assert scene.pattern is white
+    late = Late(monkeypatch, scene, "relight")
     page.locator("#tab-relight").click()
     assert late.asked.wait(PATIENCE)
     page.locator("#relight-colour").fill("#00ff00")
@@ -440,15 +440,19 @@ def test_a_late_pattern_of_the_server_replaces_nothing(
     shows(page, "relight-seen", T @ green)
     settle(page)
     np.testing.assert_array_equal(painted(page), green)
-    np.testing.assert_allclose(viewer._scene.pattern, green)
+    np.testing.assert_allclose(scene.pattern, green)
 
 
 def test_late_bounces_leave_newer_sliders(
-    page: Page, viewer: Any, T: ltcl.Transport, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    page: Page,
+    scene: ViewerScene,
+    T: ltcl.Transport,
+    picture: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     page.locator("#tab-bounces").click()
     shows(page, "bounces-mix", picture)
-    late = Late(monkeypatch, viewer, "bounces")
+    late = Late(monkeypatch, scene, "bounces")
     page.locator("#tab-probe").click()
     page.locator("#tab-bounces").click()
     assert late.asked.wait(PATIENCE)
@@ -463,9 +467,10 @@ def test_late_compensation_is_not_that_of_another_picture(
     browser: Browser, T: ltcl.Transport, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dim = 0.5 * picture[::-1]
-    pictures = {"bright": picture, "dim": dim}
-    with browser.new_context() as context, ltcl.view(T, pictures, open_browser=False) as viewer:
-        page, late = context.new_page(), Late(monkeypatch, viewer, "compensate")
+    scene = ViewerScene(T, "corner", {"bright": picture, "dim": dim}, None)
+    late = Late(monkeypatch, scene, "compensate")
+    with browser.new_context() as context, Viewer(scene, open_browser=False) as viewer:
+        page = context.new_page()
         page.goto(f"{viewer.url}#compensate")
         assert late.asked.wait(PATIENCE)
         page.evaluate(
@@ -536,7 +541,8 @@ def test_projector_window_shows_what_is_painted(page: Page, T: ltcl.Transport) -
     page.locator("#relight-clear").click()
     page.locator("#relight-colour").fill("#3060c0")
     page.locator("#relight-fill").click()
-    deadline, codes = time.monotonic() + PATIENCE, []
+    deadline = time.monotonic() + PATIENCE
+    codes: list[int] = []
     while time.monotonic() < deadline and codes[:3] != [0x30, 0x60, 0xC0]:
         codes = window.evaluate(
             "[...document.getElementById('show').getContext('2d').getImageData(3, 2, 1, 1).data]"
@@ -596,7 +602,7 @@ def test_server_is_killed_and_started_again(
 def test_a_page_too_many_is_told_so_and_comes_in_later(
     page: Page, viewer: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "PAGES", 1)
+    monkeypatch.setattr(server, "MAX_PAGES", 1)
     other = page.context.new_page()
     other.goto(viewer.url)
     other.get_by_text("1 pages are open here").wait_for()
@@ -608,7 +614,8 @@ def test_a_page_too_many_is_told_so_and_comes_in_later(
 def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
     text = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
     (tmp_path / "acquisition.toml").write_text(text)
-    rig, codes = FolderRig(tmp_path, (4, 6)), np.arange(240, dtype=np.uint8).reshape(12, 20)
+    rig = FolderRig(tmp_path, (4, 6))
+    codes = np.arange(240, dtype=np.uint8).reshape(12, 20)
     rig.prepare([(np.ones((4, 6)), 0.5), (np.zeros((4, 6)), 0.5)])
     first, second = (tmp_path / f"{shot.save_as}.png" for shot in rig.shots)
     ltcl.images.write(first, codes / 255, encoding="linear", bits=8)
@@ -728,9 +735,8 @@ def test_phone(browser: Browser, viewer: Any) -> None:
             visit(page, viewer, view)
             assert page.evaluate("document.documentElement.scrollWidth") == 360
         visit(page, viewer, "probe")
-        over, under = (
-            canvas(page, name).bounding_box() for name in ("probe-projector", "probe-camera")
-        )
+        over = canvas(page, "probe-projector").bounding_box()
+        under = canvas(page, "probe-camera").bounding_box()
         assert over is not None
         assert under is not None
         assert over["width"] > 320

@@ -29,8 +29,9 @@ from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.radiometry import Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
-from ltcl.show.window import Window, play
-from ltcl.viewer.answers import Scene
+from ltcl.show.player import play
+from ltcl.show.window import Window
+from ltcl.viewer.answers import ViewerScene
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.server import Viewer
 from tests import json_schema
@@ -48,7 +49,7 @@ def project(folder: Path, text: str) -> Project:
 
 
 def news(page: Page, seen: int = 0, count: int = 0, **wanted: Any) -> dict[str, Any]:
-    """What the page is told that has these facts, `count` photographs and warnings; asks again and again."""
+    """Ask again until the answer has these facts, and `count` photographs and warnings."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         found = page.ask("scan", seen=seen)
@@ -63,7 +64,8 @@ def news(page: Page, seen: int = 0, count: int = 0, **wanted: Any) -> dict[str, 
 
 def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
     project(tmp_path, BY_HAND)
-    rig, white = FolderRig(tmp_path, (4, 6)), np.ones((4, 6))
+    rig = FolderRig(tmp_path, (4, 6))
+    white = np.ones((4, 6))
     rig.prepare([(white, 0.5), (white, 1.0), (0 * white, 0.5)])
     codes = random.integers(0, 256, (20, 30), dtype=np.uint8)
     files = [tmp_path / f"{shot.save_as}.png" for shot in rig.shots]
@@ -98,14 +100,12 @@ def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
 
 def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
     project(tmp_path, BY_HAND)
-    rig, codes = FolderRig(tmp_path, (4, 6)), 0.1 + 0.1 * random.random((20, 30))
-    rig.prepare(
-        [
-            (pattern, t)
-            for pattern in (np.eye(4, 6), np.ones((4, 6)), np.zeros((4, 6)))
-            for t in (0.1, 0.4)
-        ]
-    )
+    rig = FolderRig(tmp_path, (4, 6))
+    codes = 0.1 + 0.1 * random.random((20, 30))
+    shots = []
+    for pattern in (np.eye(4, 6), np.ones((4, 6)), np.zeros((4, 6))):
+        shots += [(pattern, 0.1), (pattern, 0.4)]
+    rig.prepare(shots)
     for shot, factor in zip(
         rig.shots, (1, 4, 1, 1.5, 9, 9), strict=True
     ):  # of 0.4 s: 4 times as bright
@@ -118,7 +118,7 @@ def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
         "camera": CameraModel(response=Response.identity()),
     }
     known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
-    scan._calibration = cast(Any, SimpleNamespace(**known))
+    scan.agreement.calibration = cast(Any, SimpleNamespace(**known))
     warnings = scan.scan(0)[0]["warnings"]
     for first, second in ((3, 4), (5, 6)):
         assert sum(f"photograph {first} or photograph {second} " in text for text in warnings) == 1
@@ -148,23 +148,31 @@ def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
         assert (page.hello["grid"], page.hello["scan"]) == ([4, 8], True)
 
 
-def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(
-    tmp_path: Path, monkeypatch: Any
-) -> None:
+class WatchedScan(Scan):
+    """A page comes after each change of the scan, and asks what it is offered."""
+
+    grids: list[Any]
+    is_watched: bool
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        if getattr(self, "is_watched", False):
+            self.grids.append(self.hello()["grid"])
+            if "column" in self.questions:
+                self.answer("column", {"pixel": [0, 0]}, lambda *_: None)
+
+
+def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.scenes.dihedral(4, albedo=0.6).transport())
     acquisition = project(tmp_path, VIRTUAL)
-    scan, grids, make = Scan(tmp_path, None), [], Scene.__init__
-
-    def hello(scene: Scene, *arguments: Any) -> None:
-        make(scene, *arguments)
-        grids.append(scan.hello()["grid"])
-
+    scan = WatchedScan(tmp_path, None)
     with acquisition.rig() as rig:
         ltcl.acquire(rig, store=acquisition.store, **acquisition.settings)
-    monkeypatch.setattr(Scene, "__init__", hello)
+    scan.grids = []
+    scan.is_watched = True
     assert scan.scan(0)[0]["warnings"] == []
-    assert grids == [None]
-    assert scan.hello()["grid"] == (4, 8)
+    assert scan.grids[0] is None
+    assert scan.grids[-1] == (4, 8)
 
 
 def test_batches_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
@@ -247,24 +255,26 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(
     T = ltcl.scenes.dihedral(4, albedo=(0.7, 0.5, 0.3)).transport()
     film = [np.full((*T.grid, 3), 0.02 * (k + 1), np.float32) for k in range(20)]
     write_video(tmp_path / "film.mkv", film, 20.0)
-    source, told = open_frames(tmp_path / "film.mkv"), []
+    source = open_frames(tmp_path / "film.mkv")
+    told: list[Any] = []
     pictures = [frame.picture() for frame in source]
     with Window("film", open_browser=False) as window, looking(window.url, slow) as shown:
-        scene = Scene(T, "T", {}, None)
-        facts = play(scene, source, window, 0.5, lambda *what, detail: told.append(what), rtol=1e-4)
+        scene = ViewerScene(T, "T", {}, None)
+        pace = play(scene, source, window, 0.5, lambda *what, detail: told.append(what), rtol=1e-4)
         window.close()
     expected = [
         scene.codes(ltcl.compensate(T, each, gain=0.5, rtol=1e-4).pattern, 1.0) for each in pictures
     ]
     numbers = [number - 1 for _, number, _ in told]
-    assert facts["shown"] == len(numbers) == len(shown)
-    assert (facts["shown"] + facts["dropped"], numbers) == (numbers[-1] + 1, sorted({*numbers}))
+    assert pace.shown == len(numbers) == len(shown)
+    assert pace.shown + pace.dropped == numbers[-1] + 1
+    assert numbers == sorted({*numbers})
     for found, number in zip(shown, numbers, strict=True):
         np.testing.assert_allclose(found.astype(int), expected[number].astype(int), atol=1)
     assert (
-        facts["latency"] < slow + 1.0
+        pace.latency < slow + 1.0
     )  # on a busy machine; were nothing dropped, it would add up to 2 s
-    assert facts["dropped"] > 5 or not slow
+    assert pace.dropped > 5 or not slow
     assert "dropped" in window.title
 
 
@@ -272,9 +282,9 @@ def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) 
     T = ltcl.Transport(random.random((20, 12), np.float32), (3, 4), camera_grid=(4, 5))
     images.write(tmp_path / "0.png", np.full((4, 5), 0.9))
     source = open_frames(tmp_path)
-    scene = Scene(T, "T", {}, None)
+    scene = ViewerScene(T, "T", {}, None)
     with Window("film", open_browser=False) as window, looking(window.url) as shown:
-        assert play(scene, source, window, 1.0, lambda *_, **__: None)["shown"]
+        assert play(scene, source, window, 1.0, lambda *_, **__: None).shown
         window.close()
     (frame,) = source
     light = ltcl.compensate(T, frame.picture(), gain=1.0).pattern
@@ -289,10 +299,9 @@ def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey:
         images.write(
             tmp_path / f"{k}.png", 0.3 + 0.2 * random.random((*T.grid, 3) if k else T.grid)
         )
-    source, background = (
-        open_frames(tmp_path),
-        np.full((*T.grid, *(3,) * (not is_grey)), 0.05, np.float32),
-    )
+    source = open_frames(tmp_path)
+    channels = () if is_grey else (3,)
+    background = np.full((*T.grid, *channels), 0.05, np.float32)
     rules: Any = {
         "inverse": ltcl.invert(T, 1e-4),
         "background": background,
@@ -300,8 +309,9 @@ def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey:
         "clamp": True,
     }
     with Window("film", open_browser=False) as window, looking(window.url) as shown:
-        scene = Scene(T, "T", {}, None)
-        assert play(scene, source, window, 0.5, lambda *_, **__: None, **rules)["shown"] == 2
+        scene = ViewerScene(T, "T", {}, None)
+        pace = play(scene, source, window, 0.5, lambda *_, **__: None, **rules)
+        assert pace.shown == 2
         window.close()
     for found, frame in zip(shown, source, strict=True):
         light = ltcl.compensate(T, frame.picture(), gain=0.5, **rules).pattern
@@ -373,6 +383,7 @@ def film(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_play_and_show_run(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
     for command, *more in (["play", tmp_path / "T.npz", "--no-browser"], ["show", "--browser"]):
@@ -384,6 +395,7 @@ def test_play_and_show_run(tmp_path: Path) -> None:
         assert len(shown) >= 2
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
     project(tmp_path, BY_HAND)
     with running("view", tmp_path, "--no-browser") as (process, url), Page(url) as page:

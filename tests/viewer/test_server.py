@@ -107,13 +107,13 @@ def test_hello_says_what_T_is(shown):
 
 def test_columns_and_rows_are_those_of_T(shown):
     T, page = shown
-    A, c = whole(T), T.channels
+    A = whole(T)
     for ask, name, grid, matrix in (
         ("column", "picture", T.grid, A),
         ("row", "pattern", T.camera_grid, A.T),
     ):
         for pixel in ([0, 0], [grid[0] - 1, 1]):
-            unit = np.zeros((*grid, c))
+            unit = np.zeros((*grid, T.channels))
             unit[tuple(pixel)] = 1
             near(page.ask(ask, pixel=pixel)[name], matrix @ unit.ravel())
 
@@ -138,7 +138,8 @@ def test_bounces_of_a_picture_and_of_the_pattern(colour):
         page.ask("relight", {"pattern": codes})
         for fields in ({"picture": 1}, {}):
             found = page.ask("bounces", count=2, **fields)
-            rest, shares = np.einsum("cij,jc->ic", A, light.reshape(-1, 3)), []
+            rest = np.einsum("cij,jc->ic", A, light.reshape(-1, 3))
+            shares = []
             total = rest.sum()
             for name in ("direct", "bounce_1", "bounce_2"):
                 b = np.stack([F[c] * np.linalg.solve(A[c], rest[:, c]) for c in range(3)], axis=1)
@@ -246,7 +247,7 @@ def test_uploads_are_relit_and_wrong_ones_refused(colour):
         for number in range(3, 25):
             upload(page, f"{number}.png", png(codes))
         kept = page.ask("pictures")["pictures"]
-        assert [each["picture"] for each in kept] == list(range(25 - answers.UPLOADS, 25))
+        assert [each["picture"] for each in kept] == list(range(25 - answers.MAX_UPLOADS, 25))
 
 
 def test_projector_windows_show_what_is_relit_and_compensated(colour):
@@ -318,10 +319,11 @@ def test_light_beyond_what_numbers_hold_is_refused(device):
 
 
 class Slow:
-    """In the place of `separate`: 500 steps of 10 ms."""
+    """A stand-in for `separate`: 500 steps of 10 ms."""
 
     def __init__(self) -> None:
-        self.steps, self.begun = 0, threading.Event()
+        self.steps = 0
+        self.begun = threading.Event()
 
     def __call__(self, T: Any, image: Any, count: int, callback: Any) -> Any:
         for step in range(500):
@@ -449,6 +451,7 @@ def test_the_command_runs_until_ctrl_c(tmp_path):
 def test_without_the_extra_ltcl_imports_and_says_how_to_get_it():
     code = "import sys; sys.modules['starlette'] = None; import ltcl, numpy; "
     code += "ltcl.view(ltcl.Transport(numpy.eye(2), (1, 2)))"
-    words, folder = [sys.executable, "-c", code], Path(ltcl.__file__).parents[1]
+    words = [sys.executable, "-c", code]
+    folder = Path(ltcl.__file__).parents[1]
     run = subprocess.run(words, capture_output=True, text=True, cwd=folder)
     assert run.stderr.splitlines()[-1].endswith("pip install 'ltcl[view]'")

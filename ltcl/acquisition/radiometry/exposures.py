@@ -124,8 +124,9 @@ def exposure_stack(images: Sequence[Any], seconds: Any, levels: int | None = Non
     order = np.argsort(times, kind="stable")
     shape = arrays[0].shape
     pixels = shape[0] * shape[1]
+    ordered = [arrays[k].reshape(pixels, -1) for k in order]
     stack = ExposureStack(
-        images=tuple(arrays[k].reshape(pixels, -1) for k in order),
+        images=tuple(ordered),
         shape=shape,
         seconds=times[order],
         levels=code_levels(arrays, levels),

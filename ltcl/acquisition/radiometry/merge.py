@@ -125,7 +125,9 @@ def merge(
     pixels, channels = stack.images[0].shape
     if response.channels > channels:
         raise InputError("response has 3 channels, but images are grey; it must have one")
-    offsets = _channel_offsets(noise.black if black is None else black, channels)
+    if black is None:
+        black = noise.black
+    offsets = _channel_offsets(black, channels)
     mergers = [ChannelMerger(stack, response, noise, offsets[c], c) for c in range(channels)]
     value = np.empty((pixels, channels), np.float32)
     variance = np.empty((pixels, channels), np.float32)
@@ -184,7 +186,8 @@ class ChannelMerger:
 
     def merge(self, pixels: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Value, variance and validity of some pixels."""
-        light = self._linear(np.stack([image[pixels] for image in self.images]))
+        codes = np.stack([image[pixels] for image in self.images])
+        light = self._linear(codes)
         is_unsaturated = light <= self.saturation
         light -= self.black
         light *= is_unsaturated

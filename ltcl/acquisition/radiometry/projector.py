@@ -101,7 +101,8 @@ def _channel_table(codes: np.ndarray, pictures: Sequence[Radiance], name: str) -
         raise InputError(
             f"{name} have no pixel that is valid under all codes; other exposures are needed"
         )
-    L = np.stack([picture.value[is_valid] for picture in pictures]).astype(np.float64)
+    values = [picture.value[is_valid] for picture in pictures]
+    L = np.stack(values).astype(np.float64)
     black_variance = pictures[0].variance[is_valid].astype(np.float64)
     white_variance = pictures[-1].variance[is_valid].astype(np.float64)
     s = L[-1] - L[0]

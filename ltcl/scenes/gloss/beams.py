@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Exchange of light fields between patches: G of A = K G (eq. 4), found by rays, reciprocal and lossless.
 
-A beam is a patch and a bin of directions over it (`brdf`); beam i M + m of N patches and M
-bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x
+A beam is a patch and a bin of directions over it (`brdf`): beam i M + m is bin m of patch i, of N
+patches and M bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x
 projected solid angle) shared by two beams is the same from both ends:
 
     G = diag(1 / e) E,    E = E^T,    e_a = area pi / M    (here without the pi)
@@ -34,9 +34,11 @@ from ltcl.scenes.patches import Patches, check_blocks, cut
 from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall
 
-_AT_ONCE = 1 << 19  # rays followed together
-_ROUNDS, _CLOSE = 1000, 1e-9  # of the scaling
-_BYTES = 60  # a ray takes at worst, with an entry of its own in E and in what E is made of
+RAYS_AT_ONCE = 1 << 19
+# A ray takes so many bytes at worst, with an entry of its own in E and in the matrices E is made of.
+BYTES_PER_RAY = 60
+MAX_SCALING_ROUNDS = 1000
+SCALING_TOLERANCE = 1e-9
 
 
 def exchange(
@@ -45,32 +47,45 @@ def exchange(
     """Light that beams get from beams, (N M, N M), N = n * n * len(walls): incoming = G outgoing radiance.
 
     M `directions` are a square number, `rays` are followed from each beam past boxes (B, 2, 3)
-    along the axes, from places that `seed` decides. InputError: a number is out of range.
-    MemoryLimitError: so many rays do not fit in the memory of the host.
+    along the axes, from places that `seed` decides. InputError if a number is out of range,
+    MemoryLimitError if so many rays do not fit in the memory of the host.
 
     >>> from ltcl.scenes.builders import WALLS
     >>> G = exchange(WALLS, 2, directions=16, rays=16)
     >>> G.shape, bool(np.allclose(G.sum(axis=1), 1))  # a closed room
     ((384, 384), True)
     """
-    k, rays = brdf.side(directions), checks.count("rays", rays)
-    seed, boxes = checks.count("seed", seed, least=0), check_blocks(blocks)
+    k = brdf.side(directions)
+    rays = checks.count("rays", rays)
+    seed = checks.count("seed", seed, least=0)
+    boxes = check_blocks(blocks)
     patches = cut(walls, n)
-    beams = len(patches) * k * k
-    checks.fits_host(f"an exchange of {beams} beams by {rays} rays each", _BYTES * beams * rays)
-    share = np.repeat(patches.area / k**2, k**2)  # e
-    met = scipy.sparse.csr_array((beams, beams))
-    step = max(1, _AT_ONCE // (k * k * rays))
+    bins = k * k
+    beams = len(patches) * bins
+    what = f"an exchange of {beams} beams by {rays} rays each"
+    checks.fits_host(what, BYTES_PER_RAY * beams * rays)
+    hits = scipy.sparse.csr_array((beams, beams))
+    patches_at_once = max(1, RAYS_AT_ONCE // (bins * rays))
     generator = np.random.default_rng(seed)
-    for start in range(0, len(patches), step):
-        some = np.arange(start, min(start + step, len(patches)))
-        met = met + _met(walls, n, patches, some, _places(len(some), k, rays, generator), boxes)
-    E = scipy.sparse.diags_array(share / rays) @ met
-    E, lost, scale = (E + E.T) / 2, share - E.sum(axis=1), np.ones(beams)
-    for _ in range(_ROUNDS):  # to d E d with d (E d + lost) = share
-        correction = share / (scale * (E @ scale + lost))
+    for start in range(0, len(patches), patches_at_once):
+        some = np.arange(start, min(start + patches_at_once, len(patches)))
+        places = _places(len(some), k, rays, generator)
+        hits = hits + _count_hits(walls, n, patches, some, places, boxes)
+    etendue = np.repeat(patches.area / bins, bins)  # e
+    E = scipy.sparse.diags_array(etendue / rays) @ hits
+    return _scaled_exchange(E, etendue)
+
+
+def _scaled_exchange(E: Any, etendue: np.ndarray) -> scipy.sparse.csr_array:
+    """G of an etendue E that was found from each end: reciprocal, and without loss."""
+    lost = etendue - E.sum(axis=1)
+    E = (E + E.T) / 2
+    scale = np.ones(len(etendue))
+    # To d E d with d (E d + lost) = etendue.
+    for _ in range(MAX_SCALING_ROUNDS):
+        correction = etendue / (scale * (E @ scale + lost))
         scale *= np.sqrt(correction)
-        if np.abs(correction - 1).max() < _CLOSE:
+        if np.abs(correction - 1).max() < SCALING_TOLERANCE:
             break
     # Rows alone are scaled last, to make that exact.
     rows = scipy.sparse.diags_array(1.0 / (E @ scale + lost))
@@ -82,16 +97,16 @@ def _places(patches: int, k: int, rays: int, generator: np.random.Generator) -> 
 
     One set of low discrepancy, shifted for each beam (Cranley and Patterson 1976).
     """
-    sobol = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(int(np.ceil(np.log2(rays))))[
-        :rays
-    ]
+    sequence = scipy.stats.qmc.Sobol(4, scramble=False)
+    sobol = sequence.random_base2(int(np.ceil(np.log2(rays))))[:rays]
     places = (sobol + generator.random((patches, k * k, 1, 4))) % 1.0
-    row, column = np.arange(k * k) % k, np.arange(k * k) // k
-    places[..., 2:] = (places[..., 2:] + np.stack([column, row], axis=1)[:, None, :]) / k
+    column, row = np.divmod(np.arange(k * k), k)
+    corner = np.stack([column, row], axis=1)[:, None, :]
+    places[..., 2:] = (places[..., 2:] + corner) / k
     return places
 
 
-def _met(
+def _count_hits(
     walls: Sequence[Wall],
     n: int,
     patches: Patches,
@@ -99,24 +114,27 @@ def _met(
     places: np.ndarray,
     blocks: Any,
 ) -> scipy.sparse.csr_array:
-    """How many rays of each beam of `some` patches end in each beam, (N M, N M)."""
+    """Number of rays of each beam of `some` patches that end in each beam, (N M, N M)."""
     _, bins, rays, _ = places.shape
-    k, axes = int(np.sqrt(bins)), patches.frames
-    u, v = places[..., :1] - 0.5, places[..., 1:2] - 0.5
-    right, down, centre = (
-        getattr(patches, edge)[some, None, None] for edge in ("right", "down", "centre")
-    )
+    k = int(np.sqrt(bins))
+    axes = patches.frames
+    u = places[..., :1] - 0.5
+    v = places[..., 1:2] - 0.5
+    right = patches.right[some, None, None]
+    down = patches.down[some, None, None]
+    centre = patches.centre[some, None, None]
     origins = (centre + u * right + v * down).reshape(-1, 3)
-    vectors = brdf.from_square(places[..., 2:]).reshape(len(some), -1, 3) @ axes[some]
-    vectors = vectors.reshape(-1, 3)
+    directions = brdf.from_square(places[..., 2:]).reshape(len(some), -1, 3)
+    vectors = (directions @ axes[some]).reshape(-1, 3)
     hits = cast(walls, origins, vectors, blocks)
-    good = np.flatnonzero(hits.wall >= 0)
-    row, column = (
-        np.minimum((place[good] * n).astype(np.intp), n - 1) for place in (hits.v, hits.u)
-    )
-    there = row * (n * len(walls)) + hits.wall[good] * n + column
-    back = np.einsum("rij,rj->ri", axes[there], -vectors[good])
-    sent = some[good // (bins * rays)] * bins + good // rays % bins
-    got = there * bins + brdf.bins(back, k)
-    size = len(patches) * bins
-    return scipy.sparse.csr_array((np.ones(len(good)), (sent, got)), shape=(size, size))
+    ray = np.flatnonzero(hits.wall >= 0)
+    row = np.minimum((hits.v[ray] * n).astype(np.intp), n - 1)
+    column = np.minimum((hits.u[ray] * n).astype(np.intp), n - 1)
+    target = row * (n * len(walls)) + hits.wall[ray] * n + column
+    towards_source = np.einsum("rij,rj->ri", axes[target], -vectors[ray])
+    source = some[ray // (bins * rays)]
+    source_beam = source * bins + ray // rays % bins
+    target_beam = target * bins + brdf.bins(towards_source, k)
+    beams = len(patches) * bins
+    ones = np.ones(len(ray))
+    return scipy.sparse.csr_array((ones, (source_beam, target_beam)), shape=(beams, beams))

@@ -33,9 +33,14 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import InputError
 
-_POINTS = 4  # along a bin, over which its mean is taken
-_SHARPEST = 8  # exponent per bin: lobes down to half a bin's width, two points of a bin
-_ROUNDS, _CLOSE = 1000, 1e-14  # of the scaling
+# Points along a bin, over which its mean is taken.
+BIN_POINTS = 4
+# Exponent per bin: lobes down to half a bin's width, two points of a bin.
+MAX_EXPONENT_PER_BIN = 8
+MAX_SCALING_ROUNDS = 1000
+SCALING_TOLERANCE = 1e-14
+# Sums of two directions shorter than this are those of opposite grazing directions.
+OPPOSITE_TOLERANCE = 1e-12
 
 
 def side(directions: Any) -> int:
@@ -57,29 +62,37 @@ def from_square(square: np.ndarray) -> np.ndarray:
     array([0., 0., 1.])
     """
     a, b = np.moveaxis(2.0 * square - 1.0, -1, 0)
-    steep = np.abs(a) <= np.abs(b)
-    radius = np.where(steep, b, a)  # signed
-    ratio = np.divide(np.where(steep, a, b), radius, out=np.zeros_like(radius), where=radius != 0)
+    is_steep = np.abs(a) <= np.abs(b)
+    radius = np.where(is_steep, b, a)  # signed
+    other = np.where(is_steep, a, b)
+    ratio = np.divide(other, radius, out=np.zeros_like(radius), where=radius != 0)
     angle = np.pi / 4 * ratio
-    along, across = radius * np.cos(angle), radius * np.sin(angle)
+    along = radius * np.cos(angle)
+    across = radius * np.sin(angle)
+    x = np.where(is_steep, across, along)
+    y = np.where(is_steep, along, across)
     z = np.sqrt(np.maximum(0.0, 1.0 - radius**2))
-    return np.stack([np.where(steep, across, along), np.where(steep, along, across), z], axis=-1)
+    return np.stack([x, y, z], axis=-1)
 
 
 def bins(vectors: np.ndarray, k: int) -> np.ndarray:
     """Numbers (...) of the bins, of k x k, that unit vectors (..., 3) fall into; undoes `from_square`."""
-    x, y = vectors[..., 0], vectors[..., 1]
-    steep = np.abs(x) <= np.abs(y)
-    radius = np.hypot(x, y) * np.sign(np.where(steep, y, x))
-    slope = np.divide(
-        np.where(steep, x, y), np.where(steep, y, x), out=np.zeros_like(x), where=radius != 0
-    )
+    x = vectors[..., 0]
+    y = vectors[..., 1]
+    is_steep = np.abs(x) <= np.abs(y)
+    longer = np.where(is_steep, y, x)
+    shorter = np.where(is_steep, x, y)
+    radius = np.hypot(x, y) * np.sign(longer)
+    slope = np.divide(shorter, longer, out=np.zeros_like(x), where=radius != 0)
     other = radius * np.arctan(slope) * 4 / np.pi
-    column, row = (
-        np.clip(((place + 1) / 2 * k).astype(np.intp), 0, k - 1)
-        for place in (np.where(steep, other, radius), np.where(steep, radius, other))
-    )
+    column = _cell(np.where(is_steep, other, radius), k)
+    row = _cell(np.where(is_steep, radius, other), k)
     return column * k + row
+
+
+def _cell(place: np.ndarray, k: int) -> np.ndarray:
+    """Numbers of the cells, of k, in which places in [-1, 1] lie."""
+    return np.clip(((place + 1) / 2 * k).astype(np.intp), 0, k - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,21 +109,22 @@ class Lobe:
     between: np.ndarray
 
     def towards(self, vectors: np.ndarray) -> np.ndarray:
-        """Between single directions (N, 3), z >= 0, and the bins: (N, M), rows of mean 1."""
+        """The lobe between single directions (N, 3), z >= 0, and the bins: (N, M), rows of mean 1."""
         values = _bin_means(vectors, self.places, self.exponent) * self.scale
         return values / values.mean(axis=1, keepdims=True)
 
     def direct(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Between pairs of single directions, (N, 3) each: (N,)."""
-        scales = (
-            1.0 / (_bin_means(vectors, self.places, self.exponent) @ self.scale / len(self.scale))
-            for vectors in (u, v)
-        )
-        return _blinn(u, v, self.exponent) * next(scales) * next(scales)
+        """The lobe between pairs of single directions, (N, 3) each: (N,)."""
+        return _blinn(u, v, self.exponent) * self._scale_of(u) * self._scale_of(v)
+
+    def _scale_of(self, vectors: np.ndarray) -> np.ndarray:
+        """The scale s of single directions (N, 3), (N,)."""
+        means = _bin_means(vectors, self.places, self.exponent)
+        return 1.0 / (means @ self.scale / len(self.scale))
 
 
 def lobe(exponent: float, k: int) -> Lobe:
-    """The lobe of an exponent over k x k bins; InputError: not above 0, or too sharp for the bins to show.
+    """The lobe of an exponent over k x k bins; InputError if that is not above 0, or too sharp for the bins.
 
     >>> shine = lobe(20, k=4)
     >>> (
@@ -120,24 +134,27 @@ def lobe(exponent: float, k: int) -> Lobe:
     (True, True)
     """
     exponent = checks.number("exponent", exponent, above=0.0)
-    if exponent > _SHARPEST * k * k:
+    bins = k * k
+    largest = MAX_EXPONENT_PER_BIN * bins
+    if exponent > largest:
         raise InputError(
-            f"exponent is {exponent:g}; it must be at most {_SHARPEST * k * k} for {k * k} directions, "
+            f"exponent is {exponent:g}; it must be at most {largest} for {bins} directions, "
             "which cannot show a sharper lobe; raise directions"
         )
-    place = ((np.arange(k)[:, None] + (np.arange(_POINTS) + 0.5) / _POINTS) / k).ravel()
-    square = np.stack(
-        np.meshgrid(place, place, indexing="ij"), axis=-1
-    )  # spread evenly over each bin
-    cells = square.reshape(k, _POINTS, k, _POINTS, 2).swapaxes(1, 2)
-    places = from_square(cells.reshape(k * k, _POINTS**2, 2))
-    means = np.stack([_bin_means(own, places, exponent).mean(axis=0) for own in places])
-    means = (means + means.T) / 2  # rounding
-    scale = np.ones(len(means))
-    for _ in range(_ROUNDS):
-        rows = scale * (means @ scale) / len(means)
-        scale = scale / np.sqrt(rows)
-        if np.abs(rows - 1).max() < _CLOSE:
+    # Points spread evenly over each bin.
+    points = (np.arange(BIN_POINTS) + 0.5) / BIN_POINTS
+    place = ((np.arange(k)[:, None] + points) / k).ravel()
+    square = np.stack(np.meshgrid(place, place, indexing="ij"), axis=-1)
+    cells = square.reshape(k, BIN_POINTS, k, BIN_POINTS, 2).swapaxes(1, 2)
+    places = from_square(cells.reshape(bins, BIN_POINTS**2, 2))
+    rows = [_bin_means(of_bin, places, exponent).mean(axis=0) for of_bin in places]
+    means = np.stack(rows)
+    means = (means + means.T) / 2  # symmetric to the bit
+    scale = np.ones(bins)
+    for _ in range(MAX_SCALING_ROUNDS):
+        row_means = scale * (means @ scale) / bins
+        scale = scale / np.sqrt(row_means)
+        if np.abs(row_means - 1).max() < SCALING_TOLERANCE:
             break
     return Lobe(exponent, places, scale, np.outer(scale, scale) * means)
 
@@ -147,7 +164,8 @@ def _blinn(u: np.ndarray, v: np.ndarray, exponent: float) -> np.ndarray:
     half = u + v
     # Two grazing directions opposite to each other mirror one another: h is the normal.
     length = np.linalg.norm(half, axis=-1)
-    cosine = np.divide(half[..., 2], length, out=np.ones_like(length), where=length > 1e-12)
+    is_proper = length > OPPOSITE_TOLERANCE
+    cosine = np.divide(half[..., 2], length, out=np.ones_like(length), where=is_proper)
     return np.maximum(cosine, 0.0) ** exponent
 
 

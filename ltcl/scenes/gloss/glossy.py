@@ -18,6 +18,7 @@ m); sums stop there.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -28,16 +29,18 @@ import scipy.sparse.linalg
 
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
+from ltcl.scenes.camera import SceneCamera
 from ltcl.scenes.gloss import beams, brdf
 from ltcl.scenes.patches import cut
 from ltcl.scenes.rays import Sight, sight
 from ltcl.scenes.scene import Scene
-from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Block, Wall, point, spread_albedo, vector
-from ltcl.transport import frames as layout
+from ltcl.transport import frames as picture_frames
 
-_COLUMNS = 64  # of T computed together
-_TAIL = 1e-8  # of a white patch: all bounces left out together
+# Columns of T that are computed together.
+COLUMNS_AT_ONCE = 64
+# Light that all bounces which are left out add together, as a part of a white patch.
+MAX_TAIL = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -50,11 +53,11 @@ class GlossyScene(Scene):
         The same room without gloss: grid, walls, albedo, viewer, and form factors found by the same
         rays.
     G : csr_array, (N (M + 1), N (M + 1)), float64
-        Light that arrives, for light that leaves. No colour.
+        Light that arrives, for light that leaves; without colour.
     white : bsr_array, (N (M + 1), N (M + 1)), float64
         K at albedo 1: one block per patch, rows by leaving, columns by arriving direction.
     P : csr_array, (N, N (M + 1))
-        What the camera sees; 0 for patches hidden from it.
+        Light that the camera sees; 0 for patches hidden from it.
     Q : csr_array, (N (M + 1), N)
         Light of the projector; the part of each patch that is not in shadow.
 
@@ -78,31 +81,30 @@ class GlossyScene(Scene):
     @property
     def matte(self) -> Scene:
         """The same room without gloss."""
-        return Scene(*(getattr(self, own.name) for own in fields(Scene)))
+        return Scene(**{field.name: getattr(self, field.name) for field in fields(Scene)})
 
     @property
     def directions(self) -> int:
-        """M, the bins of directions over each patch."""
+        """M, the number of bins of directions over each patch."""
         return self.white.blocksize[0] - 1
 
     @property
     def K(self) -> Any:
-        """Reflection: what leaves for what arrives, bsr_array; a tuple of three in colour. F is the same."""
-        structure = self.white.indices, self.white.indptr
-        parts = tuple(
-            scipy.sparse.bsr_array((self.white.data * r[:, None, None], *structure))
-            for r in self.albedo
-        )
-        return parts[0] if self.channels == 1 else parts
+        """Reflection from arriving to leaving light, and F: a bsr_array, or a tuple of three in colour."""
+        reflections = []
+        for albedo in self.albedo:
+            blocks = self.white.data * albedo[:, None, None]
+            bsr = (blocks, self.white.indices, self.white.indptr)
+            reflections.append(scipy.sparse.bsr_array(bsr))
+        return reflections[0] if self.channels == 1 else tuple(reflections)
 
     @property
     def A(self) -> Any:
         """One bounce of the light field, K G (eq. 4), a LinearOperator; a tuple of three in colour."""
-        G, K = scipy.sparse.linalg.aslinearoperator(self.G), self.K
-        parts = tuple(
-            scipy.sparse.linalg.aslinearoperator(k) @ G for k in (K if self.channels == 3 else (K,))
-        )
-        return parts[0] if self.channels == 1 else parts
+        G = scipy.sparse.linalg.aslinearoperator(self.G)
+        reflections = self.K if self.channels == 3 else (self.K,)
+        bounces = [scipy.sparse.linalg.aslinearoperator(K) @ G for K in reflections]
+        return bounces[0] if self.channels == 1 else tuple(bounces)
 
     @property
     def first_bounce(self) -> np.ndarray:
@@ -120,19 +122,21 @@ class GlossyScene(Scene):
             If they do not fit in the memory of the host.
         """
         patches = len(self.area)
-        block = 8 * patches * (self.directions + 1) * min(_COLUMNS, patches)
+        columns_at_once = min(COLUMNS_AT_ONCE, patches)
+        light_field = 8 * patches * (self.directions + 1) * columns_at_once
         checks.fits_host(
             f"the transport of {self.name}, {self.channels} of {patches} x {patches},",
-            self.channels * 8 * patches**2 + 4 * block,
+            self.channels * 8 * patches**2 + 4 * light_field,
         )
         light = np.eye(patches)
-        slices = [slice(start, start + _COLUMNS) for start in range(0, patches, _COLUMNS)]
-        return tuple(
-            np.concatenate(
-                [sum(self._pictures(albedo, light[:, columns])) for columns in slices], axis=1
-            )
-            for albedo in self.albedo
-        )
+        matrices = []
+        for albedo in self.albedo:
+            columns = []
+            for start in range(0, patches, COLUMNS_AT_ONCE):
+                some = light[:, start : start + COLUMNS_AT_ONCE]
+                columns.append(sum(self._pictures(albedo, some)))
+            matrices.append(np.concatenate(columns, axis=1))
+        return tuple(matrices)
 
     def bounces(self, pattern: Any, count: int) -> np.ndarray:
         """True pictures of single bounces, P A^k F Q pattern for k = 0 (direct) to count (eq. 29).
@@ -141,7 +145,7 @@ class GlossyScene(Scene):
         ----------
         pattern : (h, w), (h, w, 3), or frames of these
         count : int
-            Of indirect bounces.
+            Number of indirect bounces.
 
         Returns
         -------
@@ -161,30 +165,31 @@ class GlossyScene(Scene):
         (4, 2, 4)
         """
         count = checks.count("count", count, least=0)
-        columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
-        series = [
-            self._pictures(albedo, light, count)
-            for albedo, light in zip(self.albedo, columns, strict=True)
-        ]
-        return np.stack([shape.pack(list(parts), self.grid) for parts in zip(*series, strict=True)])
+        columns, layout = picture_frames.unpack("pattern", pattern, self.grid, self.channels)
+        channels = []
+        for albedo, light in zip(self.albedo, columns, strict=True):
+            channels.append(list(self._pictures(albedo, light, count)))
+        pictures = [layout.pack(list(parts), self.grid) for parts in zip(*channels, strict=True)]
+        return np.stack(pictures)
 
     def _pictures(
         self, albedo: np.ndarray, light: np.ndarray, count: int | None = None
     ) -> Iterator[np.ndarray]:
         """P A^k F Q light (N, k) one after another: `count` indirect ones, or until little is left."""
-        most, blocks = albedo.max(), self.white.data
-        arriving, bounce = self.Q @ light.astype(np.float64), 0
-        while True:
+        largest_albedo = albedo.max()
+        blocks = self.white.data
+        arriving = self.Q @ light.astype(np.float64)
+        for bounce in itertools.count():
             # K arriving, as products of dense blocks, which are much faster than those of
             # `bsr_array`.
             leaving = blocks @ arriving.reshape(len(blocks), blocks.shape[1], -1)
             leaving *= albedo[:, None, None]
             leaving = leaving.reshape(arriving.shape)
             yield self.P @ leaving
-            left = np.abs(leaving).max(initial=0.0) * most / (1 - most)
-            if bounce == count or (count is None and left <= _TAIL):
+            tail = np.abs(leaving).max(initial=0.0) * largest_albedo / (1 - largest_albedo)
+            if bounce == count or (count is None and tail <= MAX_TAIL):
                 return
-            arriving, bounce = self.G @ leaving, bounce + 1
+            arriving = self.G @ leaving
 
 
 def glossy(
@@ -211,21 +216,21 @@ def glossy(
     n : int
         Patches along each side of a wall.
     albedo : array_like in [0, 1)
-        As `box` takes it: a scalar, one per wall, one colour, or one colour per wall.
+        A scalar, one per wall, one colour, or one colour per wall, as `box` takes it.
     gloss : array_like in [0, 1]
         Share of the reflected light that the lobe takes; a scalar or one per wall. 0 is matte.
     exponent : array_like, above 0
-        Of the lobe, see `brdf`; a scalar or one per wall, at most 8 * directions.
+        Exponent of the lobe, see `brdf`; a scalar or one per wall, at most 8 * directions.
     projector, camera : (3,)
-        Where they stand. The camera of a scene stands where its viewer does, unless given.
+        Their places. The camera of a scene stands at the eye of its viewer, unless given.
     directions : int
-        Bins over each patch, M: a square number of at least 4.
+        Number of bins over each patch, M: a square number of at least 4.
     rays : int
-        Followed from each bin of each patch.
+        Number of rays followed from each bin of each patch.
     blocks : sequence of Block
-        What else stands in the room. Faces that are not among the walls are black.
+        More boxes in the room. Faces that are not among the walls are black.
     seed : int
-        Of the rays.
+        Random seed of the rays.
 
     Returns
     -------
@@ -255,35 +260,57 @@ def glossy(
     walls, name, viewer = _room(room, camera)
     if not isinstance(blocks, Sequence) or not all(isinstance(block, Block) for block in blocks):
         raise InputTypeError(f"blocks is {blocks!r}; it must be a sequence of ltcl.scenes.Block")
-    blocks = (*(room.blocks if isinstance(room, Scene) else ()), *blocks)
+    if isinstance(room, Scene):
+        blocks = (*room.blocks, *blocks)
     boxes = np.array([(block.low, block.high) for block in blocks]).reshape(-1, 2, 3)
-    n, k = checks.count("n", n), brdf.side(directions)
-    size, slots = n * n * len(walls), k * k + 1
-    needed = 8 * size * slots**2 + 4 * 8 * size**2  # reflectances; form factors and room to work
-    checks.fits_host(f"{name}, {size} patches of {slots} x {slots} reflectances,", needed)
+    n = checks.count("n", n)
+    k = brdf.side(directions)
+    size = n * n * len(walls)
+    slots = k * k + 1
+    reflectance_bytes = 8 * size * slots**2
+    form_factor_bytes = 4 * 8 * size**2  # with room to work
+    checks.fits_host(
+        f"{name}, {size} patches of {slots} x {slots} reflectances,",
+        reflectance_bytes + form_factor_bytes,
+    )
     albedos = spread_albedo(albedo, len(walls), n)
     materials = _materials(gloss, exponent, len(walls), k)
     patches = cut(walls, n)
-    lights = sight("projector", projector, walls, patches, boxes)
-    sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, boxes)
+    eye = viewer.eye if camera is None else camera
+    lit = sight("projector", projector, walls, patches, boxes)
+    seen = sight("camera", eye, walls, patches, boxes)
     exchange = beams.exchange(walls, n, directions, rays, boxes, seed)
-    entries = (
-        exchange.tocoo()
-    )  # with an empty last slot: no patch gets what others send to the camera
-    places = tuple(index + index // (slots - 1) for index in (entries.row, entries.col))
-    form_factors, grid = _form_factors(exchange, patches.area), (n, n * len(walls))
-    matte = name, grid, form_factors, albedos, patches.area, walls, viewer, blocks
     return GlossyScene(
-        *matte,
-        G=scipy.sparse.csr_array((entries.data, places), (size * slots, size * slots)),
-        white=_reflectance(n, materials, lights, sees),
-        P=_last_slots((sees.share > 0).astype(np.float64), slots),
-        Q=scipy.sparse.csr_array(_last_slots(lights.share, slots).T),
+        name=name,
+        grid=(n, n * len(walls)),
+        form_factors=_form_factors(exchange, patches.area),
+        albedo=albedos,
+        area=patches.area,
+        walls=walls,
+        viewer=viewer,
+        blocks=tuple(blocks),
+        G=_with_last_slots(exchange, slots),
+        white=_reflectance(n, materials, lit, seen),
+        P=_last_slots((seen.share > 0).astype(np.float64), slots),
+        Q=scipy.sparse.csr_array(_last_slots(lit.share, slots).T),
     )
 
 
-def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
-    """Walls, name, and who looks: the scene's viewer, or one at the camera who looks at the walls' middle."""
+def _with_last_slots(exchange: scipy.sparse.csr_array, slots: int) -> scipy.sparse.csr_array:
+    """An exchange between bins with an empty last slot in each patch.
+
+    No patch gets the light that others send to the camera.
+    """
+    bins = slots - 1
+    entries = exchange.tocoo()
+    rows = entries.row + entries.row // bins
+    columns = entries.col + entries.col // bins
+    size = exchange.shape[0] // bins * slots
+    return scipy.sparse.csr_array((entries.data, (rows, columns)), (size, size))
+
+
+def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, SceneCamera]:
+    """Walls, name and viewer of a room; the viewer of bare walls looks from the camera at their middle."""
     if isinstance(room, Scene):
         return room.walls, f"glossy {room.name}", room.viewer
     walls = tuple(room) if isinstance(room, Sequence) else ()
@@ -291,24 +318,30 @@ def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
         raise InputTypeError(f"room is {room!r}; it must be a scene, or one or more walls")
     if camera is None:
         raise InputError("camera is None; it must be a place (x, y, z) where room is walls only")
-    viewer = Viewer(point("camera", camera), vector(cut(walls, 1).centre.mean(axis=0)))
+    middle = cut(walls, 1).centre.mean(axis=0)
+    viewer = SceneCamera(point("camera", camera), vector(middle))
     return walls, f"glossy room of {len(walls)} wall(s)", viewer
 
 
 def _materials(gloss: Any, exponent: Any, walls: int, k: int) -> list[tuple[float, brdf.Lobe]]:
-    """Share and lobe of each wall, of one number for all or one for each."""
-    numbers = []
-    for name, value in (("gloss", gloss), ("exponent", exponent)):
-        array = checks.finite(name, checks.real(name, value)).astype(np.float64)
-        numbers.append(np.broadcast_to(checks.shape(name, array, (), (walls,)), (walls,)).tolist())
-    for share in numbers[0]:
+    """Share and lobe of the gloss of each wall."""
+    shares = _of_walls("gloss", gloss, walls)
+    exponents = _of_walls("exponent", exponent, walls)
+    for share in shares:
         checks.number("gloss", share, least=0.0, most=1.0)
-    lobes = {value: brdf.lobe(value, k) for value in numbers[1]}
-    return [(share, lobes[value]) for share, value in zip(*numbers, strict=True)]
+    lobes = {value: brdf.lobe(value, k) for value in exponents}
+    return [(share, lobes[value]) for share, value in zip(shares, exponents, strict=True)]
+
+
+def _of_walls(name: str, value: Any, walls: int) -> list[float]:
+    """A number for each wall, of one for all or one for each."""
+    array = checks.finite(name, checks.real(name, value)).astype(np.float64)
+    checks.shape(name, array, (), (walls,))
+    return np.broadcast_to(array, (walls,)).tolist()
 
 
 def _form_factors(exchange: Any, area: np.ndarray) -> np.ndarray:
-    """Of matte patches: means over the bins, (N, N); reciprocal, and no row above 1, to rounding."""
+    """Form factors (N, N) of matte patches, means over the bins: reciprocal, no row above 1."""
     size = len(area)
     bins = exchange.shape[0] // size
     sums = scipy.sparse.kron(scipy.sparse.eye_array(size), np.ones((1, bins)), format="csr")
@@ -318,28 +351,32 @@ def _form_factors(exchange: Any, area: np.ndarray) -> np.ndarray:
 
 
 def _last_slots(values: np.ndarray, slots: int) -> scipy.sparse.csr_array:
-    """(N, N slots) that picks the last slot of each patch, times a value."""
+    """A matrix (N, N slots) that picks the last slot of each patch, times a value."""
     rows = np.flatnonzero(values)
+    columns = (rows + 1) * slots - 1
     shape = (len(values), len(values) * slots)
-    return scipy.sparse.csr_array((values[rows], (rows, (rows + 1) * slots - 1)), shape)
+    return scipy.sparse.csr_array((values[rows], (rows, columns)), shape)
 
 
 def _reflectance(
-    n: int, materials: list[tuple[float, brdf.Lobe]], lights: Sight, sees: Sight
+    n: int, materials: list[tuple[float, brdf.Lobe]], lit: Sight, seen: Sight
 ) -> scipy.sparse.bsr_array:
     """K of a white room: a block (M + 1, M + 1) for each patch."""
     bins = len(materials[0][1].scale)
     wall = np.arange(n * n * len(materials)) // n % len(materials)
     blocks = np.zeros((len(wall), bins + 1, bins + 1))
-    for number, (share, lobe) in enumerate(materials):
-        here = wall == number
-        seen, lit = here & (sees.share > 0), here & (lights.share > 0)
-        both = seen & lit
-        blocks[here, :-1, :-1] = (1 - share + share * lobe.between) / bins
-        blocks[seen, -1, :-1] = (1 - share + share * lobe.towards(sees.towards[seen])) / bins
-        blocks[lit, :-1, -1] = 1 - share + share * lobe.towards(lights.towards[lit])
-        blocks[both, -1, -1] = (
-            1 - share + share * lobe.direct(lights.towards[both], sees.towards[both])
-        )
+    for number, (gloss, lobe) in enumerate(materials):
+        matte = 1 - gloss
+        is_here = wall == number
+        is_seen = is_here & (seen.share > 0)
+        is_lit = is_here & (lit.share > 0)
+        is_both = is_seen & is_lit
+        towards_camera = lobe.towards(seen.towards[is_seen])
+        from_projector = lobe.towards(lit.towards[is_lit])
+        direct = lobe.direct(lit.towards[is_both], seen.towards[is_both])
+        blocks[is_here, :-1, :-1] = (matte + gloss * lobe.between) / bins
+        blocks[is_seen, -1, :-1] = (matte + gloss * towards_camera) / bins
+        blocks[is_lit, :-1, -1] = matte + gloss * from_projector
+        blocks[is_both, -1, -1] = matte + gloss * direct
     places = np.arange(len(wall))
     return scipy.sparse.bsr_array((blocks, places, np.arange(len(wall) + 1)))

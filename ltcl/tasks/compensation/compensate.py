@@ -22,7 +22,7 @@ from ltcl.device import Array
 from ltcl.errors import ConvergenceError
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.tasks.compensation.gain import exact_gain, gain_within_loss
-from ltcl.tasks.compensation.inputs import Request, check_inputs
+from ltcl.tasks.compensation.inputs import CompensationRequest, check_inputs
 from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
@@ -160,13 +160,13 @@ class StartingLight:
     """A gain, and the light (N, k) of each system to be brought within the bounds.
 
     `solutions` are those without bounds, one per channel, where T has an S. Light that
-    `meets_target` is the best there is if clipping does not change it.
+    `is_on_target` is the best there is if clipping does not change it.
     """
 
     gain: float
     light: Columns
     solutions: tuple[Solution, ...] = ()
-    meets_target: bool = False
+    is_on_target: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,7 +187,7 @@ class BoundedLight:
         return float(np.mean(self.frame_clipped))
 
 
-def _undo_light(request: Request) -> StartingLight:
+def _undo_light(request: CompensationRequest) -> StartingLight:
     """Step 2: the light without bounds, at the gain, or at the largest gain within the loss."""
     problem = request.problem
     if request.gain is None:
@@ -196,17 +196,17 @@ def _undo_light(request: Request) -> StartingLight:
         columns = problem.desired[0].shape[1]
         light = [np.zeros((len(scale), columns)) for _, scale in problem.systems]
         return StartingLight(gain=request.gain, light=light)
-    solutions = _solve_channels(request, problem.missing_light(request.gain))
+    solutions = _solve_channels(request, problem.light_to_add(request.gain))
     # S^-1 meets every pixel but masked ones, which count only where weights say so.
     return StartingLight(
         gain=request.gain,
         light=_projector_light(request, [s.x for s in solutions]),
         solutions=solutions,
-        meets_target=not problem.counts_masked_pixels,
+        is_on_target=not problem.counts_masked_pixels,
     )
 
 
-def _undo_light_at_largest_gain(request: Request) -> StartingLight:
+def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
     problem = request.problem
     if not request.T.is_square:
         gain, light = gain_within_loss(problem, request.loss)
@@ -220,7 +220,7 @@ def _undo_light_at_largest_gain(request: Request) -> StartingLight:
     gain = None
     if request.is_exact_gain_allowed:
         gain = exact_gain(slopes, shifts, problem.limits)
-    meets_target = gain is not None
+    is_on_target = gain is not None
     if gain is None:
         gain, light = gain_within_loss(problem, request.loss)
     else:
@@ -229,11 +229,11 @@ def _undo_light_at_largest_gain(request: Request) -> StartingLight:
         gain=gain,
         light=light,
         solutions=tuple(_solution_at_gain(s, gain) for s in solutions),
-        meets_target=meets_target,
+        is_on_target=is_on_target,
     )
 
 
-def _solve_channels(request: Request, targets: Columns) -> tuple[Solution, ...]:
+def _solve_channels(request: CompensationRequest, targets: Columns) -> tuple[Solution, ...]:
     """S^-1 of the targets of all systems: one solution per channel."""
     T = request.T
     if len(targets) != T.channels:
@@ -243,7 +243,7 @@ def _solve_channels(request: Request, targets: Columns) -> tuple[Solution, ...]:
         for channel, target in enumerate(targets):
             solutions.append(request.inverse.solve(target, channel))
         return tuple(solutions)
-    rtol = request.problem.rules.rtol
+    rtol = request.problem.settings.rtol
     return solve_each(
         T.systems,
         targets,
@@ -255,7 +255,7 @@ def _solve_channels(request: Request, targets: Columns) -> tuple[Solution, ...]:
     )
 
 
-def _projector_light(request: Request, direct: Columns) -> Columns:
+def _projector_light(request: CompensationRequest, direct: Columns) -> Columns:
     """The projector light of each system from the direct light of each channel."""
     light = layout.to_light(direct, request.first_bounce, request.T.mixing)
     return join_channels(light, len(request.problem.systems))
@@ -272,7 +272,7 @@ def _solution_at_gain(solution: Solution, gain: float) -> Solution:
     return dataclasses.replace(solution, x=x, standard_error=standard_error, rest=None)
 
 
-def _bring_within_bounds(request: Request, start: StartingLight) -> BoundedLight:
+def _bring_within_bounds(request: CompensationRequest, start: StartingLight) -> BoundedLight:
     """Step 3: the light within the bounds that comes nearest to the target, or the clamped one."""
     problem = request.problem
     limits = problem.limits
@@ -283,10 +283,10 @@ def _bring_within_bounds(request: Request, start: StartingLight) -> BoundedLight
     for index, unbounded in enumerate(start.light):
         nearest = limits.clip(unbounded)
         is_clipped = limits.exceeded(unbounded)
-        is_best = start.meets_target and is_clipped is None
+        is_best = start.is_on_target and is_clipped is None
         if not is_best and not request.clamp:
-            nearest, solution = problem.nearest(index, start.gain, nearest, problem.rules)
-            if request.throw and solution.status is Status.MAXITER:
+            nearest, solution = problem.nearest(index, start.gain, nearest, problem.settings)
+            if problem.settings.throw and solution.status is Status.MAXITER:
                 raise ConvergenceError(str(solution), solution)
             solves.append(solution)
             is_at_bound = (nearest <= limits.low) | (nearest >= limits.high)
@@ -298,7 +298,9 @@ def _bring_within_bounds(request: Request, start: StartingLight) -> BoundedLight
     return BoundedLight(light=light, solves=tuple(solves), frame_clipped=clipped / len(start.light))
 
 
-def _judge(request: Request, start: StartingLight, bounded: BoundedLight) -> Compensation:
+def _judge(
+    request: CompensationRequest, start: StartingLight, bounded: BoundedLight
+) -> Compensation:
     """Step 4: how far the scene under this light is from the target, with the evidence."""
     problem = request.problem
     pattern, evidence, target_norms = _gather_evidence(request, start, bounded)
@@ -323,13 +325,13 @@ def _judge(request: Request, start: StartingLight, bounded: BoundedLight) -> Com
         solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=bounded.solves,
         transport_error=request.transport_error,
-        rtol=problem.rules.rtol,
+        rtol=problem.settings.rtol,
         _evidence=evidence,
     )
 
 
 def _gather_evidence(
-    request: Request, start: StartingLight, bounded: BoundedLight
+    request: CompensationRequest, start: StartingLight, bounded: BoundedLight
 ) -> tuple[np.ndarray, Evidence, list[np.ndarray]]:
     """The pattern, the evidence, and the norms of the target, (k,) of each system."""
     problem = request.problem
@@ -377,7 +379,7 @@ def _least_error(problem: CompensationProblem, bounded: BoundedLight) -> float:
 
 
 def _residuals_of_solves(
-    request: Request, start: StartingLight, bounded: BoundedLight
+    request: CompensationRequest, start: StartingLight, bounded: BoundedLight
 ) -> Columns | None:
     """The residuals of the solves without bounds, if they are the missing light of this pattern."""
     if bounded.solves or bounded.clipped or request.problem.limits.masked.any():
@@ -407,7 +409,7 @@ def _explained_values(problem: CompensationProblem, target_norms: list[np.ndarra
     pixels = problem.desired[0].shape[0]
     explained = []
     for norms in target_norms:
-        tolerance = np.maximum(problem.rules.rtol * norms, problem.rules.atol)
+        tolerance = np.maximum(problem.settings.rtol * norms, problem.settings.atol)
         explained.append(EXPLAINED_DEVIATIONS * tolerance / np.sqrt(pixels))
     return explained
 

@@ -65,7 +65,7 @@ def gain_within_loss(problem: CompensationProblem, loss: float | None) -> tuple[
     """
     trials = GainTrials(problem)
     if loss is None:
-        rtol = problem.rules.rtol
+        rtol = problem.settings.rtol
         closest = ClosestPictureSearch(trials, enough=rtol / DEFAULT_LOSS_FACTOR).run()
         loss = max(rtol, DEFAULT_LOSS_FACTOR * closest.sine)
     search = LargestGainSearch(trials, loss)

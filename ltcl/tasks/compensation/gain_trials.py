@@ -16,12 +16,11 @@ import numpy as np
 import scipy.optimize
 
 from ltcl.errors import InputError
-from ltcl.solvers import Status
+from ltcl.solvers import SolveSettings, Status
 from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
     Limits,
-    StoppingRules,
     inner_product,
     multiply,
     subtract,
@@ -144,12 +143,12 @@ class GainTrials:
     ) -> SystemLight:
         problem = self.problem
         columns = sum(d.shape[1] for d in problem.desired)
-        rules = StoppingRules(
+        settings = SolveSettings(
             rtol=0.0,
             atol=accuracy * gain * self.desired_norm / np.sqrt(columns),
             maxiter=MAX_SOLVE_STEPS,
         )
-        light, solution = problem.nearest(index, gain, start, rules)
+        light, solution = problem.nearest(index, gain, start, settings)
         is_settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
         return SystemLight(
             light=light,
@@ -163,7 +162,7 @@ class GainTrials:
         problem = self.problem
         limits = problem.limits
         scale = problem.systems[index].scale
-        target = problem.missing_light(gain)[index]
+        target = problem.light_to_add(gain)[index]
         is_lit = (scale > 0.0) & ~limits.masked
         T = (self.matrices[index] * scale)[:, is_lit]
         columns = target.shape[1]
@@ -223,7 +222,7 @@ class GainTrials:
         problem = self.problem
         missing = []
         for b, A, system, p in zip(
-            problem.missing_light(gain), self.matrices, problem.systems, light, strict=True
+            problem.light_to_add(gain), self.matrices, problem.systems, light, strict=True
         ):
             missing.append(b - A @ (system.scale[:, None] * p))
         return problem.weighted(missing)

@@ -13,13 +13,12 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
-from ltcl.solvers import Inverse
-from ltcl.solvers.solve import METHODS, OPTIONS
+from ltcl.solvers import METHODS, Inverse, SolveSettings
+from ltcl.solvers.solve import OPTIONS
 from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
     Limits,
-    StoppingRules,
     channel_systems,
     join_channels,
 )
@@ -49,7 +48,7 @@ MIN_LOSS = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Request:
+class CompensationRequest:
     """The checked inputs of `compensate`.
 
     Attributes
@@ -72,7 +71,7 @@ class Request:
         Arguments of `ltcl.solve`.
     exact : sequence of Operator or None
         The systems that judge the solves of each channel.
-    clamp, throw : bool
+    clamp : bool
     """
 
     T: Transport
@@ -89,7 +88,6 @@ class Request:
     options: dict[str, Any]
     exact: Sequence[Operator | None]
     clamp: bool
-    throw: bool
 
 
 def check_inputs(
@@ -107,7 +105,7 @@ def check_inputs(
     inverse: Inverse | None,
     clamp: bool,
     options: dict[str, Any],
-) -> Request:
+) -> CompensationRequest:
     """Refuse bad inputs before anything is uploaded, and set up the problem."""
     check_transport(T, square=False)
     bounds = checks.interval("bounds", bounds)
@@ -123,7 +121,7 @@ def check_inputs(
         check_inverse(T, inverse, rtol, exact=exact, method=other_method)
     if rtol is None:
         rtol = default_rtol(RTOL, T, exact, inverse)
-    rules = check_rules(T, method, rtol, options, weight_unit)
+    settings = check_settings(T, method, rtol, options)
     if checks.flag("clamp", clamp) and not T.is_square:
         raise InputError(
             "clamp is True, but this T has no S; its light is found within the bounds only"
@@ -138,12 +136,12 @@ def check_inputs(
         weights=channel_weights,
         weight_unit=weight_unit,
         limits=limits,
-        rules=rules,
+        settings=dataclasses.replace(settings, atol=settings.atol / weight_unit),
     )
     first_bounce = np.zeros((T.channels, 0))
     if T.is_square:
         first_bounce = np.atleast_2d(T.first_bounce)
-    return Request(
+    return CompensationRequest(
         T=T,
         reference=reference,
         problem=problem,
@@ -158,7 +156,6 @@ def check_inputs(
         options=options,
         exact=judging_systems,
         clamp=clamp,
-        throw=options.get("throw", True),
     )
 
 
@@ -217,30 +214,21 @@ def check_weights(
     return [w / unit for w in channels], unit
 
 
-def check_rules(
-    T: Transport, method: str, rtol: float, options: dict[str, Any], weight_unit: float
-) -> StoppingRules:
-    """The rules of a solve within the bounds; a T without S has no other solve."""
+def check_settings(
+    T: Transport, method: str, rtol: float, options: dict[str, Any]
+) -> SolveSettings:
+    """The settings of a solve within the bounds; a T without S has no other solve."""
     checks.one_of("method", method, METHODS)
     if not T.is_square and method != "auto":
         raise InputError(
             f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'"
         )
     _check_option_names(T, method, options)
-    rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
-    atol = checks.number("atol", options.get("atol", 0.0), least=0.0)
-    if rtol == 0.0 and atol == 0.0:
-        condition = " where atol is 0" if "atol" in options else ""
-        raise InputError(f"rtol is 0; it must be above 0 and below 1{condition}")
-    rules = StoppingRules(
-        rtol=rtol,
-        atol=atol / weight_unit,
-        callback=options.get("callback"),
-    )
-    if options.get("maxiter") is not None:
-        maxiter = checks.count("maxiter", options["maxiter"])
-        rules = dataclasses.replace(rules, maxiter=maxiter)
-    return rules
+    shared = {}
+    for name in SOLVE_OPTIONS:
+        if options.get(name) is not None:
+            shared[name] = options[name]
+    return SolveSettings(rtol=rtol, **shared)
 
 
 def _check_option_names(T: Transport, method: str, options: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ import scipy.sparse
 from ltcl.device import Device
 from ltcl.errors import InputError
 from ltcl.operators import Operator, ScaledColumns, as_operator
+from ltcl.solvers import SolveSettings
 from ltcl.solvers.bounded import Bounded, minimise, round_inwards
 from ltcl.transport.transport import Transport
 
@@ -80,22 +80,13 @@ class Limits:
         return ~is_inside
 
 
-@dataclass(frozen=True, kw_only=True)
-class StoppingRules:
-    """Settings of a solve within the bounds; atol is in the units of the weighted picture."""
-
-    rtol: float = 1e-2
-    atol: float = 0.0
-    maxiter: int = 1000
-    callback: Callable[[int, float], object] | None = None
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CompensationProblem:
     """The pictures to be seen: T p + background = gain * desired, weighted by w.
 
     Lists hold (M, k) arrays, one per system. `weight_unit` is the unit of the weights, which keeps
-    their squares inside float64. `products` counts the products of each system so far.
+    their squares inside float64. `settings` are those of a solve within the bounds, with atol in
+    that unit. `products` counts the products of each system so far.
     """
 
     systems: tuple[ChannelSystem, ...]
@@ -104,7 +95,7 @@ class CompensationProblem:
     weights: Columns | None
     weight_unit: float
     limits: Limits
-    rules: StoppingRules
+    settings: SolveSettings
     products: Counter[int] = field(default_factory=Counter)
 
     @cached_property
@@ -145,7 +136,7 @@ class CompensationProblem:
             return self.desired
         return multiply(gain, self.desired)
 
-    def missing_light(self, gain: float) -> Columns:
+    def light_to_add(self, gain: float) -> Columns:
         """gain * desired - background: the light that the projector has to add."""
         target = self.target(gain)
         if not self.has_background:
@@ -171,7 +162,7 @@ class CompensationProblem:
                 )
 
     def nearest(
-        self, index: int, gain: float, start: np.ndarray, rules: StoppingRules
+        self, index: int, gain: float, start: np.ndarray, settings: SolveSettings
     ) -> tuple[np.ndarray, Bounded]:
         """The light (N, k) of one system within the limits that comes nearest to the target.
 
@@ -184,15 +175,15 @@ class CompensationProblem:
         upper = (free_scale * limits.high).astype(np.float32)
         solution = minimise(
             A,
-            self.missing_light(gain)[index],
+            self.light_to_add(gain)[index],
             lower[:, 0],
             upper[:, 0],
             scale[:, None] * start,
             weights=None if self.weights is None else self.weights[index],
-            rtol=rules.rtol,
-            atol=rules.atol,
-            maxiter=rules.maxiter,
-            callback=rules.callback,
+            rtol=settings.rtol,
+            atol=settings.atol,
+            maxiter=settings.maxiter,
+            callback=settings.callback,
         )
         self.products[index] += solution.products
         solution = dataclasses.replace(

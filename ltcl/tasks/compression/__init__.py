@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compressed transports: R as few numbers between two bases, with a bound on what a solution loses."""
+"""Compressed transports: R as few numbers between two bases, with a bound on the loss of a solution."""
 
 from __future__ import annotations
 
-from ltcl.tasks.compression.coefficients import INVERSE_NAMES
-from ltcl.tasks.compression.compress import ChannelCompression, Compression, Trial, compress
-from ltcl.tasks.compression.invert import SparseInverse, invert, invert_coefficients
-from ltcl.tasks.compression.losses import inverse_norm
+from ltcl.tasks.compression.bases import INVERSE_NAMES
+from ltcl.tasks.compression.compress import compress
+from ltcl.tasks.compression.fit import ChannelCompression, Compression, Trial
+from ltcl.tasks.compression.invert import invert
+from ltcl.tasks.compression.norms import inverse_norm
+from ltcl.tasks.compression.sparse_inverse import SparseInverse, invert_coefficients
 
 __all__ = [
     "INVERSE_NAMES",
@@ -15,5 +17,7 @@ __all__ = [
     "SparseInverse",
     "Trial",
     "compress",
+    "inverse_norm",
+    "invert",
+    "invert_coefficients",
 ]
-__all__ += ["inverse_norm", "invert", "invert_coefficients"]

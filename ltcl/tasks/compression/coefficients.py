@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bases in which R is written, by name, and C = W_out R W_in^T between them without its small numbers.
+"""C = W_out R W_in^T between two bases, without its small numbers.
 
 Where the host has room for all of C, one threshold is taken of it. Else blocks of rows stream
-through W_in, what is below a first threshold is dropped, and blocks of columns stream through
-W_out. Both bases are orthonormal: the error of R in the Frobenius norm is at most the sum of what
-both passes drop.
+through W_in, numbers below a first threshold are dropped, and blocks of columns stream through W_out.
+Both bases are orthonormal: the error of R in the Frobenius norm is at most the sum of what both
+passes drop.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,204 +18,111 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Device, open_device
-from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Basis, Compressed, SubsetBasis, Tiles, Wavelet, basis, smallest
-from ltcl.operators.bases import multiresolution_order, restrict_to_support
-from ltcl.operators.stored import basis_of
+from ltcl.operators import smallest
 from ltcl.operators.tiles import Packed
-from ltcl.operators.wavelets import filters
-from ltcl.tasks.compression.losses import estimate_norm
-from ltcl.tasks.compression.sources import COLUMNS, Rows, cut, source
+from ltcl.tasks.compression.norms import estimate_norm
+from ltcl.tasks.compression.sources import COLUMNS, SourceRows, cut, source
 
-Transform = Callable[
-    [np.ndarray], np.ndarray
-]  # (N, k) float32 -> (N, k) float32, k a multiple of COLUMNS
+# (N, k) float32 -> (N, k) float32, k a multiple of COLUMNS.
+Transform = Callable[[np.ndarray], np.ndarray]
 Progress = Callable[[float], object]
-_CACHED = 512  # rows of a dense block that stay in the cache while they are looked at several times
-_SHIFT = 16  # bits of a float32 that a bin of `threshold_within` leaves open
-_PIECE = 1 << 22  # numbers counted at once
-PIXELS, ROWS = "pixels", " rows"
-INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)  # compared where none is named, in this order
-_SIGNS = 32  # pictures of random signs
-_own_device = functools.cache(open_device)  # of a worker, which keeps it
 
-
-def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
-    """Names of one basis or of several, as a list."""
-    names = [names] if isinstance(names, str) else names
-    if (
-        not isinstance(names, (list, tuple))
-        or not all(isinstance(name, str) for name in names)
-        or not names
-    ):
-        raise InputTypeError(
-            f"basis is {names!r}; it must be a name, such as db2, or a list of at least one"
-        )
-    for name in names:
-        if for_inverse and name.endswith(ROWS):
-            raise InputError(
-                f"basis is {name!r}; an inverse needs one basis on both sides, such as 'db2'"
-            )
-        try:
-            if name != PIXELS:
-                filters(name.removesuffix(ROWS))
-        except InputError as error:
-            known = "pixels, or an orthonormal wavelet such as haar, db2 or db4, with ' rows' for rows alone"
-            raise InputError(f"basis is {name!r}; it must be {known}") from error
-    return list(names)
-
-
-@dataclass(frozen=True)
-class Bases:
-    """R = out^T C into; None is pixels.
-
-    `weights` (N,) of columns, at least 1, are the root of 1 + N e: the squares that a number which
-    is dropped costs a single pixel, and light of energies e.
-    """
-
-    device: Device
-    name: str
-    out: Basis | None
-    into: Basis | None
-    weights: np.ndarray
-
-    @classmethod
-    def named(cls, device: Device, grid: tuple[int, int], name: str, light: Any = None) -> Bases:
-        """Those of a name, on a grid, with weights by `light` (N, k) of norm 1."""
-        W = basis(device, grid, name.removesuffix(ROWS))
-        if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
-            order = multiresolution_order(grid, W.levels)
-            W = SubsetBasis(device, grid, order, of=W)
-        weights = np.sqrt(1.0 + (0.0 if light is None else len(light) * energies(W, light)))
-        weights = np.broadcast_to(weights, grid[0] * grid[1])
-        return cls(device, name, None if name.endswith(ROWS) else W, W, weights)
-
-    def compressed(self, core: Any, allowance: float) -> Compressed:
-        """R~ of a core with weights, rounded by `allowance` in the 2-norm, about: see `quantize`.
-
-        Where both sides have one basis, it is without coefficients that the core does not touch.
-        """
-        data = (core.data / self.weights[core.indices]).astype(core.dtype)
-        core = scipy.sparse.csr_array((data, core.indices, core.indptr), core.shape)
-        out, into = self.out, self.into
-        if into is not None and out is into:
-            core, into = restrict_to_support(core, into)
-            out = into
-        return Compressed(Tiles(self.device, quantize(core, allowance)), out, into, 0.0)
-
-    def gather(
-        self, R: Rows, progress: Progress = lambda share: None, **limits: Any
-    ) -> Coefficients:
-        """The numbers of R, times the weights, within the `limits` of `coefficients`."""
-        into = Analysis(self.into, self.weights[:, None].astype(np.float32))
-        return coefficients(R, self.out and Analysis(self.out), into, progress=progress, **limits)
-
-    def noise(self, variances: Any) -> list[np.ndarray]:
-        """Standard deviations of rows and columns of weighted numbers, of random signs: each within 13 %."""
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (variances.shape[1], _SIGNS))
-        sides = zip((self.out, self.into), variances, (1.0, self.weights), strict=True)
-        return [
-            weights * np.sqrt(energies(W, np.sqrt(each)[:, None] * signs))
-            for W, each, weights in sides
-        ]
-
-
-def energies(W: Basis | None, x: np.ndarray) -> np.ndarray:
-    """Mean squares of the coefficients of light x (N, k), k a multiple of `COLUMNS`; None is pixels."""
-    return np.mean(
-        np.square(x if W is None else Analysis(W)(x.astype(np.float32)), dtype=np.float64), axis=1
-    )
-
-
-@dataclass(frozen=True)
-class Analysis:
-    """W x of light x (N, k) on the host in float32, times weights; None is pixels. Pickles find a device."""
-
-    W: Basis | None
-    weights: np.ndarray | None = None
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Of columns."""
-        y = x if self.W is None else self.W.apply(self.W.device.upload(x)).get()
-        return y if self.weights is None else self.weights * y
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _analysis, (self.W and self.W.to_arrays(), self.weights)
-
-
-def _analysis(arrays: Any, weights: np.ndarray | None) -> Analysis:
-    return Analysis(arrays and basis_of(_own_device(), arrays), weights)
+# Rows of a dense block that stay in the cache while they are looked at several times.
+CACHED_ROWS = 512
+# Bits of a float32 that a bin of `threshold_within` leaves open.
+BIN_BITS = 16
+# Numbers that are counted at once.
+NUMBERS_AT_ONCE = 1 << 22
+# Bytes of a number that is kept: 8, and up to twice as many for a while.
+BYTES_PER_NUMBER = 16
+# Room for rounding of sums in comparing squares.
+SQUARE_TOLERANCE = 1e-12
 
 
 def quantize(C: scipy.sparse.csr_array, allowance: float) -> Packed:
     """C in the tiles of fewest bytes whose rounding has a 2-norm of at most about `allowance`.
 
-    That norm is estimated; who hands out the tiles measures what they are worth.
+    That norm is estimated; whoever hands out the tiles measures their error.
     """
     size = float(np.linalg.norm(C.data.astype(np.float64)))
-    frobenius = allowance * math.sqrt(
-        len(C.indptr) - 1
-    )  # or less: the 2-norm of rounding is far below
+    rows = len(C.indptr) - 1
+    # The 2-norm of rounding is far below its Frobenius norm, which is that of equal rows at most.
+    frobenius = allowance * math.sqrt(rows)
     while True:
-        packed = smallest(C, frobenius / size if size else 0.0)
-        fits = packed.precision == "float32" or packed.difference[1] <= allowance
-        if fits or estimate_norm(scipy.sparse.csr_array(packed.matrix() - C))[0] <= allowance:
+        relative = frobenius / size if size else 0.0
+        packed = smallest(C, relative)
+        frobenius_of_rounding, norm_of_rounding = packed.difference
+        if packed.precision == "float32" or norm_of_rounding <= allowance:
             return packed
-        frobenius = 0.5 * packed.difference[0]
+        rounding = scipy.sparse.csr_array(packed.matrix() - C)
+        if estimate_norm(rounding)[0] <= allowance:
+            return packed
+        frobenius = 0.5 * frobenius_of_rounding
 
 
 def drop_below(X: Any, threshold: float) -> tuple[scipy.sparse.csr_array, float]:
     """The numbers of X, dense or CSR, of at least `threshold`, and the sum of squares of the others."""
     if scipy.sparse.issparse(X):
-        keep = np.abs(X.data) >= threshold
-        small = X.data[~keep].astype(np.float64)
-        ends = np.concatenate([[0], np.cumsum(keep)]).astype(X.indptr.dtype)[X.indptr]
-        return scipy.sparse.csr_array((X.data[keep], X.indices[keep], ends), X.shape), float(
-            small @ small
-        )
-    counts, indices, values, squares = [np.zeros(1, np.int64)], [], [], []
-    for start, stop in cut(len(X), _CACHED):
+        return _drop_below_sparse(X, threshold)
+    counts = [np.zeros(1, np.int64)]
+    indices = []
+    values = []
+    squares = []
+    for start, stop in cut(len(X), CACHED_ROWS):
         block = np.ascontiguousarray(X[start:stop])
-        keep = (np.abs(block) >= threshold) & (block != 0.0)
-        places = np.flatnonzero(keep)
-        counts.append(np.count_nonzero(keep, axis=1))
+        is_kept = (np.abs(block) >= threshold) & (block != 0.0)
+        places = np.flatnonzero(is_kept)
+        counts.append(np.count_nonzero(is_kept, axis=1))
         indices.append((places % block.shape[1]).astype(np.int32))
         values.append(block.flat[places])
-        rest = block.astype(np.float64)
-        rest.flat[places] = 0.0
-        squares.append(float(np.vdot(rest, rest)))
-    arrays = (np.concatenate(values), np.concatenate(indices), np.cumsum(np.concatenate(counts)))
-    return scipy.sparse.csr_array(arrays, X.shape), math.fsum(squares)
+        dropped = block.astype(np.float64)
+        dropped.flat[places] = 0.0
+        squares.append(float(np.vdot(dropped, dropped)))
+    pointers = np.cumsum(np.concatenate(counts))
+    csr = (np.concatenate(values), np.concatenate(indices), pointers)
+    return scipy.sparse.csr_array(csr, X.shape), math.fsum(squares)
+
+
+def _drop_below_sparse(X: Any, threshold: float) -> tuple[scipy.sparse.csr_array, float]:
+    is_kept = np.abs(X.data) >= threshold
+    dropped = X.data[~is_kept].astype(np.float64)
+    kept_before = np.concatenate([[0], np.cumsum(is_kept)]).astype(X.indptr.dtype)
+    csr = (X.data[is_kept], X.indices[is_kept], kept_before[X.indptr])
+    return scipy.sparse.csr_array(csr, X.shape), float(dropped @ dropped)
 
 
 def threshold_within(frobenius: float, *arrays: np.ndarray, most: float = math.inf) -> float:
-    """The largest threshold below which float32 arrays have at most this norm; more, to leave `most` numbers.
+    """The largest threshold below which float32 arrays have at most a Frobenius norm.
 
-    Without sorting: numbers are counted in bins of less than a percent, the same exponent and first
-    seven bits behind it, and the threshold is an edge of a bin.
+    It is larger where that leaves more than `most` numbers. Nothing is sorted: numbers are counted
+    in bins of less than a percent, of the same exponent and first seven bits behind it, and the
+    threshold is an edge of a bin.
     """
-    bins = 1 << (32 - _SHIFT - 1)
-    counts, squares = np.zeros(bins, np.int64), np.zeros(bins)
-    for flat in map(np.ravel, arrays):
-        for start, stop in cut(flat.size, _PIECE):
-            piece = np.abs(flat[start:stop])
-            keys = piece.view(np.int32) >> _SHIFT
+    bins = 1 << (32 - BIN_BITS - 1)
+    counts = np.zeros(bins, np.int64)
+    squares = np.zeros(bins)
+    for array in arrays:
+        flat = np.ravel(array)
+        for start, stop in cut(flat.size, NUMBERS_AT_ONCE):
+            sizes = np.abs(flat[start:stop])
+            keys = sizes.view(np.int32) >> BIN_BITS
             counts += np.bincount(keys, minlength=bins)
-            squares += np.bincount(keys, np.square(piece, dtype=np.float64), minlength=bins)
-    edge = int(np.searchsorted(np.cumsum(squares), frobenius**2 * (1 + 1e-12), side="right"))
-    edge = min(edge, int(np.flatnonzero(counts)[-1]) + 1 if counts.any() else 0)
-    above = np.cumsum(counts[::-1])[::-1]  # numbers in this bin and beyond
-    edge = max(edge, int(np.searchsorted(-above, -most, side="left")))
-    return float(np.int32(edge << _SHIFT).view(np.float32))
+            squares += np.bincount(keys, np.square(sizes, dtype=np.float64), minlength=bins)
+    largest_square = frobenius**2 * (1 + SQUARE_TOLERANCE)
+    edge = int(np.searchsorted(np.cumsum(squares), largest_square, side="right"))
+    edge_above_all = int(np.flatnonzero(counts)[-1]) + 1 if counts.any() else 0
+    edge = min(edge, edge_above_all)
+    numbers_from_bin = np.cumsum(counts[::-1])[::-1]
+    edge = max(edge, int(np.searchsorted(-numbers_from_bin, -most, side="left")))
+    return float(np.int32(edge << BIN_BITS).view(np.float32))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Coefficients:
     """The numbers of R between two bases of at least `threshold`: R~ = W_out^T core W_in.
 
-    `first` is the Frobenius norm of what was dropped between the passes, `second` of what was at
-    the end.
+    `first` is the Frobenius norm of what was dropped between the passes, `second` of what was
+    dropped at the end.
     """
 
     core: scipy.sparse.csr_array
@@ -231,17 +137,17 @@ class Coefficients:
 
     def largest(self, drop: float) -> Coefficients:
         """The largest of them, so that all in all about the Frobenius norm `drop` is left out."""
-        threshold = threshold_within(math.sqrt(max(drop**2 - self.dropped**2, 0.0)), self.core.data)
+        room = max(drop**2 - self.dropped**2, 0.0)
+        threshold = threshold_within(math.sqrt(room), self.core.data)
         if threshold <= self.threshold:
             return self
-        core, lost = drop_below(self.core, threshold)
-        return replace(
-            self, core=core, second=math.sqrt(self.second**2 + lost), threshold=threshold
-        )
+        core, squares = drop_below(self.core, threshold)
+        second = math.sqrt(self.second**2 + squares)
+        return replace(self, core=core, second=second, threshold=threshold)
 
 
 def coefficients(
-    R: Rows,
+    R: SourceRows,
     out: Transform | None,
     into: Transform | None,
     threshold: float | None = None,
@@ -251,96 +157,165 @@ def coefficients(
     first: float | None = None,
     progress: Progress = lambda share: None,
 ) -> Coefficients:
-    """C = W_out R W_in^T without what is below `threshold`, and below `first` between the two passes.
+    """C = W_out R W_in^T without what is below a threshold.
 
-    W_out of (M, k) and W_in of (N, k) numbers are orthonormal, None of pixels. By default,
-    `threshold` is the largest that drops no more than the Frobenius norm `drop`, or a larger one
-    where that keeps more than `most` numbers, and `first` 0 where the host has room for all numbers
-    twice, else what drops about a third of `drop`, or more. The core has the same bits for any
-    `R.memory` and `R.client`.
+    Parameters
+    ----------
+    R : SourceRows, (M, N)
+    out, into : callable or None
+        Orthonormal W_out of (M, k) and W_in of (N, k) numbers; None is pixels.
+    threshold : float, optional
+        By default the largest that drops no more than the Frobenius norm `drop`, or a larger one
+        where that keeps more than `most` numbers.
+    first : float, optional
+        Threshold between the two passes. By default 0 where the host has room for all numbers
+        twice, else one that drops about a third of `drop`, or more.
+    progress : callable(share)
+
+    Returns
+    -------
+    Coefficients
+        The core has the same bits for any `R.memory` and `R.client`.
     """
-    (m, n), room = R.shape, checks.host_memory() // 2
+    m, n = R.shape
+    room = checks.host_memory() // 2
     if first is None and 4 * m * n <= room:
-        C = np.empty((m, n), np.float32)
-        for at, rows in R.each(lambda at, rows, _: (at, _transformed(into, rows.T).T)):
-            C[at] = rows
-            progress(0.5 * at.stop / m)
-        for start, stop in cut(n, _CACHED) if out is not None else ():
-            C[:, start:stop] = _transformed(out, C[:, start:stop])
-        threshold = threshold_within(drop, C, most=most) if threshold is None else threshold
-        core, lost = drop_below(C, threshold)
-        progress(1.0)
-        return Coefficients(core, 0.0, math.sqrt(lost), threshold)
-    most = min(most, room // 16)  # 8 bytes each, and up to twice as many for a while
+        return _dense_coefficients(R, out, into, threshold, drop, most, progress)
+    room_for_numbers = room // BYTES_PER_NUMBER
+    most = min(most, room_for_numbers)
     if out is None:
-        core, lost, threshold = _collect(R, into, threshold, drop, most, progress)
-        return Coefficients(core, 0.0, lost, threshold)
-    between, left, _ = _collect(
-        R, into, first, drop / 3.0, room // 16, lambda share: progress(0.5 * share)
-    )
-    columns = scipy.sparse.csr_array(between.T)
+        collected = _collect(R, into, threshold, drop, most, progress)
+        return Coefficients(
+            core=collected.core, first=0.0, second=collected.lost, threshold=collected.threshold
+        )
+
+    def progress_of_rows(share: float) -> None:
+        progress(0.5 * share)
+
+    def progress_of_columns(share: float) -> None:
+        progress(0.5 + 0.5 * share)
+
+    between = _collect(R, into, first, drop / 3.0, room_for_numbers, progress_of_rows)
+    columns = scipy.sparse.csr_array(between.core.T)
     lit = np.flatnonzero(np.diff(columns.indptr))  # few, where light is smooth
-    columns, note = (
-        source("C", columns[lit], R.memory, R.client),
-        lambda share: progress(0.5 + 0.5 * share),
-    )
-    core, lost, threshold = _collect(columns, out, threshold, drop, most, note)
-    core = scipy.sparse.csr_array(core.T)
+    lit_columns = source("C", columns[lit], R.memory, R.client)
+    collected = _collect(lit_columns, out, threshold, drop, most, progress_of_columns)
+    core = scipy.sparse.csr_array(collected.core.T)
     indices = lit.astype(core.indices.dtype)[core.indices]
     core = scipy.sparse.csr_array((core.data, indices, core.indptr), (m, n))
-    return Coefficients(core, left, lost, threshold)
+    return Coefficients(
+        core=core, first=between.lost, second=collected.lost, threshold=collected.threshold
+    )
+
+
+def _dense_coefficients(
+    R: SourceRows,
+    out: Transform | None,
+    into: Transform | None,
+    threshold: float | None,
+    drop: float,
+    most: float,
+    progress: Progress,
+) -> Coefficients:
+    """`coefficients` where all numbers fit into memory."""
+    m, n = R.shape
+    C = np.empty((m, n), np.float32)
+
+    def transform_rows(place: slice, rows: np.ndarray, value: Any) -> tuple[slice, np.ndarray]:
+        return place, _transformed(into, rows.T).T
+
+    for place, rows in R.each(transform_rows):
+        C[place] = rows
+        progress(0.5 * place.stop / m)
+    if out is not None:
+        for start, stop in cut(n, CACHED_ROWS):
+            C[:, start:stop] = _transformed(out, C[:, start:stop])
+    if threshold is None:
+        threshold = threshold_within(drop, C, most=most)
+    core, squares = drop_below(C, threshold)
+    progress(1.0)
+    return Coefficients(core=core, first=0.0, second=math.sqrt(squares), threshold=threshold)
+
+
+@dataclass(frozen=True)
+class _Collected:
+    """The large numbers of R W^T, the Frobenius norm of what was lost, and the threshold."""
+
+    core: scipy.sparse.csr_array
+    lost: float
+    threshold: float
 
 
 def _collect(
-    R: Rows,
+    R: SourceRows,
     W: Transform | None,
     threshold: float | None,
     drop: float,
     most: float,
     progress: Progress,
-) -> tuple[scipy.sparse.csr_array, float, float]:
-    """R W^T without what is below a threshold; what was lost; and the threshold.
+) -> _Collected:
+    """R W^T without what is below a threshold.
 
-    One that is not given rises whenever twice as many numbers as `most` have come together, never
-    above what all of them call for.
+    A threshold that is not given rises whenever twice as many numbers as `most` have come together,
+    never above what all of them call for.
     """
-    pieces: list[Any] = [scipy.sparse.csr_array((0, R.shape[1]), dtype=np.float32)]
-    lost, lowest = 0.0, threshold or 0.0
+    kept = _KeptNumbers(R.shape[1], threshold or 0.0)
 
-    def large(
-        at: slice, rows: np.ndarray, least: float
+    def large_numbers(
+        place: slice, rows: np.ndarray, least: float
     ) -> tuple[int, scipy.sparse.csr_array, float]:
         core, squares = drop_below(_transformed(W, rows.T), least)
-        return at.stop, scipy.sparse.csr_array(core.T), squares
+        return place.stop, scipy.sparse.csr_array(core.T), squares
 
-    def raise_threshold(frobenius: float) -> None:
-        nonlocal pieces, lost, lowest
-        lowest = max(
-            lowest, threshold_within(frobenius, *(piece.data for piece in pieces), most=most)
-        )
-        cores, squares = zip(*(drop_below(piece, lowest) for piece in pieces), strict=True)
-        pieces, lost = list(cores), lost + math.fsum(squares)
-
-    for stop, piece, squares in R.each(large, lambda: lowest):
-        pieces.append(piece)
-        lost += squares
-        if threshold is None and sum(piece.nnz for piece in pieces) > 2 * most:
-            raise_threshold(0.0)
+    for stop, piece, squares in R.each(large_numbers, lambda: kept.threshold):
+        kept.append(piece, squares)
+        if threshold is None and kept.count > 2 * most:
+            kept.raise_threshold(0.0, most)
         progress(stop / R.shape[0])
     if threshold is None:
-        raise_threshold(math.sqrt(max(drop**2 - lost, 0.0)))
-    return (
-        scipy.sparse.csr_array(scipy.sparse.vstack(pieces, format="csr")),
-        math.sqrt(lost),
-        lowest,
-    )
+        room = max(drop**2 - kept.squares, 0.0)
+        kept.raise_threshold(math.sqrt(room), most)
+    core = scipy.sparse.csr_array(scipy.sparse.vstack(kept.pieces, format="csr"))
+    return _Collected(core, math.sqrt(kept.squares), kept.threshold)
+
+
+class _KeptNumbers:
+    """Pieces of a sparse matrix that come together, above a threshold that rises."""
+
+    def __init__(self, columns: int, threshold: float) -> None:
+        self.threshold = threshold
+        self.squares = 0.0  # of what was dropped
+        self.pieces: list[Any] = [scipy.sparse.csr_array((0, columns), dtype=np.float32)]
+
+    @property
+    def count(self) -> int:
+        """Numbers in all pieces."""
+        return sum(piece.nnz for piece in self.pieces)
+
+    def append(self, piece: scipy.sparse.csr_array, squares: float) -> None:
+        """Add a piece, of which numbers with these `squares` were dropped."""
+        self.pieces.append(piece)
+        self.squares += squares
+
+    def raise_threshold(self, frobenius: float, most: float) -> None:
+        """Drop numbers of at most this norm, and more, to leave `most`."""
+        values = [piece.data for piece in self.pieces]
+        self.threshold = max(self.threshold, threshold_within(frobenius, *values, most=most))
+        pieces = []
+        squares = []
+        for piece in self.pieces:
+            core, dropped = drop_below(piece, self.threshold)
+            pieces.append(core)
+            squares.append(dropped)
+        self.pieces = pieces
+        self.squares += math.fsum(squares)
 
 
 def _transformed(transform: Transform | None, block: np.ndarray) -> np.ndarray:
     """`transform` of the columns of `block`, filled up with zeros to a multiple of `COLUMNS`."""
     if transform is None:
         return np.ascontiguousarray(block)
-    count = block.shape[1]
-    padded = np.zeros((len(block), -(-count // COLUMNS) * COLUMNS), np.float32)
-    padded[:, :count] = block
-    return transform(padded)[:, :count]
+    rows, columns = block.shape
+    padded = np.zeros((rows, -(-columns // COLUMNS) * COLUMNS), np.float32)
+    padded[:, :columns] = block
+    return transform(padded)[:, :columns]

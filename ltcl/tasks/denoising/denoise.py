@@ -15,6 +15,7 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
 from ltcl.tasks.denoising.problem import DenoisingProblem
 from ltcl.tasks.denoising.shrinkage import NoteShare, first_estimate, refine
+from ltcl.tasks.requirements import check_progress
 from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport, check_transport
 
@@ -51,24 +52,26 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     Examples
     --------
     >>> import ltcl, numpy
-    >>> from ltcl.transport.noise import Noise
+    >>> from ltcl.tasks.requirements import check_progress
+    from ltcl.transport.noise import Noise
     >>> exact = ltcl.scenes.dihedral(8, albedo=0.6).transport().to_numpy()
     >>> error = 0.001 * numpy.random.default_rng(0).standard_normal(exact.shape)
     >>> T = ltcl.Transport(exact + error, (8, 16), noise=Noise.uniform(exact.shape, 0.001))
     >>> bool(numpy.linalg.norm(ltcl.denoise(T).to_numpy() - exact) < 0.5 * numpy.linalg.norm(error))
     True
     """
-    _check_input(T, progress)
+    _check_entries(T)
+    report = check_progress(progress)
     matrices = []
     variance_shares = np.ones(T.channels)
     for channel in range(T.channels):
-        note = partial(_report_share, progress, channel, T.channels)
+        note = partial(_report_share, report, channel, T.channels)
         entries, variance_shares[channel] = _denoise_channel(T, channel, note)
         matrices.append(entries)
     return _transport_like(T, matrices, _scaled_noise(T.noise, variance_shares))
 
 
-def _check_input(T: Any, progress: Any) -> None:
+def _check_entries(T: Any) -> None:
     check_transport(T, square=False)
     if T.blocks is not None:
         raise InputError("T has blocks between colours; denoise takes a T of 1 or 3 channels")
@@ -79,8 +82,6 @@ def _check_input(T: Any, progress: Any) -> None:
                 f"T is made of {type(A).__name__}; it must be of arrays or sparse: "
                 "denoise, then compress"
             )
-    if progress is not None and not callable(progress):
-        raise InputTypeError(f"progress is {progress!r}; it must be callable(text, share), or None")
     rows, columns = T.shape
     checks.fits_host("denoising", 4 * ARRAYS_AT_ONCE * rows * columns)
 
@@ -141,8 +142,7 @@ def _transport_like(T: Transport, matrices: list[np.ndarray], noise: Noise) -> T
 
 
 def _report_share(
-    progress: Callable[[str, float], object] | None, channel: int, channels: int, share: float
+    report: Callable[[str, float], object], channel: int, channels: int, share: float
 ) -> None:
     """Report progress: `share` is 1 after the first estimate of a channel, and 2 at its end."""
-    if progress is not None:
-        progress("denoising", (channel + share / 2) / channels)
+    report("denoising", (channel + share / 2) / channels)

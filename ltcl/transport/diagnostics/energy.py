@@ -50,7 +50,7 @@ class Energy:
 
     @property
     def conserved(self) -> bool:
-        """Whether every pixel gives back less light than it gets; False if unknown."""
+        """True if every pixel gives back less light than it gets; False if unknown."""
         return self.bounce_highest < 1.0
 
 

@@ -73,7 +73,7 @@ class _RowPairs:
         return float(self._difference(i, j).mean())
 
     def jump_at_ends(self, width: int) -> bool:
-        """Whether rows differ more over the ends of a width than within."""
+        """True if rows differ more over the ends of a width than within."""
         pixels = self.random.permutation(self.n - 1)
         is_last = pixels % width == width - 1
         last = pixels[is_last][:PAIRS]

@@ -19,7 +19,7 @@ ENTRIES_PER_STEP = 1 << 22
 
 
 def shows_rows(T: Any) -> bool:
-    """Whether rows of T can be read: an array, a sparse matrix, or rows of a store."""
+    """True if rows of T can be read: an array, a sparse matrix, or rows of a store."""
     return hasattr(T, "rows") or isinstance(T, np.ndarray) or scipy.sparse.issparse(T)
 
 

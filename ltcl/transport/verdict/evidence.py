@@ -78,7 +78,7 @@ class Evidence:
             yield Measure("dark", T.masked.mean(), place)
 
     def _shows_damages(self, channel: int) -> bool:
-        """Whether the entries of a channel are read, and are enough."""
+        """True if the entries of a channel are read, and are enough."""
         has_entries = isinstance(self.matrices[channel], ENTRIES)
         return self.T.is_square and has_entries and len(self.T.masked) >= MIN_PIXELS
 

@@ -70,7 +70,7 @@ class Finding:
 
     @property
     def spoils(self) -> bool:
-        """Whether it spoils some use."""
+        """True if it spoils some use."""
         return self.spoils_compensation or self.spoils_bounces
 
 

@@ -17,7 +17,8 @@ import ltcl
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Wavelet
-from ltcl.tasks.compression.coefficients import Analysis, coefficients
+from ltcl.tasks.compression.bases import CoefficientAnalysis
+from ltcl.tasks.compression.coefficients import coefficients
 from ltcl.tasks.compression.sources import source
 
 from_array: Any = dask.array.from_array  # whose chunks are no str
@@ -117,8 +118,8 @@ def test_numbers_of_rows_larger_than_memory_are_those_of_the_serial_ones(
     monkeypatch.setattr(
         checks, "host_memory", lambda: 4 * N * N
     )  # half of it is too little for all
-    monkeypatch.setattr("ltcl.compression.sources._ITEMS", 3)  # several blocks in each
-    W = Analysis(Wavelet(device, GRID, "db2"))
+    monkeypatch.setattr("ltcl.tasks.compression.sources.MAX_ITEMS", 3)  # several blocks in each
+    W = CoefficientAnalysis(Wavelet(device, GRID, "db2"))
     out = W if sides == 2 else None
     serial = coefficients(source("T", matrix, SMALLEST), out, W, **limits)
     C = coefficients(source("T", Rows(matrix), SMALLEST, client), out, W, **limits)

@@ -47,7 +47,7 @@ class Corner(NamedTuple):
 
 @cache
 def corner() -> Corner:
-    """Albedo 0.85, direct light of 81.8 %; 12 pixels with 1e-6 of their light, one without light."""
+    """Albedo 0.85, direct light of 81.8 %; 12 pixels have 1e-6 of their light, one has none."""
     rng = np.random.default_rng(1)
     N = n * n
     G = np.asarray(ltcl.scenes.dihedral(n).form_factors)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl demo`: the main result of ltcl, without hardware."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from ltcl.cli import options
+from ltcl.cli.command import Answer, Context, command
+from ltcl.cli.options import option
+from ltcl.cli.reports.program import DemoReport
+from ltcl.cli.tables import percent, table
+from ltcl.device import open_device
+
+VIEW_LABELS = {
+    "uncompensated": "projected as it is",
+    "colours_only": "wall colours undone, bounces left",
+}
+
+
+@command()
+def demo(
+    context: Context,
+    out: options.OutFolder = Path("ltcl-demo"),
+    size: Annotated[
+        int, option("Patches along a wall; the projector has 3 N^2 pixels.", min=4)
+    ] = 36,
+    device: options.DeviceName = None,
+) -> Answer:
+    """Compensate a picture in a coloured room corner: no hardware, no download, half a minute.
+
+    Fills DIR with the desired picture, the look of the walls without compensation, the pattern, the
+    compensated result, the bounces of light, a convergence plot, a report and a contact sheet.
+    """
+    opened = open_device(device)
+    # It imports OpenCV and matplotlib.
+    from ltcl import demo
+
+    def show_step(step: str) -> None:
+        context.progress(step, demo.STEPS.index(step), len(demo.STEPS))
+
+    done = demo.run(out, size, device=opened, progress=show_step)
+    report = DemoReport(folder=done.folder, files=list(done.files), **done.report)
+    rows = []
+    for view, error in done.report["errors"].items():
+        rows.append((VIEW_LABELS.get(view, view), percent(error)))
+    sheet = out / "contact_sheet.png"
+    place = f"\n{len(done.files)} files in {out}; look at {sheet}"
+    return Answer(report, [table(("what the viewer sees", "error"), rows), place])

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl play` and `ltcl show`: films and patterns on a projector."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ltcl.cli import compensation, loading, options
+from ltcl.cli.command import Answer, Context, command
+from ltcl.cli.options import argument, option
+from ltcl.cli.reports.program import PlayReport, ShowReport
+from ltcl.cli.view import address, address_options
+from ltcl.errors import InputError
+from ltcl.tasks.compensation import RTOL
+
+
+@command(*options.READ_OPTIONS, options.solve_options, address_options)
+def play(
+    context: Context,
+    film: Annotated[
+        Path, argument("FILM", "A video, whose sound is left out, or a folder of pictures.")
+    ],
+    transport: options.TransportFile,
+    gain: compensation.Gain = None,
+) -> Answer:
+    """Play FILM in a projector window of the browser, compensated for TRANSPORT.
+
+    Ctrl-C ends it. Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT,
+    makes it fast.
+    """
+    from ltcl.images.frames import open_frames
+    from ltcl.show.player import play as run_film
+    from ltcl.show.window import Window
+    from ltcl.viewer.answers import ViewerScene
+
+    source = open_frames(film)
+    T = loading.load(context, transport)
+    setup = loading.load_setup(transport)
+    settings = loading.solver_settings(context, T, RTOL)
+    del settings["callback"]
+    settings["background"] = None if setup is None else setup.ambient
+    scene = ViewerScene(T, transport.name, {}, setup)
+    report = PlayReport(film=film)
+    with Window(film.name, **address(context)) as window:
+        typer.echo(f"{window.url} plays {film}; Ctrl-C ends it", err=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            pace = run_film(
+                scene,
+                source,
+                window,
+                compensation.resolve_gain(gain, setup),
+                context.progress,
+                **settings,
+            )
+            report = PlayReport(film=film, **dataclasses.asdict(pace))
+    if report.shown is None:
+        return Answer(report, [])
+    line = (
+        f"{report.shown} frames shown, {report.frames_per_second:.1f} a second, "
+        f"{report.latency:.3f} s late; {report.dropped} dropped"
+    )
+    return Answer(report, [line])
+
+
+@command()
+def show(
+    context: Context,
+    folder: Annotated[
+        Path,
+        argument("FOLDER", "A picture, a folder of pictures, or the folder of an acquisition."),
+    ],
+    display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
+    every: Annotated[
+        float | None,
+        option("Seconds between two pictures. Default: until a key is pressed.", metavar="SECONDS"),
+    ] = None,
+    arrival: Annotated[
+        bool,
+        option(
+            "Show the next pattern when its photograph is in the folder of the acquisition.",
+            "--arrival",
+        ),
+    ] = False,
+    browser: Annotated[
+        bool,
+        option(
+            "Show the patterns in a projector window of the browser, for any display.",
+            "--browser",
+        ),
+    ] = False,
+) -> Answer:
+    """Show patterns full screen, next by key, timer or photograph; Escape ends it.
+
+    This needs the extra projector. With --browser Ctrl-C ends it, and it needs the extra view.
+    """
+    if every is not None and arrival:
+        raise InputError(
+            f"--every is {every:g}, but --arrival is given; one of them decides what comes next"
+        )
+    from ltcl.acquisition import rigs
+
+    advance: Any = "key"
+    if arrival:
+        advance = "arrival"
+    elif every is not None:
+        advance = every
+    counter = _ShotCounter(context)
+    if not browser:
+        shown = rigs.show(folder, display=display, advance=advance, progress=counter)
+    else:
+        shown = _show_in_browser(folder, advance, counter)
+    report = ShowReport(folder=folder, shown=shown)
+    return Answer(report, [f"{shown} pattern(s) were shown"])
+
+
+class _ShotCounter:
+    """Shows the progress of `ltcl.acquisition.rigs.show`, and counts patterns."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self.count = 0
+
+    def __call__(self, shot: Any, done: int, total: int) -> None:
+        step = f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}"
+        self._context.progress(step, done, total)
+        self.count = done + 1
+
+
+def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter) -> int:
+    """Show patterns in a window until they or Ctrl-C end it; return how many were shown."""
+    from ltcl.acquisition import rigs
+    from ltcl.show.window import Window
+
+    with Window(str(folder)) as window:
+        typer.echo(f"{window.url} shows {folder}; Ctrl-C ends it", err=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            return rigs.show(folder, display=window, advance=advance, progress=counter)
+    return counter.count
