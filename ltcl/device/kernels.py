@@ -47,7 +47,7 @@ class Kernel:
 
     Values are Python numbers, `Array`s, or local memory. Work-items are rounded up to whole
     work-groups, whose size is clamped to what kernel and device allow (`group`). A name that is
-    wrong, missing or doubled is an `InputTypeError`, at once.
+    wrong or missing is an `InputTypeError`, at once; Python refuses one that is doubled.
 
     >>> import ltcl
     >>> device = ltcl.open_device("cpu")
@@ -78,13 +78,13 @@ class Kernel:
             self.parameters = _parameters(device.cl.kernel_arg_info, handle)
         self.idle.append(handle)
 
-    def __call__(self, items: Size, group: Size, /, *positional: Any, **named: Any) -> None:
+    def __call__(self, items: Size, group: Size, /, **arguments: Any) -> None:
         """Queue a launch over `items`, rounded up to whole groups; returns at once."""
-        Launch(self, items, group, self._by_name(positional, named))()
+        Launch(self, items, group, arguments)()
 
-    def bind(self, items: Size, group: Size, /, *positional: Any, **named: Any) -> Launch:
+    def bind(self, items: Size, group: Size, /, **arguments: Any) -> Launch:
         """Make the launch that calling the kernel would queue, to be queued again and again."""
-        return Launch(self, items, group, self._by_name(positional, named))
+        return Launch(self, items, group, arguments)
 
     def group(self, size: Any) -> Any:
         """Work-group of a launch that asks for `size`: halved until kernel and device allow it."""
@@ -127,21 +127,6 @@ class Kernel:
         known = ", ".join(self.parameters)
         return InputTypeError(f"kernel {self.name} has no argument {name}; it has {known}")
 
-    def _by_name(self, positional: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-        """All arguments by name; those given without one are in the order of the source."""
-        if not positional:
-            return named
-        if len(positional) > len(self.parameters):
-            raise InputTypeError(
-                f"kernel {self.name} got {len(positional)} arguments; "
-                f"it has {len(self.parameters)}: {', '.join(self.parameters)}"
-            )
-        values = dict(zip(self.parameters, positional, strict=False))
-        doubled = values.keys() & named.keys()
-        if doubled:
-            raise InputTypeError(f"kernel {self.name} got argument {min(doubled)} twice")
-        return values | named
-
 
 def _parameters(info: Any, handle: Any) -> dict[str, Parameter]:
     """Arguments of a cl_kernel by name, in the order of the source."""
@@ -162,28 +147,25 @@ class Launch:
     It keeps its buffers alive.
     """
 
-    def __init__(self, kernel: Kernel, items: Size, group: Size, values: dict[str, Any]) -> None:
+    def __init__(self, kernel: Kernel, items: Size, group: Size, arguments: dict[str, Any]) -> None:
         self._kernel = kernel
         self._parameters = kernel.parameters
         self._group = kernel.group(group if isinstance(group, tuple) else (group,))
         self.resize(items)
-        if len(values) != len(kernel.parameters):
-            kernel.check_names(values)
+        if len(arguments) != len(kernel.parameters):
+            kernel.check_names(arguments)
         self._handle = kernel.take()
         # OpenCL does not keep what a kernel was given.
         self._buffers: dict[str, Any] = {}
-        self.set(**values)
+        self.set(**arguments)
 
     def __call__(self) -> None:
         """Queue the launch; returns at once."""
         if 0 not in self._size:
             self._kernel.device.launch(self._kernel.name, self._handle, self._size, self._group)
 
-    def set(self, *indexed: Any, **values: Any) -> None:
+    def set(self, /, **values: Any) -> None:
         """Change arguments, by name, for the launches that follow: ``launch.set(keep=0.5)``."""
-        if indexed:
-            index, value = indexed
-            values = {list(self._parameters)[index]: value}
         parameters = self._parameters
         handle = self._handle
         name = ""
