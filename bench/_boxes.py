@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import ltcl
-from _coefficients import relative
+from _coefficients import relative_error
 from ltcl.scenes import Scene, box
 from ltcl.scenes.camera import SceneCamera
 from ltcl.solvers import Solution, Status
@@ -57,7 +57,9 @@ def terms(systems: Sequence[Any], l_out: np.ndarray, count: int) -> np.ndarray:
     return np.stack(found)
 
 
-def lit(room: Scene, lamp: Any, device: ltcl.Device) -> tuple[Scene, np.ndarray, Any, np.ndarray]:
+def light_room(
+    room: Scene, lamp: Any, device: ltcl.Device
+) -> tuple[Scene, np.ndarray, Any, np.ndarray]:
     """A room from the front, its direct light under a lamp (channels, N), S of each channel, the picture."""
     scene = from_the_front(room)
     l_d = scene.albedo * scene.irradiance(lamp).reshape(-1)
@@ -84,7 +86,7 @@ class Race:
         return self.jacobi.status is Status.DIVERGED
 
     @property
-    def said(self) -> str:
+    def outcome(self) -> str:
         """How Jacobi ended."""
         end = "diverges" if self.diverged else f"1 % in {self.steps()} iterations"
         return f"rho(R) = {self.rho:.3f}, {end}"
@@ -100,4 +102,4 @@ def race(name: str, n: int, sides: int, albedo: float, device: ltcl.Device) -> R
         ltcl.solve(S, l_out, m, rtol=1e-5, throw=False) for m in ("jacobi", "chebyshev")
     )
     rho_a = albedo * float(np.linalg.eigvalsh(scene.form_factors)[-1])
-    return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, relative(chebyshev.x, l_d))
+    return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, relative_error(chebyshev.x, l_d))

@@ -31,18 +31,18 @@ def analysis(W: Wavelet) -> Callable[[np.ndarray], np.ndarray]:
     return lambda x: W.apply(W.device.upload(x)).get()
 
 
-def relative(found: np.ndarray, exact: np.ndarray) -> float:
+def relative_error(found: np.ndarray, exact: np.ndarray) -> float:
     """Error of (N,) or (N, k) in the norm over pixels, of the worst column."""
     return float(np.max(np.linalg.norm(found - exact, axis=0) / np.linalg.norm(exact, axis=0)))
 
 
-def largest(matrix: Any, x: np.ndarray, y: np.ndarray, error: float) -> scipy.sparse.csr_array:
+def keep_largest(matrix: Any, x: np.ndarray, y: np.ndarray, error: float) -> scipy.sparse.csr_array:
     """As few of the largest numbers of a matrix, dense or sparse, as keep `error` of y = matrix @ x."""
     blocks = [slice(start, start + ROWS) for start in range(0, matrix.shape[0], ROWS)]
 
     def of_product(threshold: float) -> float:
         products = [(matrix[rows] * (abs(matrix[rows]) >= threshold)) @ x for rows in blocks]
-        return relative(np.concatenate(products), y)
+        return relative_error(np.concatenate(products), y)
 
     threshold = bisect(of_product, error, float(max(matrix.max(), -matrix.min())))
     kept = [drop_below(matrix[rows], threshold)[0] for rows in blocks]
@@ -58,7 +58,7 @@ def bisect(error: Callable[[float], float], wanted: float, high: float) -> float
     return low
 
 
-def fewest(C: Any, error: Callable[[Any], float], wanted: float) -> Any:
+def keep_fewest(C: Any, error: Callable[[Any], float], wanted: float) -> Any:
     """As few of the largest numbers of C as keep `error` of them at `wanted`."""
     threshold = bisect(lambda t: error(drop_below(C, t)[0]), wanted, float(np.abs(C.data).max()))
     return drop_below(C, threshold)[0]

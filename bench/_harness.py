@@ -54,7 +54,7 @@ class Row:
     target: float | None = None
 
     @classmethod
-    def of_times(
+    def from_times(
         cls,
         question: str,
         who: str,
@@ -75,7 +75,7 @@ class Row:
         return "hit" if part >= 1.0 else f"MISS: {part:.1%} of {self.target:.3g}x"
 
 
-def options(description: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Options:
+def parse_options(description: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Options:
     """Parse the command line, with a bench's own arguments, and open the device."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run")

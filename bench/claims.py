@@ -20,7 +20,7 @@ import scipy.sparse
 from scipy.sparse.linalg import aslinearoperator
 
 import ltcl
-from _harness import Row, options, report
+from _harness import Row, parse_options, report
 from ltcl.device import Device
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense, IdentityPlus, Tiles
@@ -120,7 +120,7 @@ def untrue(device: Device, random: Random, tally: Counter[str]) -> str | None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     random, tally, total = np.random.default_rng(0), Counter[str](), SOLVES[given.smoke]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, options, product, report, seconds, triad
+from _harness import Options, Row, parse_options, product, report, seconds, triad
 from _peers import sparse_products
 from ltcl.operators import CSR
 
@@ -58,20 +58,20 @@ def compare(given: Options, name: str, A: Any) -> list[Row]:
         targets = {"scipy": SCIPY_TARGET.get(k), "cupy": CUSPARSE_TARGET}
         for peer, who in PEERS.items():
             if (theirs := ms.get(f"{peer} {k}")) is not None:
-                rows.append(Row.of_times(question, who, theirs, ours, "ms", targets.get(peer)))
+                rows.append(Row.from_times(question, who, theirs, ours, "ms", targets.get(peer)))
         if k == 1:
             roof, rate = nbytes / ms["triad"] / 1e6, 8 * A.nnz / ours / 1e6
             target = TRIAD_TARGET if "runs" in name else None
             rows.append(Row(question, "our triad", roof, rate, "GB/s", rate / roof, target))
         elif k in SIDE_TARGET:
             rows.append(
-                Row.of_times(question, "k = 1", alone, ours / k, "ms a side", SIDE_TARGET[k])
+                Row.from_times(question, "k = 1", alone, ours / k, "ms a side", SIDE_TARGET[k])
             )
     return rows
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     n, per_row = (2048, 32) if given.smoke else (131072, 256)
     rows = []
     for name, run in (("runs of 16", 16), ("random", 1)):

@@ -13,7 +13,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from _harness import Row, options, report, seconds
+from _harness import Row, parse_options, report, seconds
 from ltcl.acquisition.geometry import GrayCode, Resampling, decode
 
 QUESTIONS = {
@@ -40,7 +40,7 @@ def off(x: np.ndarray, y: np.ndarray, truth: tuple[np.ndarray, np.ndarray]) -> f
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     grid, (H, W) = ((48, 64), (60, 80)) if given.smoke else ((768, 1024), (1024, 1280))
     (h, w), code = grid, GrayCode(grid)
     v, u = np.mgrid[:H, :W] / np.array([H, W]).reshape(2, 1, 1)

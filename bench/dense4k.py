@@ -15,13 +15,13 @@ import numpy as np
 import scipy.linalg
 
 import ltcl
-from _coefficients import relative
-from _harness import Row, options, report, seconds, triad
+from _coefficients import relative_error
+from _harness import Row, parse_options, report, seconds, triad
 from ltcl.operators import Dense
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     scene = ltcl.scenes.box(6 if given.smoke else 32, sides=4, albedo=0.45)
     T = scene.transport(device=given.device)
     S = T.systems[0]
@@ -43,17 +43,17 @@ def main() -> None:
     times = seconds(actions, repeats=5)
     question, kept = f"direct part at N = {T.shape[0]}", "LU kept, float32 (ours: an inverse kept)"
     rows = [
-        Row.of_times(
+        Row.from_times(
             question, "numpy.linalg.solve, float64", times["float64"], times["ours"], "s", 51.0
         ),
-        Row.of_times(question, kept, times["kept32"], times["inverse"], "s", 1.0),
+        Row.from_times(question, kept, times["kept32"], times["inverse"], "s", 1.0),
     ]
     facts = {
         "pixels": T.shape[0],
         "rho(R)": ltcl.analyze(T).channels[0].spectral_radius,
         "products": solution.products,
-        "relative error of the direct part": relative(solution.x, l_d),
-        "and with the inverse": relative(inverse.solve(l_out).x, l_d),
+        "relative error of the direct part": relative_error(solution.x, l_d),
+        "and with the inverse": relative_error(inverse.solve(l_out).x, l_d),
         "GB/s of our products": solution.products * S.nbytes / times["ours"] / 1e9,
         "GB/s of our triad": nbytes / times["triad"] / 1e9,
     }

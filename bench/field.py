@@ -18,7 +18,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from _harness import Options, options, publish
+from _harness import Options, parse_options, publish
 from scenes import baselines, dataset, scoring, tracing
 
 # These fail, and it is no error: R of the closed box has eigenvalues above 1.
@@ -75,7 +75,7 @@ def make(data: Path, given: Options) -> dict[str, Any]:
 
 def main() -> None:
     """Score every method on every scene; exit status 1 where one fails that is not of `DIVERGES`."""
-    given, failures = options(__doc__ or "", ARGUMENTS), []
+    given, failures = parse_options(__doc__ or "", ARGUMENTS), []
     chosen = commands(given.more.method)
     if not given.smoke and given.more.data is None:
         raise SystemExit(

@@ -23,7 +23,7 @@ import _figures as figures
 import ltcl
 from _boxes import FLOOR, NEUTRAL
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.plots.page import FAINT, INK, axes_at, label_at
 from ltcl.scenes import Scene
 from ltcl.theory import bounce_coefficients
@@ -189,7 +189,7 @@ def draw_contents(figure: Figure) -> None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     found = measure(4 if given.smoke else 16, given.device)
     facts = {
         "patches": found.l_d.shape[1],

@@ -24,7 +24,7 @@ import _figures as figures
 import ltcl
 from _boxes import FLOOR, RTOL, Race, race
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.plots.page import FAINT, INK
 from ltcl.scenes import box
 from ltcl.solvers import matrix_series
@@ -121,7 +121,7 @@ def claims(found: Found) -> list[Claim]:
     )
 
     def slow(text: str, race: Race, name: str = "", differs: str = "") -> Claim:
-        return Claim(text, name + race.said, "over 50", 50 < race.steps() < math.inf, differs)
+        return Claim(text, name + race.outcome, "over 50", 50 < race.steps() < math.inf, differs)
 
     return [
         Claim(alike, parts, "signs alternate; within 10 %", is_alike),
@@ -129,7 +129,7 @@ def claims(found: Found) -> list[Claim]:
             "(b) the error stays below eq. 16", f"at most {worst:.3f} of the bound", "1", worst <= 1
         ),
         Claim(constant, factor, "0.01", off < 0.01),
-        Claim(quick, few.said, "1 % in at most 10", few.steps() <= 10, shared),
+        Claim(quick, few.outcome, "1 % in at most 10", few.steps() <= 10, shared),
         Claim(
             "(c) the rate is m / (1 - m)",
             f"1 % at most {late:.1f} iterations off it",
@@ -137,8 +137,8 @@ def claims(found: Found) -> list[Claim]:
             late <= 1,
         ),
         slow("(c) near 0.5 slowly", closed[0.49], "0.49: "),
-        Claim("(c) 0.51 diverges", closed[0.51].said, "diverges", closed[0.51].diverged),
-        Claim("(d) 6 sides diverge", opened[6].said, "diverges", opened[6].diverged),
+        Claim("(c) 0.51 diverges", closed[0.51].outcome, "diverges", closed[0.51].diverged),
+        Claim("(d) 6 sides diverge", opened[6].outcome, "diverges", opened[6].diverged),
         slow("(d) 5 sides converge very slowly", opened[5], differs=limit),
         slow("(d) so they do below that limit", found.below, "0.60: "),
         Claim(
@@ -207,10 +207,11 @@ def draw_races(axes: Axes, races: Mapping[float, Race]) -> None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     found = measure(4 if given.smoke else 16, given.device)
     facts = {
-        r.name: f"{r.said}; Chebyshev 1e-5 in {r.chebyshev.products} products" for r in found.races
+        r.name: f"{r.outcome}; Chebyshev 1e-5 in {r.chebyshev.products} products"
+        for r in found.races
     }
     figures.conclude(given, "Figure 5: convergence", claims(found), facts, lambda: draw(found))
 

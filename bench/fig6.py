@@ -26,7 +26,7 @@ import _figures as figures
 import ltcl
 from _boxes import ALBEDO, RTOL
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.plots.page import FAINT
 from ltcl.scenes import Block, Scene, box, glossy
 
@@ -82,7 +82,7 @@ class Recovery:
 def with_shadows(n: int, device: ltcl.Device) -> Recovery:
     """The box with a block in it, under a lamp."""
     room = box(n, 5, SHADED, occluder=BLOCK, device=device)
-    scene, l_d, systems, l_out = boxes.lit(room, LAMP, device)
+    scene, l_d, systems, l_out = boxes.light_room(room, LAMP, device)
     sums = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0)
     return Recovery(scene, l_d, sums, systems, tuple(scene.A), scene.picture)
 
@@ -196,7 +196,7 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     shade = with_shadows(4 if given.smoke else 14, given.device)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)
     scene = glossy_box(

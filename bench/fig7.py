@@ -32,10 +32,10 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, fewest, note, relative
+from _coefficients import analysis, keep_fewest, note, relative_error
 from _corner import Bounce, interreflection
 from _figures import Claim
-from _harness import Options, options, seconds
+from _harness import Options, parse_options, seconds
 from ltcl import checks
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
 from ltcl.scenes import landscape
@@ -113,10 +113,12 @@ def by_steps(S: IdentityPlus, at: Problem, kept: float) -> Way:
     def solve(rtol: float) -> ltcl.Solution:
         return ltcl.solve(S, at.l_out, "jacobi", rtol=rtol)
 
-    enough = (t for t in TOLERANCES if relative(solve(t).x, at.l_d) <= ERROR)
+    enough = (t for t in TOLERANCES if relative_error(solve(t).x, at.l_d) <= ERROR)
     rtol = float(next(enough, TOLERANCES[-1]))
     s = solve(rtol)
-    return Way(lambda: solve(rtol).x, relative(s.x, at.l_d), s.seconds, s.products, S.nbytes, kept)
+    return Way(
+        lambda: solve(rtol).x, relative_error(s.x, at.l_d), s.seconds, s.products, S.nbytes, kept
+    )
 
 
 def by_numpy(S: IdentityPlus, steps: int) -> np.ndarray:
@@ -138,7 +140,7 @@ def by_matrices(inverse: Callable[[int], np.ndarray], at: Problem, like: Way) ->
     start = time.perf_counter()
     l_d = run()
     spent = time.perf_counter() - start
-    return Way(run, relative(l_d, at.l_d), spent, like.products - 1, like.nbytes, like.kept)
+    return Way(run, relative_error(l_d, at.l_d), spent, like.products - 1, like.nbytes, like.kept)
 
 
 def of_rows(given: Options, at: Problem, C: Any) -> Any:
@@ -161,9 +163,9 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
 
     def error(core: Any) -> float:
         S = system(CSR(given.device, core))
-        return relative(ltcl.solve(S, at.l_out, "jacobi", rtol=DROPPED / 10).x, at.l_d)
+        return relative_error(ltcl.solve(S, at.l_out, "jacobi", rtol=DROPPED / 10).x, at.l_d)
 
-    kept = fewest(C, error, DROPPED)
+    kept = keep_fewest(C, error, DROPPED)
     core, V = restrict_to_support(kept, W) if both else (kept, W)
     return by_steps(
         system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out)
@@ -348,7 +350,7 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     points = [p for n in (SMOKE if given.smoke else SIZES) for p in measure(given, n)]
     laws = {} if given.smoke else all_laws(points)
     facts: dict[str, Any] = {"albedo": ALBEDO}

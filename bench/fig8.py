@@ -20,7 +20,7 @@ import _boxes as boxes
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.scenes import Scene, box
 
 ALBEDO, LAMP, FEW, MANY = 0.4, (0.85, 0.75, 0.8), 30, 1000
@@ -50,7 +50,7 @@ class Inversion:
 
 def invert(n: int, device: ltcl.Device) -> Inversion:
     """The box under its lamp, n x n patches a wall."""
-    scene, (l_d,), (S,), (l_out,) = boxes.lit(box(n, sides=5, albedo=ALBEDO), LAMP, device)
+    scene, (l_d,), (S,), (l_out,) = boxes.light_room(box(n, sides=5, albedo=ALBEDO), LAMP, device)
     return Inversion(scene, S, l_out, l_d)
 
 
@@ -108,7 +108,7 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     found = invert(6 if given.smoke else 32, given.device)
     errors = measure(found)
     facts = {"pixels": len(found.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}

@@ -21,7 +21,7 @@ import _boxes as boxes
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.scenes import Scene, dihedral, glossy
 from ltcl.scenes.walls import Wall
 
@@ -162,7 +162,7 @@ def draw(plain: Parts, board: Parts) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     plain = diffuse(6 if given.smoke else 24, given.device)
     board = with_board(5 if given.smoke else 14, given.smoke, given.device)
     facts = {

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from _harness import Row, options, product, report, seconds
+from _harness import Row, parse_options, product, report, seconds
 from ltcl.device import Device
 from ltcl.scenes import FormFactor, Patches, box, cut
 from ltcl.scenes.patches import scaled, squared_size
@@ -65,7 +65,7 @@ class Peer:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     n = 12 if given.smoke else 148
     patches = cut(box(1).walls, n)
     count = len(patches)
@@ -87,7 +87,7 @@ def main() -> None:
     table = [
         Row("product, k = 1", "NumPy", theirs, alone, "Gpairs/s", alone / theirs, TARGETS["numpy"]),
         Row("product, k = 3", "k = 1", alone, three, "Gpairs/s", three / alone, TARGETS["side"]),
-        Row.of_times("row sums off 1", "what is promised", ACCURACY, off, "", 1.0),
+        Row.from_times("row sums off 1", "what is promised", ACCURACY, off, "", 1.0),
     ]
     facts = {
         "patches": count,

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import Options, options
+from _harness import Options, parse_options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.tasks.plausibility import LARGEST_NEGATIVE
@@ -223,7 +223,7 @@ def _curves(
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # the warning is among what is measured
     found = cases(given)
     facts = {f"{c.room}, exponent {c.exponent:g}, gloss {c.gloss:g}": asdict(c) for c in found}

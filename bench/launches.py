@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import ltcl
-from _harness import Options, options, record, write_json
+from _harness import Options, parse_options, record, write_json
 from ltcl.device import Device
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.bounded import minimise
@@ -133,7 +133,7 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     kinds = itertools.product(operators(given).items(), TARGETS, (1, 3))
     rows = [row(given.device, kind, make, method, k) for (kind, make), method, k in kinds]
     misses = sum(one["verdict"] == "MISS" for one in rows)

@@ -19,7 +19,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from _harness import Options, Row, options, report, seconds
+from _harness import Options, Row, parse_options, report, seconds
 from ltcl.acquisition.radiometry import NoiseModel, Response, calibrate, merge
 from ltcl.images import from_srgb, to_srgb
 
@@ -85,7 +85,7 @@ def speeds(given: Options, n: int) -> list[Row]:
         theirs = np.asarray(actions[name]())
         off, own = (error(found[ours.valid], light[ours.valid]) for found in (theirs, ours.value))
         rows.append(
-            Row.of_times("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", 1.0)
+            Row.from_times("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", 1.0)
         )
     return rows
 
@@ -112,13 +112,13 @@ def responses(n: int) -> list[Row]:
     question, rows = f"response of {n} x {n} pixels, 8 bits", []
     for name, make in CALIBRATORS.items():
         off, duration = timed(partial(theirs, make))
-        rows.append(Row.of_times(question, f"OpenCV {name}", off, own, "rms", 1.0))
-        rows.append(Row.of_times(question, f"OpenCV {name}", duration, spent, "s"))
+        rows.append(Row.from_times(question, f"OpenCV {name}", off, own, "rms", 1.0))
+        rows.append(Row.from_times(question, f"OpenCV {name}", duration, spent, "s"))
     return rows
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     rows = speeds(given, 64 if given.smoke else 1200) + responses(64 if given.smoke else 400)
     report(given, "Merging exposures", rows, {"exposures": len(SECONDS), "opencv": cv2.__version__})
 

@@ -16,7 +16,7 @@ import numpy as np
 from rich.table import Table
 
 import ltcl
-from _harness import Options, options, publish
+from _harness import Options, parse_options, publish
 from ltcl.scenes import box, dihedral, glossy
 from ltcl.solvers.solve import METHODS, SAMPLED
 from solve import RTOL, Problem
@@ -35,7 +35,7 @@ def problem(name: str, scene: Any, given: Options) -> Problem:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     n, directions = (4, 16) if given.smoke else (16, 64)
     rooms = {f"rho {rho:g}": box(n, sides=6, albedo=rho / (1.0 + rho)) for rho in RADII}
     rooms |= {"corner": box(n, sides=3, albedo=OPEN)}

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
@@ -43,7 +43,7 @@ def ratios(
 
 def main() -> None:
     """Judge each way, scene and noise."""
-    given, facts, good = options(__doc__ or ""), dict[str, Any](), list[bool]()
+    given, facts, good = parse_options(__doc__ or ""), dict[str, Any](), list[bool]()
     for twice, photons, scene in product((False, True), PHOTONS, SCENES):
         exact = truth(scene, 6 if given.smoke else 12)
         found = [ratios(exact, level, photons, twice) for level in LEVELS]

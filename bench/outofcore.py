@@ -34,7 +34,7 @@ import scipy.sparse
 
 import ltcl
 from _coefficients import note
-from _harness import Options, Row, options, product, report, seconds
+from _harness import Options, Row, parse_options, product, report, seconds
 from ltcl.device import Device
 from ltcl.operators import Dense, MultiDevice, Streamed
 
@@ -188,12 +188,12 @@ def devices(given: Options) -> list[Row]:
     spent = seconds({name: product(A, np.ones(n)) for name, A in ways.items()})
     ms = {name: 1e3 * each for name, each in spent.items()}
     question, ours = f"dense, {n} rows on two halves", ms.pop("both")
-    return [Row.of_times(question, name, theirs, ours, "ms") for name, theirs in ms.items()]
+    return [Row.from_times(question, name, theirs, ours, "ms") for name, theirs in ms.items()]
 
 
 def main() -> None:
     os.environ.setdefault("POCL_MEMORY_LIMIT", str(CAP >> 30))  # before the device is opened
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     rows, side = devices(given), 32 if given.smoke else SIDE
     with tempfile.TemporaryDirectory() as folder:
         scene, size = Scene(side, Path(folder) / "T.npy"), 4 * side**4

@@ -22,9 +22,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import _figures as figures
-from _coefficients import ROWS, analysis, largest, note, relative
+from _coefficients import ROWS, analysis, keep_largest, note, relative_error
 from _corner import interreflection
-from _harness import Options, Row, options, product, report, seconds, triad
+from _harness import Options, Row, parse_options, product, report, seconds, triad
 from _peers import missing, sparse_products
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
@@ -111,7 +111,7 @@ def measure(
 ) -> tuple[list[Point], dict[str, float]]:
     """All formats at one error; where it is that of the targets, milliseconds of everything else too."""
     note(f"error {wanted:.1%}")
-    numbers = {form.name: largest(form.matrix, form.x, form.y, AIM * wanted) for form in found}
+    numbers = {form.name: keep_largest(form.matrix, form.x, form.y, AIM * wanted) for form in found}
     ways = [(form.name, *form.operators(given, numbers[form.name])) for form in found]
     actions: dict[str, Callable[[], object]] = {}
     if wanted == ERROR:
@@ -124,7 +124,7 @@ def measure(
     ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
     points = []
     for form, _, A in ways:
-        error, kept = relative(A.matvec(at.x), at.y), numbers[form].nnz / len(at.x)
+        error, kept = relative_error(A.matvec(at.x), at.y), numbers[form].nnz / len(at.x)
         points.append(
             Point(form, wanted, error, kept, A.nbytes, ms[f"ours, {form}"], ms[f"core, {form}"])
         )
@@ -139,13 +139,13 @@ def compare(at: Problem, sparse: Point, best: Point, ms: dict[str, float]) -> li
     for how, ours in (("with transforms", best.pixels), ("in a solve", best.core)):
         for name, theirs in others.items():
             rows.append(
-                Row.of_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name))
+                Row.from_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name))
             )
     for name, size in (
         ("thresholded rows of any peer", sparse.nbytes),
         ("dense numpy", at.R.nbytes),
     ):
-        rows.append(Row.of_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
+        rows.append(Row.from_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
     return rows
 
 
@@ -207,7 +207,7 @@ def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> No
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     at, (memory, nbytes) = problem(given.smoke), triad(given.device, given.smoke)
     found, points, ms = forms(given, at), list[Point](), dict[str, float]()
     for wanted in ERRORS:

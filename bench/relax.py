@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, options, product, report, seconds
+from _harness import Options, Row, parse_options, product, report, seconds
 from csr import matrix
 from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.operators.relaxation import Sweeps, relaxation
@@ -60,19 +60,19 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
     times = {key: value * 1e3 for key, value in seconds(actions, repeats=15).items()}
     sweeping, one = f"{name}, strips of {relax.block}", times["product"]
     rows = [
-        Row.of_times(sweeping, "one product", one, times["sweep"], "ms", PRODUCT_TARGET),
-        Row.of_times(
+        Row.from_times(sweeping, "one product", one, times["sweep"], "ms", PRODUCT_TARGET),
+        Row.from_times(
             f"{name}, block method", "one product", one, times["block"], "ms", PRODUCT_TARGET
         ),
     ]
     if theirs is not None:
         target = PYAMG_TARGETS.get(name, PYAMG_DENSE)
-        rows.append(Row.of_times(sweeping, "pyamg", times["pyamg"], times["sweep"], "ms", target))
+        rows.append(Row.from_times(sweeping, "pyamg", times["pyamg"], times["sweep"], "ms", target))
     return rows
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     n, per_row, dense = (2048, 32, 256) if given.smoke else (131072, 256, 4096)
     pyamg = importlib.util.find_spec("pyamg")  # the extra `bench` brings it
     theirs = pyamg and importlib.import_module("pyamg.relaxation.relaxation").gauss_seidel

@@ -27,10 +27,10 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, fewest, note, relative, transport
+from _coefficients import analysis, keep_fewest, note, relative_error, transport
 from _corner import Bounce
 from _figures import Claim
-from _harness import Options, options, product, seconds
+from _harness import Options, parse_options, product, seconds
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import dihedral, landscape
@@ -107,9 +107,9 @@ def build(given: Options, rows: Bounce) -> Built:
             def error(core: Any, truth: np.ndarray = truth) -> float:
                 core, V = restrict_to_support(core, W)
                 S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
-                return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
+                return relative_error(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
 
-            fewer.append(fewest(C, error, SHARE * ERROR))
+            fewer.append(keep_fewest(C, error, SHARE * ERROR))
     return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
 
 
@@ -127,7 +127,7 @@ def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]
     parts = [separation.direct, *separation.bounces]
     pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
     return [wanted, pattern, *parts], [
-        relative(part.reshape(-1, 3), truth) for part, truth in pairs
+        relative_error(part.reshape(-1, 3), truth) for part, truth in pairs
     ]
 
 
@@ -146,7 +146,7 @@ def draw(names: list[str], images: list[np.ndarray]) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     rows = Bounce(8 if given.smoke else 256, REFERENCE)
     built = build(given, rows)
     images, errors = pictures(rows, built)

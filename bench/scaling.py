@@ -28,7 +28,7 @@ import scipy.optimize
 import scipy.sparse
 
 import ltcl
-from _harness import Options, Row, options, report, triad
+from _harness import Options, Row, parse_options, report, triad
 from ltcl.operators import CSR, Dense, Distributed, IdentityPlus
 
 SIZES = {
@@ -61,7 +61,7 @@ def mpi(given: Options) -> tuple[list[Row], dict[str, Any]]:
     for (n, k), times in zip(sizes, found := json.loads(run.stdout), strict=True):
         for who, target in (("1 rank", 1.8 if n * k >= LARGE else None), ("no MPI", None)):
             pair = times[f"solve {who}"], times["solve 2 ranks"]
-            rows.append(Row.of_times(f"Chebyshev by 2 ranks, {n} x {k}", who, *pair, "s", target))
+            rows.append(Row.from_times(f"Chebyshev by 2 ranks, {n} x {k}", who, *pair, "s", target))
         for what in ("reading the same", "triad"):
             limit, gain = (
                 times[f"{each} 1 rank"] / times[f"{each} 2 ranks"] for each in (what, "solve")
@@ -189,7 +189,7 @@ def paired(comm: Any, actions: dict[str, Callable[[], Any] | None]) -> dict[str,
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     report(given, "Scaling over ranks", *mpi(given))
 
 

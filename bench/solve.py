@@ -19,8 +19,8 @@ import scipy.sparse
 from scipy.sparse.linalg import gmres
 
 import ltcl
-from _coefficients import relative
-from _harness import Options, Row, options, report, seconds
+from _coefficients import relative_error
+from _harness import Options, Row, parse_options, report, seconds
 from csr import matrix
 from ltcl.operators import CSR, IdentityPlus
 
@@ -43,7 +43,7 @@ class Problem:
     def check(self, who: str, x: np.ndarray) -> None:
         """Stop where a solution is not within the tolerance, in float64."""
         x = np.asarray(x, np.float64)
-        residual = relative(x + self.R.astype(np.float64) @ x, self.b.astype(np.float64))
+        residual = relative_error(x + self.R.astype(np.float64) @ x, self.b.astype(np.float64))
         if residual > RTOL * (1 + 1e-3):
             raise SystemExit(f"{who} misses the tolerance of {self.name}: {residual:.3g}")
 
@@ -108,21 +108,21 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
         problem.name,
     )
     of_neumann, of_gmres = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
-    new = [Row.of_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (
+    new = [Row.from_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (
         problem.b.ndim == 1
     )
     return [
         *new,
-        Row.of_times(
+        Row.from_times(
             name, "Neumann's products", products, ours.products, "products", PRODUCTS_TARGET
         ),
-        Row.of_times(name, loop, times["neumann"], times["ours"], "ms", of_neumann),
-        Row.of_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", of_gmres),
+        Row.from_times(name, loop, times["neumann"], times["ours"], "ms", of_neumann),
+        Row.from_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", of_gmres),
     ]
 
 
 def main() -> None:
-    given, facts = options(__doc__ or ""), {}
+    given, facts = parse_options(__doc__ or ""), {}
     R = matrix(2048, 32, 16) if given.smoke else matrix(131072, 256, 16)
     R.data *= np.repeat(0.8 / R.sum(axis=1), np.diff(R.indptr)).astype(
         np.float32
@@ -138,7 +138,9 @@ def main() -> None:
     ours = [ltcl.solve(beyond.S, beyond.b, rtol=RTOL) for _ in range(3)][2]  # the second surveys S
     beyond.check("ours", ours.x)
     due = DIVERGENT_TARGET
-    rows.append(Row.of_times(beyond.name, "products allowed", due, ours.products, "products", 1.0))
+    rows.append(
+        Row.from_times(beyond.name, "products allowed", due, ours.products, "products", 1.0)
+    )
     report(given, "Solve to 1 %", rows, facts)
 
 

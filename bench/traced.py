@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from denoise import QUANTITIES, patterns
 from scenes import tracing
 
@@ -95,7 +95,7 @@ def judge(T: ltcl.Transport, true: ltcl.Transport) -> tuple[Any, ...]:
 
 def main() -> None:
     """Judge each scene, or say why not."""
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     if why := "" if given.smoke else tracing.unavailable():
         raise SystemExit(f"not measured: {why}")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # of T that is noisy

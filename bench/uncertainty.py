@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options, seconds
+from _harness import parse_options, seconds
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
@@ -98,7 +98,7 @@ def claims(shares: dict[tuple[str, float], np.ndarray], ratios: dict[str, float]
 
 def main() -> None:
     """Measure, and conclude; so few repetitions as of --smoke show that it runs."""
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # of glossy scenes, each time
     scenes, repetitions = (SCENES[:1], 2) if given.smoke else (SCENES, 200)
     shares = {(s, level): coverage(s, level, repetitions) for s in scenes for level in LEVELS}

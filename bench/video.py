@@ -17,7 +17,7 @@ import scipy.sparse
 
 import _coefficients
 import ltcl
-from _harness import Options, Row, options, report, seconds
+from _harness import Options, Row, parse_options, report, seconds
 from ltcl.operators import Compressed, Wavelet
 from ltcl.scenes import landscape
 
@@ -61,7 +61,7 @@ def shown(T: ltcl.Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     grid, coarse = ((16, 32), (4, 8)) if given.smoke else ((256, 512), (32, 64))
     T = transport(given, grid, coarse)
     inverse, frames = ltcl.invert(T, RTOL), film(T, BATCH)

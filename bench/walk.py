@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, options, report, seconds
+from _harness import Options, Row, parse_options, report, seconds
 from _peers import missing
 from csr import matrix
 from ltcl.operators import CSR
@@ -89,7 +89,7 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
     R, b = matrix(n, per_row, 1), np.random.default_rng(2).random(n, dtype=np.float32)
     values = np.random.default_rng(0).uniform(

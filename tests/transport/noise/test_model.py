@@ -275,7 +275,13 @@ KINDS = [
 
 
 @pytest.mark.parametrize(
-    ("kind", "extension"), [*KINDS, *(("compressed", end) for end in ("npz", "zarr", "pickle"))]
+    ("kind", "extension"),
+    [
+        *KINDS,
+        ("compressed", "pickle"),
+        pytest.param("compressed", "npz", marks=pytest.mark.slow),
+        pytest.param("compressed", "zarr", marks=pytest.mark.slow),
+    ],
 )
 def test_noise_is_kept_unless_it_is_an_estimate(
     kind: str, extension: str, tmp_path: Path, disk_without_delay: None
@@ -321,7 +327,12 @@ def test_second_measurement_on_the_command_line(
 
 
 @pytest.mark.parametrize(
-    ("strategy", "least"), [("pixel", 0.6), ("adaptive", 0.6), ("hadamard", 0.3)]
+    ("strategy", "least"),
+    [
+        ("pixel", 0.6),
+        pytest.param("adaptive", 0.6, marks=pytest.mark.slow),
+        pytest.param("hadamard", 0.3, marks=pytest.mark.slow),
+    ],
 )
 def test_acquired_transports_have_the_noise_of_their_scan(
     strategy: str, least: float, tmp_path: Path, disk_without_delay: None
