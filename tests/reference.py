@@ -211,7 +211,7 @@ def walk_rows(tables, steps, b, pixels, samples, seed: int, stream: int, chunk: 
 
 
 def walk_columns(tables, steps, source: int, samples, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Targets of the samples from row `source`, and their values there, float32."""
+    """Where samples from row `source` end, and what they bring there, float32."""
     scores, ends = walk(tables, steps, None, np.full(len(samples), source), samples, seed, 0)
     return ends, scores[:, 0]
 
@@ -308,7 +308,7 @@ def form_factor_matvec(G, left, right, x, scale: float, add: np.ndarray | None) 
 
 
 def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """True where the way from p to q (..., 3) passes through a box (B, 6) given as centre and half sides.
+    """Whether the way from p to q (..., 3) passes through a box (B, 6) given as centre and half sides.
 
     By slabs: the stretches of the way within each pair of faces have a part in common.
     """
@@ -329,7 +329,7 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
 
 
 def form_factor_visible(starts, ends, normals, blocks: np.ndarray) -> np.ndarray:
-    """Share of the rays from starts to ends (rays, 3, N), before both normals (3, N), that meet no box."""
+    """Of the rays from starts to ends (rays, 3, N) before both normals (3, N), the share that meet no box."""
     faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
     for a, b in zip(starts.astype(np.float64), ends.astype(np.float64), strict=True):
         d = b.T[None] - a.T[:, None]
@@ -381,22 +381,24 @@ def vector_dots(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray)
 def krylov_subtract(V, w, h, square: np.ndarray | None = None) -> np.ndarray:
     """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
     left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
-    return (
-        left
-        if square is None
-        else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
-    )
+    if square is None:
+        return left
+    squares_of_h = np.sum(h.astype(np.float64) ** 2, axis=0)
+    return left / np.sqrt(square - squares_of_h)
 
 
 def krylov_cg(sums, previous, last, moves, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """alpha (k,), then p, q, x and r after a step, of w, p, q, x and r before; sums <r, r> and <w, r>."""
+    """alpha (k,), then p, q, x and r after a step.
+
+    `sums` are <r, r> and <w, r>, `vectors` w, p, q, x and r before the step.
+    """
     square, product = sums
-    w, p, q, x, r = (v.astype(np.float64) for v in vectors)
+    w, p, q, x, r = _float64(*vectors)
     beta = square / previous
     alpha = square / (product - beta * square / last)
+    alpha = np.where(moves, alpha, 0.0)
     p = np.where(moves, r + beta * p, p)
     q = np.where(moves, w + beta * q, q)
-    alpha = np.where(moves, alpha, 0.0)
     return alpha, p, q, x + alpha * p, r - alpha * q
 
 
@@ -406,14 +408,19 @@ def krylov_half(rho: np.ndarray, sigma: np.ndarray, r: np.ndarray, v: np.ndarray
 
 
 def krylov_bicgstab(sums, rho, alpha, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The next rho (k,), then x, r and p of s, t, v, p and x; sums <t, s>, <t, t>, <r*, s> and <r*, t>."""
+    """The next rho (k,), then x, r and p.
+
+    `sums` are <t, s>, <t, t>, <r*, s> and <r*, t>, `vectors` s, t, v, p and x.
+    """
     ts, tt, shadow_s, shadow_t = sums
-    s, t, v, p, x = (u.astype(np.float64) for u in vectors)
+    s, t, v, p, x = _float64(*vectors)
     omega = ts / tt
-    following = shadow_s - omega * shadow_t
+    next_rho = shadow_s - omega * shadow_t
     r = s - omega * t
-    beta = following / rho * alpha / omega
-    return following, x + alpha * p + omega * s, r, r + beta * (p - omega * v)
+    beta = next_rho / rho * alpha / omega
+    x = x + alpha * p + omega * s
+    p = r + beta * (p - omega * v)
+    return next_rho, x, r, p
 
 
 def bounded_look(lower, upper, x, g, h) -> np.ndarray:

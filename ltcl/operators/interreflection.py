@@ -11,7 +11,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device, open_device
-from ltcl.device.vectors import rounded
+from ltcl.device.arrays import rounded
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR, Pattern
