@@ -133,10 +133,13 @@ def southwell_step(
 def philox(counters: np.ndarray, seed: int) -> np.ndarray:
     """Philox4x32-10 of counters (n, 4) and a key of 64 bits, as (n, 4) uint32."""
     c = [counters[:, i].astype(np.uint64) for i in range(4)]
-    low, key = np.uint64(0xFFFFFFFF), [seed & 0xFFFFFFFF, seed >> 32]
+    low = np.uint64(0xFFFFFFFF)
+    key = [seed & 0xFFFFFFFF, seed >> 32]
     for _ in range(10):
-        a, b = np.uint64(0xD2511F53) * c[0], np.uint64(0xCD9E8D57) * c[2]
-        high_a, high_b = a >> np.uint64(32), b >> np.uint64(32)
+        a = np.uint64(0xD2511F53) * c[0]
+        b = np.uint64(0xCD9E8D57) * c[2]
+        high_a = a >> np.uint64(32)
+        high_b = b >> np.uint64(32)
         c = [high_b ^ c[1] ^ np.uint64(key[0]), b & low, high_a ^ c[3] ^ np.uint64(key[1]), a & low]
         key = [(key[0] + 0x9E3779B9) & 0xFFFFFFFF, (key[1] + 0xBB67AE85) & 0xFFFFFFFF]
     return np.stack(c, axis=1).astype(np.uint32)
@@ -147,7 +150,8 @@ def walk_tables(
 ) -> tuple[int, np.float32, np.ndarray]:
     """Entries that count, |R_i|, and the chance to draw each column with each sign, (n, 2)."""
     sizes = np.abs(values.astype(np.float64))
-    exact, chances = math.fsum(sizes), np.zeros((n, 2))
+    exact = math.fsum(sizes)
+    chances = np.zeros((n, 2))
     if np.float32(exact) < np.finfo(np.float32).tiny:
         return 0, np.float32(0), chances
     np.add.at(chances, (columns, np.signbit(values).astype(int)), sizes / exact)
@@ -164,7 +168,8 @@ def walk(
     ends, the adjoint.
     """
     records, entries, channels, links = tables
-    row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
+    row = np.array(pixels)
+    step = np.zeros(len(pixels), np.int64)
     weight = np.ones((len(row), channels), np.float32)
     scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
     alive = np.ones(len(row), bool)
@@ -242,7 +247,8 @@ def form_factor_pair(p, q, n, m, clip: bool = True) -> np.ndarray:
     """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
     d = q[None] - p[:, None]
     r2 = (d**2).sum(axis=2)
-    here, there = np.einsum("mnc,mc->mn", d, n), -np.einsum("mnc,nc->mn", d, m)
+    here = np.einsum("mnc,mc->mn", d, n)
+    there = -np.einsum("mnc,nc->mn", d, m)
     faces = (here > 1e-6) & (there > 1e-6) if clip else r2 > 0
     return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
 
@@ -273,7 +279,8 @@ def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) 
     def smooth(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return form_factor_pair(p, q, normal, normal, clip=False)
 
-    curved, step = smooth(centre, centre), 1e-2
+    curved = smooth(centre, centre)
+    step = 1e-2
     ends = [move for edge in (step * right, step * down) for move in (-edge, edge)]
     bends = [smooth(centre + e, centre) + smooth(centre, centre + e) - 2 * curved for e in ends]
     curved = curved + sum(bends) / (24 * step**2)
@@ -281,8 +288,10 @@ def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) 
     d = centre[None] - centre[:, None]
     height = np.einsum("mnc,mc->mn", d, normal)
     rise = sum(np.abs(normal @ edge.T) for edge in (right, down)) / 2
-    above, below = height + rise > 1e-6, height - rise < -1e-6
-    r2, sizes = (d**2).sum(axis=2), geometry[12] + geometry[12][:, None]
+    above = height + rise > 1e-6
+    below = height - rise < -1e-6
+    r2 = (d**2).sum(axis=2)
+    sizes = geometry[12] + geometry[12][:, None]
     hard = (r2 < inner**2 * sizes) | below | below.T
     close = np.where(above & above.T, np.where(hard, eight, curved), 0.0)
     return np.where(r2 < outer**2 * sizes, close, one)
@@ -306,9 +315,11 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     p, q = np.broadcast_arrays(np.asarray(p, np.float64), np.asarray(q, np.float64))
     result = np.zeros(p.shape[:-1], bool)
     for box in np.asarray(blocks, np.float64):
-        low, high = box[:3] - box[3:], box[:3] + box[3:]
+        low = box[:3] - box[3:]
+        high = box[:3] + box[3:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (low - p) / (q - p), (high - p) / (q - p)
+            a = (low - p) / (q - p)
+            b = (high - p) / (q - p)
         along = q == p  # never leaves the slab, or never enters it
         inside = (low <= p) & (p <= high)
         enter = np.where(along, np.where(inside, -np.inf, np.inf), np.minimum(a, b)).max(axis=-1)
@@ -450,8 +461,10 @@ def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
     last sample stands for the pixels left over; joined to another by weights, it keeps a constant
     constant.
     """
-    size, rest = 2**level, pixels % 2**level
-    n, regular = -(-pixels // size), pixels // size // 2
+    size = 2**level
+    rest = pixels % 2**level
+    n = -(-pixels // size)
+    regular = pixels // size // 2
     half = (n + 1) // 2
     M = np.zeros((n, n))
     for m, t in itertools.product(range(regular), range(taps.shape[1])):
@@ -460,13 +473,15 @@ def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
         M[half - 1, n - 1] = 1
     elif half > regular:
         weights = np.sqrt([size, rest]) / np.sqrt(size + rest)
-        M[half - 1, n - 2 :], M[n - 1, n - 2 :] = weights, weights[::-1] * [1, -1]
+        M[half - 1, n - 2 :] = weights
+        M[n - 1, n - 2 :] = weights[::-1] * [1, -1]
     return M
 
 
 def wavelet_split(grid: tuple[int, int], levels: int, taps: np.ndarray) -> np.ndarray:
     """W (N, N), from pictures of h x w pixels to their coefficients after all levels."""
-    (h, w), n = grid, grid[0] * grid[1]
+    h, w = grid
+    n = grid[0] * grid[1]
     W = np.eye(n).reshape(h, w, n)
     for level in range(levels):
         corner = np.s_[: -(-h // 2**level), : -(-w // 2**level)]

@@ -224,10 +224,10 @@ class _Search:
         distance = safe_ratio(gap, self.errors, self.errors > 0.0)
         bound = np.minimum(self.errors - distance, self.errors)
         self.least = np.fmax(self.least, bound)
-        excess = self._excess_of(self.errors)
+        excess = self._excess_above_least(self.errors)
         self.excess = np.where(np.isfinite(self.errors), excess, np.inf)
 
-    def _excess_of(self, errors: np.ndarray) -> np.ndarray:
+    def _excess_above_least(self, errors: np.ndarray) -> np.ndarray:
         """Return what errors are above the least one, with all that rounding may hide."""
         excess = errors - self.least + 2.0 * self.hidden
         return np.maximum(excess, ROUNDING_SHARE * self.scale)
@@ -261,7 +261,7 @@ class _Search:
         saturated = self.descent.saturated(self.x)
         self.saturated = np.where(self.is_worse, False, saturated)
         self.errors = np.where(self.is_worse, self.initial, self.errors)
-        self.excess = np.where(self.is_worse, self._excess_of(self.initial), self.excess)
+        self.excess = np.where(self.is_worse, self._excess_above_least(self.initial), self.excess)
 
 
 class _Descent:

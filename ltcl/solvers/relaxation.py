@@ -50,8 +50,8 @@ class BlockGaussSeidel(IterativeMethod):
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it with an iterate."""
-        how = relaxation(system.S, self.name, self.block, self.omega)
-        sweeps = Sweeps(how, x, system.b, r)
+        plan = relaxation(system.S, self.name, self.block, self.omega)
+        sweeps = Sweeps(plan, x, system.b, r)
         sweeps.sweep()
         system.products += 1
         _repeat(sweeps.sweep, system, sweeps.before, r, monitor)
