@@ -36,9 +36,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 
 import _figures as figures
 import ltcl
-from _coefficients import relative
+from _coefficients import relative_error
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.acquisition import Report, VirtualRig, acquire
 from ltcl.device import Device
 from ltcl.store import BlockStore
@@ -150,7 +150,7 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str
         P = np.repeat(held(truth.n)[..., None], truth.channels, axis=-1)
         return Found(
             name, strategy, truth.n**2, plan["photographs"], report.photographs, *exposures, seconds,
-            relative(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
+            relative_error(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
             *far(T, truth, unit), compensated(T, truth, unit), *of_bounces(T, truth),
         )  # fmt: skip
 
@@ -163,7 +163,9 @@ def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float
     (y, x), (v, u) = (np.divmod(part, TILES) for part in (tile, np.arange(TILES**2)))
     beyond = (np.maximum(abs(y - v), abs(x - u)) > 1)[..., None]
     ours, theirs = (np.sum(beyond * seen, axis=1) for seen in (unit * shown(T, P), truth.seen(P)))
-    return relative(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
+    return relative_error(ours, theirs), float(
+        np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1))
+    )
 
 
 def of_bounces(T: ltcl.Transport, truth: Truth) -> tuple[list[float], float]:
@@ -279,7 +281,7 @@ def draw(costs: list[Found]) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     sides = [6, 8] if given.smoke else [16, 24, 32, 48, 64]
     run = partial(measured, device=given.device)
     truth, cameras = Truth([corner(sides[-1])]), list(CAMERAS)[-1:] if given.smoke else CAMERAS

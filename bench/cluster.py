@@ -26,7 +26,7 @@ import psutil
 from distributed import Client, LocalCluster
 
 import ltcl
-from _harness import Row, options, report
+from _harness import Row, parse_options, report
 
 BATCH, RTOL, KILLS = 4, 1e-4, 10
 EFFICIENCY, GROWTH = 0.9, 1.1  # of two workers; of memory over the run
@@ -79,7 +79,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     size, frames, many = (6, 12, 40) if given.smoke else (48, 96, 2000)
     kills, rows, facts = 1 if given.smoke else KILLS, [], {}
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:

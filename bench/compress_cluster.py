@@ -17,7 +17,7 @@ from distributed import Client, LocalCluster
 
 from _coefficients import note
 from _corner import Bounce
-from _harness import Options, Row, options, report
+from _harness import Options, Row, parse_options, report
 from ltcl.operators import Wavelet
 from ltcl.tasks.compression.bases import CoefficientAnalysis
 from ltcl.tasks.compression.coefficients import Coefficients, coefficients
@@ -46,7 +46,7 @@ def compress(given: Options, rows: Bounce, workers: int) -> tuple[Coefficients, 
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     rows = Bounce(8 if given.smoke else 256, REFERENCE)
     (one, slow), (two, fast) = (compress(given, rows, workers) for workers in (1, 2))
     for name in ("indptr", "indices", "data"):
@@ -57,7 +57,7 @@ def main() -> None:
         "share of the time": fast / slow,
         "peak memory here, MB": peak,
     }
-    row = Row.of_times(
+    row = Row.from_times(
         "numbers of A", "one worker", slow, fast, "s", None if given.smoke else 1 / SHARE
     )
     report(given, "compression by two workers of a core", [row], facts)

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import relative
+from _coefficients import relative_error
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl import scenes
 from ltcl.scenes.landscape import landscape
 from scenes import tracing
@@ -82,7 +82,7 @@ def loss(T: ltcl.Transport, C: ltcl.Transport, count: int) -> float:
     light, ours = (ltcl.solve(each, b, rtol=ACCURATE).x for each in (S, approximate))
     undone = ltcl.solve(approximate, seen, rtol=ACCURATE).x
     pairs = ((approximate @ direct, seen), (undone, direct), (ours, light), (S @ ours, b))
-    return max(relative(*map(np.asarray, pair)) for pair in pairs)
+    return max(relative_error(*map(np.asarray, pair)) for pair in pairs)
 
 
 def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, Any], list[Claim]]:
@@ -93,7 +93,7 @@ def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, A
 
     def off(C: ltcl.Transport) -> float:
         ours, exact = (np.asarray(A.operators[0] @ p).ravel() for A in (C, other))
-        return relative(ours, exact)
+        return relative_error(ours, exact)
 
     exact = off(T)
     differ = np.linalg.norm(R[1] - R[0]) / np.linalg.norm(R[0] - np.eye(len(p)))
@@ -120,7 +120,7 @@ def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, A
 
 def main() -> None:
     """Run it."""
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     n, small, count = (8, 6, 16) if given.smoke else (32, 16, HELD)
     others = {
         "corner": scenes.dihedral(small, albedo=0.6),

@@ -24,7 +24,7 @@ from rich.table import Table
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.plots.page import OTHERS
 from ltcl.tasks.denoising.bases import multiwavelets
 from ltcl.tasks.denoising.problem import DenoisingProblem
@@ -170,7 +170,7 @@ def draw(cases: Sequence[Case]) -> Any:
 
 def main() -> None:
     """Run the bench."""
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # of glossy scenes, at each separation
     sizes = [(8, 1.0)] if given.smoke else [(12, 0.0), (12, 1.0), (20, 0.0)]
     some = SCENES[: 1 if given.smoke else None]

@@ -35,9 +35,9 @@ from rich.progress import track
 
 import _figures as figures
 import ltcl
-from _coefficients import relative
+from _coefficients import relative_error
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl import scenes
 from ltcl.acquisition import VirtualRig, acquire, camera_map
 from ltcl.errors import AcquisitionError, ScanRefused
@@ -239,13 +239,13 @@ def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
             named = early and any(first <= number <= last for number in numbers(str(error)))
             results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
             continue
-        change = relative(shown[:, known & seen].T, clean[:, known & seen].T)
+        change = relative_error(shown[:, known & seen].T, clean[:, known & seen].T)
         results.append(Outcome(kind, name, at, count, change, False, False, ""))
     return results
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     kinds, faults, clean = (KINDS[:1], 1, 1) if given.smoke else (KINDS, FAULTS, CLEAN)
     jobs = [(k, kinds if k < faults else ()) for k in range(clean)]
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:

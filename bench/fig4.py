@@ -23,7 +23,7 @@ import _figures as figures
 import ltcl
 from _boxes import FLOOR, NEUTRAL
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.plots.page import FAINT, INK, axes_at, label_at
 from ltcl.scenes import Scene
 from ltcl.theory import bounce_coefficients
@@ -270,16 +270,16 @@ def draw_contents(figure: Figure) -> None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    n = 4 if given.smoke else 16
-    series = measure(n, given.device)
+    options = parse_options(__doc__)
+    n = 4 if options.smoke else 16
+    series = measure(n, options.device)
     facts = {
         "patches": series.l_d.shape[1],
         "largest albedo": float(series.scene.albedo.max()),
         "relative error after n terms": [float(f"{error:.3g}") for error in series.errors],
     }
     title = "Figure 4: terms of the inverse series"
-    figures.conclude(given, title, claims(series), facts, lambda: draw(series))
+    figures.conclude(options, title, claims(series), facts, lambda: draw(series))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import _figures as figures
 import ltcl
 from _boxes import FLOOR, RTOL, Race, race
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.plots.page import FAINT, INK
 from ltcl.scenes import box
 from ltcl.solvers import matrix_series
@@ -168,7 +168,7 @@ def closed_claims(closed: Mapping[float, Race]) -> list[Claim]:
     return [
         Claim(
             "(c) albedo 0.45 converges in a few iterations",
-            few.said,
+            few.outcome,
             "1 % in at most 10",
             few.steps() <= 10,
             shared_light,
@@ -207,11 +207,11 @@ def open_claims(opened: Mapping[int, Race], below_limit: Race) -> list[Claim]:
 
 def slow_claim(text: str, race: Race, prefix: str = "", differs: str = "") -> Claim:
     is_slow = 50 < race.steps() < math.inf
-    return Claim(text, prefix + race.said, "over 50", is_slow, differs)
+    return Claim(text, prefix + race.outcome, "over 50", is_slow, differs)
 
 
 def divergence_claim(text: str, race: Race) -> Claim:
-    return Claim(text, race.said, "diverges", race.diverged)
+    return Claim(text, race.outcome, "diverges", race.diverged)
 
 
 def chebyshev_claim(races: list[Race]) -> Claim:
@@ -299,14 +299,14 @@ def draw_jacobi(axes: Axes, name: str, box_race: Race, shade: str) -> None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    measured = measure(4 if given.smoke else 16, given.device)
+    options = parse_options(__doc__)
+    measured = measure(4 if options.smoke else 16, options.device)
     facts = {}
     for box_race in measured.races:
         products = box_race.chebyshev.products
-        facts[box_race.name] = f"{box_race.said}; Chebyshev 1e-5 in {products} products"
+        facts[box_race.name] = f"{box_race.outcome}; Chebyshev 1e-5 in {products} products"
     title = "Figure 5: convergence"
-    figures.conclude(given, title, claims(measured), facts, lambda: draw(measured))
+    figures.conclude(options, title, claims(measured), facts, lambda: draw(measured))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ import _figures as figures
 import ltcl
 from _boxes import ALBEDO, RTOL
 from _figures import Claim
-from _harness import Options, options
+from _harness import Options, parse_options
 from ltcl.plots.page import FAINT
 from ltcl.scenes import Block, Scene, box, glossy
 
@@ -96,7 +96,7 @@ class Recovery:
 def with_shadows(n: int, device: ltcl.Device) -> Recovery:
     """The box with a block in it, under a lamp."""
     room = box(n, 5, SHADED_ALBEDO, occluder=BLOCK, device=device)
-    scene, l_d, systems, l_out = boxes.lit(room, LAMP, device)
+    scene, l_d, systems, l_out = boxes.light_room(room, LAMP, device)
     terms = boxes.terms(systems, l_out, ITERATIONS)
     return Recovery(
         scene=scene,
@@ -242,18 +242,18 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
     return figure
 
 
-def camera_radius(given: Options) -> float:
+def camera_radius(options: Options) -> float:
     """rho(R) of the glossy box as one camera and one projector see it."""
     # Smaller than the box that is drawn: its spectrum is that of a dense matrix.
-    scene = glossy_box(4 if given.smoke else 6, given.smoke)
-    T = scene.transport(scene.first_bounce, given.device, on_dark="mask")
+    scene = glossy_box(4 if options.smoke else 6, options.smoke)
+    T = scene.transport(scene.first_bounce, options.device, on_dark="mask")
     return max(channel.spectral_radius for channel in ltcl.analyze(T).channels)
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    shade = with_shadows(4 if given.smoke else 14, given.device)
-    gloss = with_gloss(4 if given.smoke else 12, given.smoke)
+    options = parse_options(__doc__)
+    shade = with_shadows(4 if options.smoke else 14, options.device)
+    gloss = with_gloss(4 if options.smoke else 12, options.smoke)
     unknowns = []
     errors = []
     albedos = []
@@ -266,9 +266,9 @@ def main() -> None:
         "relative error after n iterations": errors,
         "largest albedo": albedos,
     }
-    listed = claims(shade, gloss, camera_radius(given))
+    listed = claims(shade, gloss, camera_radius(options))
     title = "Figure 6: shadows and gloss"
-    figures.conclude(given, title, listed, facts, lambda: draw(shade, gloss))
+    figures.conclude(options, title, listed, facts, lambda: draw(shade, gloss))
 
 
 if __name__ == "__main__":

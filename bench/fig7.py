@@ -33,10 +33,10 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, fewest, note, relative
+from _coefficients import analysis, keep_fewest, note, relative_error
 from _corner import Bounce, interreflection
 from _figures import Claim
-from _harness import Options, options, seconds
+from _harness import Options, parse_options, seconds
 from ltcl import checks
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
 from ltcl.scenes import landscape
@@ -138,11 +138,11 @@ def iteration_way(S: IdentityPlus, corner: Problem, kept: float) -> Way:
     def solve(rtol: float) -> ltcl.Solution:
         return ltcl.solve(S, corner.l_out, "jacobi", rtol=rtol)
 
-    rtol = loosest_tolerance(lambda rtol: relative(solve(rtol).x, corner.l_d))
+    rtol = loosest_tolerance(lambda rtol: relative_error(solve(rtol).x, corner.l_d))
     solution = solve(rtol)
     return Way(
         run=lambda: solve(rtol).x,
-        error=relative(solution.x, corner.l_d),
+        error=relative_error(solution.x, corner.l_d),
         first=solution.seconds,
         products=solution.products,
         nbytes=S.nbytes,
@@ -181,7 +181,7 @@ def matrix_way(inverse: Callable[[int], np.ndarray], corner: Problem, iteration:
     first = time.perf_counter() - start
     return Way(
         run=run,
-        error=relative(l_d, corner.l_d),
+        error=relative_error(l_d, corner.l_d),
         first=first,
         products=steps,
         nbytes=iteration.nbytes,
@@ -211,9 +211,9 @@ def wavelet_way(corner: Problem, W: Wavelet, C: Any, both: bool) -> Way:
     def error(core: Any) -> float:
         S = system(CSR(W.device, core), W)
         solution = ltcl.solve(S, corner.l_out, "jacobi", rtol=COMPRESSION_ERROR / 10)
-        return relative(solution.x, corner.l_d)
+        return relative_error(solution.x, corner.l_d)
 
-    core = fewest(C, error, COMPRESSION_ERROR)
+    core = keep_fewest(C, error, COMPRESSION_ERROR)
     V: Any = W
     if both:
         core, V = restrict_to_support(core, W)
@@ -231,12 +231,12 @@ class Point:
     way: Way
 
 
-def ways(given: Options, corner: Problem) -> dict[str, Way]:
+def ways(options: Options, corner: Problem) -> dict[str, Way]:
     """Every method that goes so far, ready to run."""
-    return dense_ways(given, corner) | compressed_ways(given, corner)
+    return dense_ways(options, corner) | compressed_ways(options, corner)
 
 
-def dense_ways(given: Options, corner: Problem) -> dict[str, Way]:
+def dense_ways(options: Options, corner: Problem) -> dict[str, Way]:
     """The iteration and the series with all numbers of R, if memory is left for these."""
     n = corner.pixels
     # Pixels of dense R for which the host has memory.
@@ -244,7 +244,7 @@ def dense_ways(given: Options, corner: Problem) -> dict[str, Way]:
     if n > min(MAX_DENSE_PIXELS, most):
         return {}
     R = interreflection(corner.rows.n, ALBEDO, lambda text: note(f"N = {n}: {text.strip()}"))
-    S = IdentityPlus(Dense(given.device, R))
+    S = IdentityPlus(Dense(options.device, R))
     iteration = iteration_way(S, corner, n)
     dense = {"iteration": iteration}
     if n <= min(MAX_SERIES_PIXELS, most):
@@ -255,9 +255,9 @@ def dense_ways(given: Options, corner: Problem) -> dict[str, Way]:
     return dense
 
 
-def compressed_ways(given: Options, corner: Problem) -> dict[str, Way]:
+def compressed_ways(options: Options, corner: Problem) -> dict[str, Way]:
     """The iteration with R in wavelets, on both sides and in its rows."""
-    W = Wavelet(given.device, corner.rows.grid, "db2")
+    W = Wavelet(options.device, corner.rows.grid, "db2")
     transform = analysis(W)
     blocks = source("A", corner.rows, BLOCK_BYTES)
     A = coefficients(blocks, transform, transform, THRESHOLD, first=THRESHOLD / 4)
@@ -269,11 +269,11 @@ def compressed_ways(given: Options, corner: Problem) -> dict[str, Way]:
     }
 
 
-def measure(given: Options, n: int) -> list[Point]:
+def measure(options: Options, n: int) -> list[Point]:
     """All methods at one N, timed in turn."""
     start = time.perf_counter()
     corner = problem(n)
-    methods = ways(given, corner)
+    methods = ways(options, corner)
     pixels = corner.pixels
     times = {}
     actions: dict[str, Callable[[], object]] = {}
@@ -488,11 +488,11 @@ def label_end(axes: Axes, method: Method, end: tuple[float, float], offset: int)
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    options = parse_options(__doc__)
     points = []
-    for n in SMOKE_SIZES if given.smoke else SIZES:
-        points += measure(given, n)
-    laws = {} if given.smoke else all_laws(points)
+    for n in SMOKE_SIZES if options.smoke else SIZES:
+        points += measure(options, n)
+    laws = {} if options.smoke else all_laws(points)
     facts: dict[str, Any] = {"albedo": ALBEDO}
     for name, method in METHODS.items():
         facts |= method_facts(method, select_method(points, name))
@@ -507,7 +507,7 @@ def main() -> None:
         n, ratio = slowdown(points, slow, fast)
         facts[f"{METHODS[slow].label} over {METHODS[fast].label} at N = {n}"] = ratio
     title = "Figure 7: resolution"
-    figures.conclude(given, title, claims(points, laws), facts, lambda: draw(points, laws))
+    figures.conclude(options, title, claims(points, laws), facts, lambda: draw(points, laws))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import _boxes as boxes
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.scenes import Scene, box
 
 ALBEDO = 0.4
@@ -55,7 +55,7 @@ class Inversion:
 def invert(n: int, device: ltcl.Device) -> Inversion:
     """The box under its lamp, n x n patches a wall."""
     room = box(n, sides=5, albedo=ALBEDO)
-    scene, (l_d,), (S,), (l_out,) = boxes.lit(room, LAMP, device)
+    scene, (l_d,), (S,), (l_out,) = boxes.light_room(room, LAMP, device)
     return Inversion(scene=scene, S=S, l_out=l_out, l_d=l_d)
 
 
@@ -141,15 +141,15 @@ def draw_estimates(figure: Figure, inversion: Inversion) -> None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    inversion = invert(6 if given.smoke else 32, given.device)
+    options = parse_options(__doc__)
+    inversion = invert(6 if options.smoke else 32, options.device)
     errors = measure(inversion)
     facts = {"pixels": len(inversion.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}
     for kind, values in errors.items():
         facts[f"relative error, {kind}"] = np.round(values.mean(axis=1), 5).tolist()
     listed = claims(inversion, errors)
     title = "Figure 8: Monte Carlo"
-    figures.conclude(given, title, listed, facts, lambda: draw(inversion, errors))
+    figures.conclude(options, title, listed, facts, lambda: draw(inversion, errors))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import _boxes as boxes
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from ltcl.scenes import Scene, dihedral, glossy
 from ltcl.scenes.walls import Wall
 
@@ -220,16 +220,16 @@ def draw(plain: Parts, board: Parts) -> Figure:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    plain = diffuse(6 if given.smoke else 24, given.device)
-    board = with_board(5 if given.smoke else 14, given.smoke, given.device)
+    options = parse_options(__doc__ or "")
+    plain = diffuse(6 if options.smoke else 24, options.device)
+    board = with_board(5 if options.smoke else 14, options.smoke, options.device)
     facts = {
         "patches": [int(np.prod(parts.scene.grid)) for parts in (plain, board)],
         "reciprocity defect of the glossy scene": board.separation.reciprocity_defect,
     }
     listed = claims(plain, board)
     title = "Figure 9: bounces of light"
-    figures.conclude(given, title, listed, facts, lambda: draw(plain, board))
+    figures.conclude(options, title, listed, facts, lambda: draw(plain, board))
 
 
 if __name__ == "__main__":

@@ -40,9 +40,9 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import relative
+from _coefficients import relative_error
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from acquire import CAMERAS, corner, held
 from ltcl.acquisition import Calibration, MitsubaRig, Report, VirtualRig, acquire, camera_map
 from ltcl.acquisition.geometry import decode
@@ -133,7 +133,7 @@ def measured(device: Device, truth: np.ndarray, view: View, camera: str, noise: 
     theirs = truth.sum(axis=1)[seen]
     wanted = (truth @ P)[seen]
     ours *= (white @ theirs) / (white @ white)
-    errors = {name: relative(ours[:, some], wanted[:, some]) for name, some in KINDS.items()}
+    errors = {name: relative_error(ours[:, some], wanted[:, some]) for name, some in KINDS.items()}
     return Found(view.size, camera, noise, errors, int(np.count_nonzero(~seen)))
 
 
@@ -167,7 +167,8 @@ def rendered(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop
         ours, theirs = np.asarray(T @ white, np.float64)[inner], truth.radiance(white)[inner]
         unit = ours @ theirs / (ours @ ours)
         errors = [
-            relative(unit * np.asarray(T @ p)[inner], truth.radiance(p)[inner]) for p in patterns
+            relative_error(unit * np.asarray(T @ p)[inner], truth.radiance(p)[inner])
+            for p in patterns
         ]
         y, x = np.mgrid[:h, :w] / w
         desired, level = (
@@ -326,7 +327,7 @@ def _percent(axes: Axes) -> None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     run, loop = partial(measured, given.device, corner(N)), None
     kinds, quiet = list(CAMERAS), next(iter(NOISES))
     seen, sizes, louder, seeds = kinds, SIZES, list(NOISES)[1:], range(PLACES)

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import Options, options
+from _harness import Options, parse_options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.tasks.plausibility import LARGEST_NEGATIVE
@@ -162,8 +162,8 @@ def round_all(values: np.ndarray) -> list[float]:
     return [round_digits(value) for value in values]
 
 
-def measure_cases(given: Options) -> list[Case]:
-    if given.smoke:
+def measure_cases(options: Options) -> list[Case]:
+    if options.smoke:
         n, directions = 4, 16
         exponents = [5, 20]
         shares = (0.0, 0.1, 0.2, 0.4)
@@ -183,7 +183,7 @@ def measure_cases(given: Options) -> list[Case]:
             projector=PROJECTOR,
             directions=directions,
         )
-        cases.append(measure(scene, room, exponent, gloss, given.device))
+        cases.append(measure(scene, room, exponent, gloss, options.device))
     return cases
 
 
@@ -347,16 +347,16 @@ def draw_curves(
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    options = parse_options(__doc__)
     # The warning is among the results.
     logging.getLogger("ltcl").setLevel(logging.ERROR)
-    cases = measure_cases(given)
+    cases = measure_cases(options)
     facts = {}
     for case in cases:
         name = f"{case.room}, exponent {case.exponent:g}, gloss {case.gloss:g}"
         facts[name] = asdict(case)
     title = "The single-view approximation (eq. 28, 29)"
-    figures.conclude(given, title, claims(cases), facts, lambda: draw(cases))
+    figures.conclude(options, title, claims(cases), facts, lambda: draw(cases))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import ltcl
-from _harness import Options, options, record, write_json
+from _harness import Options, parse_options, record, write_json
 from ltcl.device import Device
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.bounded import minimise
@@ -103,13 +103,13 @@ def record_traffic() -> Iterator[Traffic]:
         yield traffic
 
 
-def operators(given: Options) -> dict[str, Callable[[], Any]]:
+def operators(options: Options) -> dict[str, Callable[[], Any]]:
     """R of one kind each, made anew at every call: the mean of two neighbours.
 
     Its eigenvalues are all over [-0.9, 0.9], so that no method comes near rounding in those steps.
     """
-    device = given.device
-    side = 16 if given.smoke else 64
+    device = options.device
+    side = 16 if options.smoke else 64
     ring = np.roll(np.eye(side**2, dtype=np.float32), 1, axis=0)
     G = 0.45 * (ring + ring.T)
     W = Wavelet(device, (side, side), "db2")
@@ -194,19 +194,19 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    kinds = operators(given).items()
+    options = parse_options(__doc__)
+    kinds = operators(options).items()
     rows = []
     for (kind, make), method, k in itertools.product(kinds, TARGETS, (1, 3)):
-        rows.append(row(given.device, kind, make, method, k))
+        rows.append(row(options.device, kind, make, method, k))
     misses = [cells["verdict"] for cells in rows].count("MISS")
     table = Table(*rows[0], caption=f"{misses} of {len(rows)} targets missed")
     for cells in rows:
         table.add_row(*map(str, cells.values()))
     Console(width=190).print(table)
-    if given.json is not None:
-        content = record(given, "What a step asks of a device", {"missed": misses})
-        write_json(given.json, content | {"rows": rows})
+    if options.json is not None:
+        content = record(options, "What a step asks of a device", {"missed": misses})
+        write_json(options.json, content | {"rows": rows})
 
 
 if __name__ == "__main__":

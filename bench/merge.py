@@ -18,7 +18,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from _harness import Options, Row, options, report, seconds
+from _harness import Options, Row, parse_options, report, seconds
 from ltcl.acquisition.radiometry import NoiseModel, Response, calibrate, merge
 from ltcl.images import from_srgb, to_srgb
 
@@ -59,7 +59,7 @@ def scaled_error(measured: np.ndarray, true: np.ndarray) -> float:
     return float(np.std(ratio) / np.mean(ratio))
 
 
-def merging_rows(given: Options, n: int) -> list[Row]:
+def merging_rows(options: Options, n: int) -> list[Row]:
     """Speed of merging, and noise of the merged picture."""
     light = scene(n)
     shots_8 = photographs(light, 256)
@@ -72,7 +72,7 @@ def merging_rows(given: Options, n: int) -> list[Row]:
         "ours 12": lambda: merge(shots_12, EXPOSURES, response, noise, levels=4096),
         **theirs,
     }
-    times = seconds(actions, 1 if given.smoke else 4)
+    times = seconds(actions, 1 if options.smoke else 4)
     megapixels = len(EXPOSURES) * n * n / 1e6
     rates = {name: megapixels / spent for name, spent in times.items()}
     rows = []
@@ -90,7 +90,7 @@ def merging_rows(given: Options, n: int) -> list[Row]:
         picture = np.asarray(process())
         their_noise = scaled_error(picture[merged.valid], valid_light)
         question = "noise of the picture, 8 bits"
-        rows.append(Row.of_times(question, f"OpenCV {name}", their_noise, our_noise, "rms", 1.0))
+        rows.append(Row.from_times(question, f"OpenCV {name}", their_noise, our_noise, "rms", 1.0))
     return rows
 
 
@@ -120,8 +120,8 @@ def response_rows(n: int) -> list[Row]:
     rows = []
     for name, make in CALIBRATORS.items():
         error, duration = judge_response(partial(estimate, make))
-        rows.append(Row.of_times(question, f"OpenCV {name}", error, our_error, "rms", 1.0))
-        rows.append(Row.of_times(question, f"OpenCV {name}", duration, our_seconds, "s"))
+        rows.append(Row.from_times(question, f"OpenCV {name}", error, our_error, "rms", 1.0))
+        rows.append(Row.from_times(question, f"OpenCV {name}", duration, our_seconds, "s"))
     return rows
 
 
@@ -139,11 +139,11 @@ def judge_response(estimate: Callable[[], np.ndarray]) -> tuple[float, float]:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    rows = merging_rows(given, 64 if given.smoke else 1200)
-    rows += response_rows(64 if given.smoke else 400)
+    options = parse_options(__doc__)
+    rows = merging_rows(options, 64 if options.smoke else 1200)
+    rows += response_rows(64 if options.smoke else 400)
     facts = {"exposures": len(EXPOSURES), "opencv": cv2.__version__}
-    report(given, "Merging exposures", rows, facts)
+    report(options, "Merging exposures", rows, facts)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 import ltcl
-from _harness import Options, options, publish
+from _harness import Options, parse_options, publish
 from ltcl.scenes import box, dihedral, glossy
 from ltcl.solvers.solve import METHODS, SAMPLED
 from solve import RTOL, Problem
@@ -29,9 +29,9 @@ GLOSS = [0.4, 0.4]
 GLOSSY_ROOM = {"exponent": 20, "projector": (2.4, 1.2, 1.2)}
 
 
-def problem(name: str, scene: Any, given: Options) -> Problem:
+def problem(name: str, scene: Any, options: Options) -> Problem:
     """S of a scene with its true first bounce, and a picture of it."""
-    (S,) = scene.transport(first_bounce=scene.first_bounce, device=given.device).systems
+    (S,) = scene.transport(first_bounce=scene.first_bounce, device=options.device).systems
     n = S.shape[0]
     R = S.to_dense() - np.eye(n, dtype=np.float32)
     is_lit = np.arange(n) < n / 3
@@ -61,8 +61,8 @@ def products(problem: Problem, method: str) -> int | str:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    problems = [problem(name, room, given) for name, room in rooms(given.smoke).items()]
+    options = parse_options(__doc__)
+    problems = [problem(name, room, options) for name, room in rooms(options.smoke).items()]
     table = Table("method", *(room.name for room in problems))
     counts: dict[str, dict[str, int | str]] = {}
     for method in METHODS:
@@ -71,7 +71,7 @@ def main() -> None:
         counts[method] = {room.name: products(room, method) for room in problems}
         table.add_row(method, *map(str, counts[method].values()))
     pixels = {f"pixels, {room.name}": len(room.b) for room in problems}
-    publish(given, "Products to 1 %", pixels, table, {"products": counts}, Figure)
+    publish(options, "Products to 1 %", pixels, table, {"products": counts}, Figure)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
@@ -64,8 +64,8 @@ def ratios(exact: ltcl.Transport, level: float, photons: float, twice: bool) -> 
 
 def main() -> None:
     """Judge each way, scene and noise."""
-    given = options(__doc__ or "")
-    size = 6 if given.smoke else 12
+    options = parse_options(__doc__)
+    size = 6 if options.smoke else 12
     facts = {}
     is_good = []
     for twice, photons, scene in product((False, True), PHOTONS, SCENES):
@@ -78,8 +78,8 @@ def main() -> None:
     text = f"cases of which 95 % of the entries are within a factor {MAX_FACTOR}"
     claim = Claim(text, f"{sum(is_good)} of {len(is_good)}", "all", all(is_good))
     # Scenes of --smoke are too small for the claim.
-    listed = [] if given.smoke else [claim]
-    figures.conclude(given, "Noise of T, estimated over true", listed, facts, Figure)
+    listed = [] if options.smoke else [claim]
+    figures.conclude(options, "Noise of T, estimated over true", listed, facts, Figure)
 
 
 if __name__ == "__main__":

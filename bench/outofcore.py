@@ -35,7 +35,7 @@ import scipy.sparse
 
 import ltcl
 from _coefficients import note
-from _harness import Options, Row, options, product, report, seconds
+from _harness import Options, Row, parse_options, product, report, seconds
 from ltcl.device import Device
 from ltcl.operators import Dense, MultiDevice, Streamed
 
@@ -169,13 +169,13 @@ def near_transport(scene: Scene, whole: ltcl.Transport, device: Device) -> ltcl.
     return ltcl.Transport(scipy.sparse.csr_array(T), whole.grid, whole.first_bounce, device=device)
 
 
-def solve_tasks(given: Options, scene: Scene, T: np.ndarray) -> dict[str, str]:
+def solve_tasks(options: Options, scene: Scene, T: np.ndarray) -> dict[str, str]:
     """Solves with T on the disk, whose answers are judged without it."""
     grid = (scene.side, scene.side)
     light = np.random.default_rng(0).uniform(0.3, 0.7, (FRAMES, *grid)).astype(np.float32)
     pictures = scene.relight(light).astype(np.float32)
-    whole = ltcl.Transport(T, grid, device=given.device)
-    near = near_transport(scene, whole, given.device)
+    whole = ltcl.Transport(T, grid, device=options.device)
+    near = near_transport(scene, whole, options.device)
 
     def compensate(T: ltcl.Transport, **settings: Any) -> tuple[int, float]:
         answer = ltcl.compensate(T, pictures, **settings)
@@ -222,12 +222,12 @@ def half_devices(device: Device) -> tuple[Device, Device]:
     return first, second
 
 
-def compare_devices(given: Options) -> list[Row]:
+def compare_devices(options: Options) -> list[Row]:
     """Rows on two halves of the device against one half, and against the whole."""
-    device = given.device
+    device = options.device
     if device.compute_units < 2 or device.handle.partition_max_sub_devices < 2:
         return []
-    n = 512 if given.smoke else 8192
+    n = 512 if options.smoke else 8192
     first, second = half_devices(device)
     matrix = np.ones((n, n), np.float32)
     parts = [Dense(first, matrix[: n // 2]), Dense(second, matrix[n // 2 :])]
@@ -243,7 +243,7 @@ def compare_devices(given: Options) -> list[Row]:
     ours = 1e3 * times["both"]
     rows = []
     for name in ("one half", "the whole device"):
-        rows.append(Row.of_times(question, name, 1e3 * times[name], ours, "ms"))
+        rows.append(Row.from_times(question, name, 1e3 * times[name], ours, "ms"))
     return rows
 
 
@@ -258,9 +258,9 @@ def limit_memory(file: Path) -> None:
 def main() -> None:
     # PoCL reads it when the device is opened.
     os.environ.setdefault("POCL_MEMORY_LIMIT", str(MEMORY_CAP >> 30))
-    given = options(__doc__ or "")
-    rows = compare_devices(given)
-    side = 32 if given.smoke else SIDE
+    options = parse_options(__doc__)
+    rows = compare_devices(options)
+    side = 32 if options.smoke else SIDE
     with tempfile.TemporaryDirectory() as folder:
         scene = Scene(side, Path(folder) / "T.npy")
         size = 4 * side**4
@@ -268,13 +268,13 @@ def main() -> None:
             raise SystemExit(f"{folder} has no room for {size / 1e9:.3g} GB")
         note(f"writing {size / 1e9:.3g} GB")
         scene.write()
-        if not given.smoke:
+        if not options.smoke:
             limit_memory(scene.file)
         T = np.load(scene.file, mmap_mode="r")
         facts: dict[str, Any] = {"file, GB": size / 1e9, "cap, GB": MEMORY_CAP / 1e9}
-        speed_rows, speed_facts = compare_speeds(scene, Streamed(given.device, T))
-        facts |= speed_facts | solve_tasks(given, scene, T)
-    report(given, "A transport on a disk, and on two devices", rows + speed_rows, facts)
+        speed_rows, speed_facts = compare_speeds(scene, Streamed(options.device, T))
+        facts |= speed_facts | solve_tasks(options, scene, T)
+    report(options, "A transport on a disk, and on two devices", rows + speed_rows, facts)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ rows in db2 wavelets (the paper's), and of db2 wavelets on both sides; the error
 for a picture l, in float64. Others multiply the thresholded matrix at 1 %, each with its own sparse
 rows in float32, and the dense one. Ours is timed with vectors on the device, as inside a solve;
 where both sides are in wavelets a solve runs on the coefficients that are active, so that a product
-there is of the core alone: both figures are given.
+there is of the core alone: both figures are options.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import _figures as figures
-from _coefficients import ROWS, analysis, largest, note, relative
+from _coefficients import ROWS, analysis, keep_largest, note, relative_error
 from _corner import interreflection
-from _harness import Options, Row, options, product, report, seconds, triad
+from _harness import Options, Row, parse_options, product, report, seconds, triad
 from _peers import missing, sparse_products
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
@@ -67,15 +67,15 @@ class Form:
     x: np.ndarray
     y: np.ndarray
 
-    def operators(self, given: Options, numbers: Any) -> tuple[Operator, Operator]:
+    def operators(self, options: Options, numbers: Any) -> tuple[Operator, Operator]:
         """(core, operator on pictures) of some numbers: sparse rows, or tiles of 16 bits in a basis."""
         if self.into is None:
-            rows = CSR(given.device, numbers)
+            rows = CSR(options.device, numbers)
             return rows, rows
         basis: Any = self.into
         if self.out is not None:
             numbers, basis = restrict_to_support(numbers, basis)
-        core = Tiles(given.device, numbers, 8, "float16")
+        core = Tiles(options.device, numbers, 8, "float16")
         return core, Compressed(core, basis if self.out else None, basis)
 
 
@@ -107,9 +107,9 @@ def problem(smoke: bool) -> Problem:
     return Problem(R=R, grid=(n, 2 * n), x=x, y=np.concatenate(blocks))
 
 
-def forms(given: Options, scene: Problem) -> list[Form]:
+def forms(options: Options, scene: Problem) -> list[Form]:
     """R in all formats, to far more numbers than any error needs."""
-    W = Wavelet(given.device, scene.grid, "db2")
+    W = Wavelet(options.device, scene.grid, "db2")
     transform = analysis(W)
     drop = DROP_RTOL * float(np.linalg.norm(scene.R.ravel()))
 
@@ -126,7 +126,7 @@ def forms(given: Options, scene: Problem) -> list[Form]:
 
 
 def measure(
-    given: Options,
+    options: Options,
     scene: Problem,
     formats: list[Form],
     target_error: float,
@@ -141,9 +141,9 @@ def measure(
     operators = {}
     kept = {}
     for form in formats:
-        numbers = largest(form.matrix, form.x, form.y, DROPPED_SHARE * target_error)
+        numbers = keep_largest(form.matrix, form.x, form.y, DROPPED_SHARE * target_error)
         kept[form.name] = numbers.nnz / len(scene.x)
-        operators[form.name] = form.operators(given, numbers)
+        operators[form.name] = form.operators(options, numbers)
         if form.name == "pixels" and peers:
             actions |= sparse_products(numbers, scene.x)
     peer_names = list(actions)
@@ -157,7 +157,7 @@ def measure(
         point = Point(
             form=name,
             target_error=target_error,
-            error=relative(A.matvec(scene.x), scene.y),
+            error=relative_error(A.matvec(scene.x), scene.y),
             kept=kept[name],
             nbytes=A.nbytes,
             pixels=ms[f"ours, {name}"],
@@ -174,10 +174,10 @@ def compare(scene: Problem, sparse: Point, best: Point, ms: dict[str, float]) ->
     for setting, ours in (("with transforms", best.pixels), ("in a solve", best.core)):
         question = f"1 % of R l, {setting}"
         for name, theirs in others.items():
-            rows.append(Row.of_times(question, name, theirs, ours, "ms", TARGETS.get(name)))
+            rows.append(Row.from_times(question, name, theirs, ours, "ms", TARGETS.get(name)))
     sizes = {"thresholded rows of any peer": sparse.nbytes, "dense numpy": scene.R.nbytes}
     for name, size in sizes.items():
-        rows.append(Row.of_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
+        rows.append(Row.from_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
     return rows
 
 
@@ -257,16 +257,16 @@ def point_facts(points: list[Point]) -> dict[str, str]:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    scene = problem(given.smoke)
-    memory, nbytes = triad(given.device, given.smoke)
+    options = parse_options(__doc__)
+    scene = problem(options.smoke)
+    memory, nbytes = triad(options.device, options.smoke)
     peers = {"triad": memory, "dense numpy": lambda: scene.R @ scene.x}
-    formats = forms(given, scene)
+    formats = forms(options, scene)
     points: list[Point] = []
     ms: dict[str, float] = {}
     for error in ERRORS:
         timed_peers = peers if error == TARGET_ERROR else {}
-        error_points, peer_ms = measure(given, scene, formats, error, timed_peers)
+        error_points, peer_ms = measure(options, scene, formats, error, timed_peers)
         points += error_points
         ms |= peer_ms
     bandwidth = nbytes / ms.pop("triad") / 1e6
@@ -278,7 +278,7 @@ def main() -> None:
     best = at_target["both"]
     rows = compare(scene, sparse, best, ms)
     title = "Products with a smooth R"
-    report(given, title, rows, facts, lambda: draw(scene, points, sparse, best, ms))
+    report(options, title, rows, facts, lambda: draw(scene, points, sparse, best, ms))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, options, product, report, seconds
+from _harness import Options, Row, parse_options, product, report, seconds
 from csr import matrix
 from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.operators.relaxation import Sweeps, relaxation
@@ -36,18 +36,18 @@ def full_matrix(R: Any) -> scipy.sparse.csr_array:
     return S.astype(np.float32)
 
 
-def compare(given: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> list[Row]:
+def compare(options: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> list[Row]:
     is_sparse = scipy.sparse.issparse(R)
-    operator = CSR(given.device, R) if is_sparse else Dense(given.device, R)
+    operator = CSR(options.device, R) if is_sparse else Dense(options.device, R)
     S = IdentityPlus(operator)
     n = S.shape[0]
     b = np.random.default_rng(1).random(n, dtype=np.float32)
-    device_b = given.device.upload(b)
+    device_b = options.device.upload(b)
     relax = relaxation(S, "gauss_seidel")
     block_relax = relaxation(S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
 
     def start(how: Any) -> Sweeps:
-        x = given.device.upload(np.zeros(n, np.float32))
+        x = options.device.upload(np.zeros(n, np.float32))
         return Sweeps(how, x, device_b, device_b.like())
 
     sweeps = start(relax)
@@ -55,7 +55,7 @@ def compare(given: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> 
 
     def sweep(sweeps: Sweeps) -> None:
         sweeps.sweep()
-        given.device.finish()
+        options.device.finish()
 
     actions: dict[str, Callable[[], object]] = {
         "product": product(S.R, b),
@@ -73,7 +73,7 @@ def compare(given: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> 
     ms = {key: 1e3 * spent for key, spent in seconds(actions, repeats=15).items()}
 
     def row(question: str, competitor: str, key: str, ours: str, target: float) -> Row:
-        return Row.of_times(question, competitor, ms[key], ms[ours], "ms", target)
+        return Row.from_times(question, competitor, ms[key], ms[ours], "ms", target)
 
     strips = f"{name}, strips of {relax.block}"
     block_method = f"{name}, block method"
@@ -95,16 +95,16 @@ def find_pyamg_sweep() -> Callable | None:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    n, per_row, dense = (2048, 32, 256) if given.smoke else (131072, 256, 4096)
+    options = parse_options(__doc__)
+    n, per_row, dense = (2048, 32, 256) if options.smoke else (131072, 256, 4096)
     pyamg_sweep = find_pyamg_sweep()
-    rows = compare(given, "runs of 16", matrix(n, per_row, 16), pyamg_sweep)
-    rows += compare(given, "random", matrix(n, per_row, 1), pyamg_sweep)
+    rows = compare(options, "runs of 16", matrix(n, per_row, 16), pyamg_sweep)
+    rows += compare(options, "random", matrix(n, per_row, 1), pyamg_sweep)
     R = np.random.default_rng(2).random((dense, dense), dtype=np.float32) / dense
-    rows += compare(given, f"dense {dense}", R, pyamg_sweep)
+    rows += compare(options, f"dense {dense}", R, pyamg_sweep)
     installed = "no: its rows are left out" if pyamg_sweep is None else "yes"
     facts = {"pixels": n, "nonzeros a row": per_row, "PyAMG": installed}
-    report(given, "Gauss-Seidel sweep", rows, facts)
+    report(options, "Gauss-Seidel sweep", rows, facts)
 
 
 if __name__ == "__main__":

@@ -28,10 +28,10 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, fewest, note, relative, transport
+from _coefficients import analysis, keep_fewest, note, relative_error, transport
 from _corner import Bounce
 from _figures import Claim
-from _harness import Options, options, product, seconds
+from _harness import Options, parse_options, product, seconds
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import dihedral, landscape
@@ -100,9 +100,9 @@ class Built:
         return ltcl.compensate(self.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
 
 
-def build(given: Options, rows: Bounce) -> Built:
+def build(options: Options, rows: Bounce) -> Built:
     """The transport, from rows of A alone."""
-    W = Wavelet(given.device, rows.grid, "db2")
+    W = Wavelet(options.device, rows.grid, "db2")
     spent = Stopwatch()
     with spent("compressing A"):
         transform = analysis(W)
@@ -137,12 +137,12 @@ def fewest_for_patterns(W: Wavelet, rows: Bounce, cores: list[Any]) -> list[Any]
         core, V = restrict_to_support(core, W)
         S = IdentityPlus(Compressed(CSR(W.device, core), V, V))
         solution = ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION_RTOL)
-        return relative(solution.x, truth)
+        return relative_error(solution.x, truth)
 
     fewer = []
     for core, truth in zip(cores, exact.T, strict=True):
         channel_error = functools.partial(error, truth)
-        fewer.append(fewest(core, channel_error, DROPPED_SHARE * ERROR))
+        fewer.append(keep_fewest(core, channel_error, DROPPED_SHARE * ERROR))
     return fewer
 
 
@@ -159,9 +159,9 @@ def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]
     for _ in range(BOUNCES):
         truth.append(bounce(rows, truth[-1]))
     parts = [separation.direct, *separation.bounces]
-    errors = [relative((pattern * ALBEDO).reshape(-1, 3), direct)]
+    errors = [relative_error((pattern * ALBEDO).reshape(-1, 3), direct)]
     for part, exact in zip(parts, truth, strict=True):
-        errors.append(relative(part.reshape(-1, 3), exact))
+        errors.append(relative_error(part.reshape(-1, 3), exact))
     return [desired, pattern, *parts], errors
 
 
@@ -202,7 +202,7 @@ def measure_ms(built: Built, picture: np.ndarray) -> dict[str, float]:
     return {name: 1e3 * spent for name, spent in seconds(actions).items()}
 
 
-def build_facts(given: Options, built: Built, n: int, ms: dict[str, float]) -> dict[str, Any]:
+def build_facts(options: Options, built: Built, n: int, ms: dict[str, float]) -> dict[str, Any]:
     row_counts = ", ".join(f"{inverse.D.nnz / n:.3g}" for inverse in built.R)
     fewer_counts = ", ".join(f"{core.nnz / n:.3g}" for core in built.fewer)
     facts: dict[str, Any] = {
@@ -220,7 +220,7 @@ def build_facts(given: Options, built: Built, n: int, ms: dict[str, float]) -> d
     facts |= {f"{name}, ms": spent for name, spent in ms.items()}
     usage = resource.getrusage(resource.RUSAGE_SELF)
     facts["peak memory, MB"] = usage.ru_maxrss / 1024
-    facts["largest buffer allowed, MB"] = given.device.max_allocation / 2**20
+    facts["largest buffer allowed, MB"] = options.device.max_allocation / 2**20
     return facts
 
 
@@ -237,16 +237,16 @@ def claims(names: list[str], errors: list[float], ms: dict[str, float]) -> list[
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    rows = Bounce(8 if given.smoke else 256, REFERENCE)
-    built = build(given, rows)
+    options = parse_options(__doc__)
+    rows = Bounce(8 if options.smoke else 256, REFERENCE)
+    built = build(options, rows)
     images, errors = pictures(rows, built)
     ms = measure_ms(built, images[0])
-    facts = build_facts(given, built, rows.shape[0], ms)
+    facts = build_facts(options, built, rows.shape[0], ms)
     names = ["pattern", "direct"] + [f"bounce {k}" for k in range(1, BOUNCES + 1)]
-    listed = [] if given.smoke else claims(names, errors, ms)
+    listed = [] if options.smoke else claims(names, errors, ms)
     title = "131072 pixels in colour"
-    figures.conclude(given, title, listed, facts, lambda: draw(names, images))
+    figures.conclude(options, title, listed, facts, lambda: draw(names, images))
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ import scipy.optimize
 import scipy.sparse
 
 import ltcl
-from _harness import Row, options, report, triad
+from _harness import Row, parse_options, report, triad
 from ltcl.operators import CSR, Dense, Distributed, IdentityPlus
 
 # Pixels and entries a row; as many of both: a dense matrix.
@@ -74,8 +74,8 @@ def size_rows(n: int, k: int, times: dict[str, float]) -> list[Row]:
     target = LARGE_TARGET if n * k >= MIN_LARGE_ENTRIES else None
     question = f"Chebyshev by 2 ranks, {name}"
     rows = [
-        Row.of_times(question, "1 rank", one_rank, ours, "s", target),
-        Row.of_times(question, "no MPI", times["solve no MPI"], ours, "s"),
+        Row.from_times(question, "1 rank", one_rank, ours, "s", target),
+        Row.from_times(question, "no MPI", times["solve no MPI"], ours, "s"),
     ]
     gain = one_rank / ours
     for reading in ("reading the same", "triad"):
@@ -257,8 +257,8 @@ def median_seconds(comm: Any, actions: dict[str, Callable[[], object] | None]) -
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    sizes = SMOKE_SIZES if given.smoke else SIZES
+    options = parse_options(__doc__)
+    sizes = SMOKE_SIZES if options.smoke else SIZES
     results = run_ranks(sizes)
     rows = []
     facts: dict[str, Any] = {}
@@ -269,7 +269,7 @@ def main() -> None:
         facts[difference] = times["difference"]
     # The last size is dense, and has no 4 ranks.
     facts |= model(sizes[:-1], results[:-1])
-    report(given, "Scaling over ranks", rows, facts)
+    report(options, "Scaling over ranks", rows, facts)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ import scipy.sparse
 from scipy.sparse.linalg import gmres
 
 import ltcl
-from _coefficients import relative
-from _harness import Options, Row, options, report, seconds
+from _coefficients import relative_error
+from _harness import Options, Row, parse_options, report, seconds
 from csr import matrix
 from ltcl.operators import CSR, IdentityPlus
 
@@ -63,16 +63,16 @@ class Problem:
         """Stop where a solution is not within the tolerance, in float64."""
         x = np.asarray(x, np.float64)
         product = x + self.R.astype(np.float64) @ x
-        residual = relative(product, self.b.astype(np.float64))
+        residual = relative_error(product, self.b.astype(np.float64))
         if residual > RTOL * (1 + 1e-3):
             raise SystemExit(f"{name} misses the tolerance of {self.name}: {residual:.3g}")
 
 
-def box(given: Options, rho: float) -> Problem:
+def box(options: Options, rho: float) -> Problem:
     """A closed box of one albedo m, rho(R) = m / (1 - m), with its true first bounce."""
-    n = 10 if given.smoke else 26
+    n = 10 if options.smoke else 26
     scene = ltcl.scenes.box(n, sides=6, albedo=rho / (1 + rho))
-    T = scene.transport(first_bounce=scene.first_bounce, device=given.device)
+    T = scene.transport(first_bounce=scene.first_bounce, device=options.device)
     R = (T.matrices[0] / T.first_bounce - np.eye(T.shape[0])).astype(np.float32)
     return problem(f"box of {len(R)}, rho {rho:g}", R, T.systems[0])
 
@@ -147,8 +147,8 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
     has_one_column = problem.b.ndim == 1
     rows = []
     if has_one_column:
-        rows.append(Row.of_times(name, "3 later solves", 3 * ms["ours"], first_ms, "ms", 1.0))
-    fewer = Row.of_times(
+        rows.append(Row.from_times(name, "3 later solves", 3 * ms["ours"], first_ms, "ms", 1.0))
+    fewer = Row.from_times(
         name, "Neumann's products", neumann_products, ours.products, "products", PRODUCTS_TARGET
     )
     library = "scipy.sparse" if problem.is_sparse else "numpy"
@@ -158,8 +158,8 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
     return [
         *rows,
         fewer,
-        Row.of_times(name, loop, ms["neumann"], ms["ours"], "ms", neumann_target),
-        Row.of_times(name, "scipy GMRES", ms["gmres"], ms["ours"], "ms", gmres_target),
+        Row.from_times(name, loop, ms["neumann"], ms["ours"], "ms", neumann_target),
+        Row.from_times(name, "scipy GMRES", ms["gmres"], ms["ours"], "ms", gmres_target),
     ]
 
 
@@ -173,22 +173,22 @@ def compare_divergent(problem: Problem, facts: dict[str, Any]) -> Row:
     ours = problem.solve()
     problem.check("ours", ours.x)
     allowed = DIVERGENT_TARGET
-    return Row.of_times(problem.name, "products allowed", allowed, ours.products, "products", 1.0)
+    return Row.from_times(problem.name, "products allowed", allowed, ours.products, "products", 1.0)
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    options = parse_options(__doc__)
     facts: dict[str, Any] = {}
-    dense = box(given, 0.8)
-    R = sparse_R(given.smoke)
-    S = IdentityPlus(CSR(given.device, R))
+    dense = box(options, 0.8)
+    R = sparse_R(options.smoke)
+    S = IdentityPlus(CSR(options.device, R))
     name = f"sparse {R.shape[0]}, rho 0.8"
     rows = compare(dense, facts)
     rows += compare(problem(name, R, S), facts)
     for columns in (3, 8):
         rows += compare(problem(name, R, S, columns), facts)
-    rows.append(compare_divergent(box(given, 4.0), facts))
-    report(given, "Solve to 1 %", rows, facts)
+    rows.append(compare_divergent(box(options, 4.0), facts))
+    report(options, "Solve to 1 %", rows, facts)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options
+from _harness import parse_options
 from denoise import QUANTITIES, patterns
 from scenes import tracing
 
@@ -158,7 +158,7 @@ def judge(T: ltcl.Transport, true: ltcl.Transport) -> Judgement:
 
 
 def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
-    """Judge some measurements, by the noise model they are given."""
+    """Judge some measurements, by the noise model they are options."""
     alone = []
     with_second = []
     for k in range(JUDGED):
@@ -192,9 +192,9 @@ def list_errors(judgements: list[Judgement]) -> str:
 
 def main() -> None:
     """Judge each scene, or say why not."""
-    given = options(__doc__ or "")
+    options = parse_options(__doc__)
     facts: dict[str, Any] = {}
-    if given.smoke:
+    if options.smoke:
         facts["path-traced"] = "not measured: --smoke"
     else:
         reason = tracing.unavailable()
@@ -204,8 +204,8 @@ def main() -> None:
     logging.getLogger("ltcl").setLevel(logging.ERROR)
     claims: list[Claim] = []
     is_halved: list[bool] = []
-    for scene in ("simulated",) if given.smoke else SCENES:
-        if given.smoke:
+    for scene in ("simulated",) if options.smoke else SCENES:
+        if options.smoke:
             measured, off = simulated_measurements(), {}
         else:
             measured, off = traced_measurements(scene)
@@ -219,8 +219,8 @@ def main() -> None:
             claims += way_claims(name, judgements)
     halved = f"{sum(is_halved)} of {len(is_halved)}"
     claims.append(Claim("denoised: at most half is left", halved, "all", all(is_halved)))
-    listed = [] if given.smoke else claims
-    figures.conclude(given, "Path-traced transports", listed, facts, Figure)
+    listed = [] if options.smoke else claims
+    figures.conclude(options, "Path-traced transports", listed, facts, Figure)
 
 
 if __name__ == "__main__":

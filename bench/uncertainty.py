@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import options, seconds
+from _harness import parse_options, seconds
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
@@ -142,24 +142,24 @@ def share_claim(shares: Shares, quantity: int, deviations: int) -> Claim:
 
 def main() -> None:
     """Measure, and conclude; the few repetitions of --smoke only show that it runs."""
-    given = options(__doc__ or "")
+    options = parse_options(__doc__)
     # Glossy scenes warn each time.
     logging.getLogger("ltcl").setLevel(logging.ERROR)
-    scenes = SCENES[:1] if given.smoke else SCENES
-    repetitions = 2 if given.smoke else REPETITIONS
+    scenes = SCENES[:1] if options.smoke else SCENES
+    repetitions = 2 if options.smoke else REPETITIONS
     shares: Shares = {}
     for scene in scenes:
         for level in LEVELS:
             shares[scene, level] = coverage(scene, level, repetitions)
-    listed = claims(shares, costs(6 if given.smoke else 32, given.smoke))
+    listed = claims(shares, costs(6 if options.smoke else 32, options.smoke))
     pixels = max(truth(scene).shape[1] for scene in scenes)
     facts: dict[str, Any] = {"repetitions": repetitions, "pixels": pixels}
     for (scene, level), table in shares.items():
         cells = ", ".join(f"{one:.1%} {two:.1%}" for one, two in table)
         facts[f"{scene}, {level:g}: within 1 and 2"] = cells
-    if given.smoke:
+    if options.smoke:
         listed = []
-    figures.conclude(given, "Uncertainty, pixel by pixel", listed, facts, Figure)
+    figures.conclude(options, "Uncertainty, pixel by pixel", listed, facts, Figure)
 
 
 if __name__ == "__main__":

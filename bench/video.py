@@ -18,7 +18,7 @@ import scipy.sparse
 
 import _coefficients
 import ltcl
-from _harness import Options, Row, options, report, seconds
+from _harness import Options, Row, parse_options, report, seconds
 from ltcl.images import from_srgb, to_srgb
 from ltcl.operators import Compressed, Wavelet
 from ltcl.scenes import landscape
@@ -44,12 +44,12 @@ def to_codes(light: np.ndarray) -> np.ndarray:
 TO_CODES = to_codes(np.linspace(0, 1, LIGHT_STEPS + 1, dtype=np.float32))
 
 
-def transport(given: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> ltcl.Transport:
+def transport(options: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> ltcl.Transport:
     """T = (I + R) F with R symmetric in the `coarse` wavelet coefficients.
 
     The norm of R is m / (1 - m) at most.
     """
-    W = Wavelet(given.device, grid, "db2")
+    W = Wavelet(options.device, grid, "db2")
     core = symmetric_core(grid, coarse)
     cores = []
     for albedo in ALBEDO:
@@ -91,7 +91,7 @@ def projector_codes(T: ltcl.Transport, codes: np.ndarray, **settings: Any) -> np
 
 
 def measure(
-    given: Options, T: ltcl.Transport, inverse: ltcl.Inverse, frames: np.ndarray
+    options: Options, T: ltcl.Transport, inverse: ltcl.Inverse, frames: np.ndarray
 ) -> dict[str, float]:
     """Seconds of BATCH frames, in all ways."""
 
@@ -116,7 +116,7 @@ def measure(
             "solves, compensate_frames, .png to .png": lambda: run_files(folder),
             "inverse, compensate_frames, .png to .png": lambda: run_files(folder, inverse=inverse),
         }
-        return seconds(actions, 1 if given.smoke else 7)
+        return seconds(actions, 1 if options.smoke else 7)
 
 
 def rate_row(name: str, spent: float) -> Row:
@@ -144,11 +144,11 @@ def frame_facts(T: ltcl.Transport) -> dict[str, Any]:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    grid, coarse = ((16, 32), (4, 8)) if given.smoke else ((256, 512), (32, 64))
-    T = transport(given, grid, coarse)
+    options = parse_options(__doc__)
+    grid, coarse = ((16, 32), (4, 8)) if options.smoke else ((256, 512), (32, 64))
+    T = transport(options, grid, coarse)
     inverse = ltcl.invert(T, RTOL)
-    times = measure(given, T, inverse, film(T, BATCH))
+    times = measure(options, T, inverse, film(T, BATCH))
     rows = [rate_row(name, spent) for name, spent in times.items()]
     R = cast(Compressed, T.systems[0].R)
     facts = {
@@ -157,7 +157,7 @@ def main() -> None:
         **frame_facts(T),
         "error of the inverse, bound": inverse.error,
     }
-    report(given, "Video, 256 x 512 in colour", rows, facts)
+    report(options, "Video, 256 x 512 in colour", rows, facts)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ import resolution131k
 import video
 from _corner import Bounce
 from _figures import Claim
-from _harness import Options, options
+from _harness import Options, parse_options
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.scenes import landscape
@@ -243,7 +243,7 @@ def rate(text: str, value: float, least: float) -> Claim:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
+    given = parse_options(__doc__ or "")
     large, small = (transport(given, n) for n in ((8, 4) if given.smoke else (256, 48)))
     with tempfile.TemporaryDirectory() as name, Chromium() as page:
         probe, painting, sliding, busy = touch(page, large, given)

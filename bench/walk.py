@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, options, report, seconds
+from _harness import Options, Row, parse_options, report, seconds
 from _peers import missing
 from csr import matrix
 from ltcl.operators import CSR
@@ -76,7 +76,7 @@ def numba_walker(
 
 
 def coloured_matrices(
-    given: Options, R: scipy.sparse.csr_array, random: np.random.Generator
+    options: Options, R: scipy.sparse.csr_array, random: np.random.Generator
 ) -> list[CSR]:
     """R of three colours with one sparsity pattern."""
     n = R.shape[0]
@@ -87,21 +87,21 @@ def coloured_matrices(
         numbers = (data.astype(np.float32), R.indices, R.indptr)
         host = scipy.sparse.csr_array(numbers, shape=R.shape)
         pattern = matrices[0].pattern if matrices else None
-        matrices.append(CSR(given.device, host, pattern))
+        matrices.append(CSR(options.device, host, pattern))
     return matrices
 
 
-def compare_colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
+def compare_colours(options: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
     """Steps of walks that three channels share, counted for each, beside those of a walk a channel."""
     random = np.random.default_rng(3)
     n = R.shape[0]
     pixels = np.arange(n)
-    matrices = coloured_matrices(given, R, random)
+    matrices = coloured_matrices(options, R, random)
     b = random.random((n, 3), dtype=np.float32)
 
     def prepare(walk_tables: Any, light: np.ndarray) -> Callable[[], Any]:
         walker = Walker(walk_tables, LENGTHS, 0)
-        device_light = given.device.upload(light)
+        device_light = options.device.upload(light)
         return lambda: walker.rows(device_light, pixels, samples)
 
     shared_walk = prepare(linked(matrices, (1.0, 1.0, 1.0)), b)
@@ -135,13 +135,13 @@ def exact_indirect(R: Any, b: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    given = options(__doc__ or "")
-    n, per_row = (1024, 16) if given.smoke else (131072, 100)
+    options = parse_options(__doc__)
+    n, per_row = (1024, 16) if options.smoke else (131072, 100)
     samples = 32
     R = signed_matrix(n, per_row)
     b = np.random.default_rng(2).random(n, dtype=np.float32)
-    alias_tables = Tables(CSR(given.device, R))
-    light = given.device.upload(b)
+    alias_tables = Tables(CSR(options.device, R))
+    light = options.device.upload(b)
     pixels = np.arange(n)
     walker = Walker(alias_tables, LENGTHS, 0)
     actions: dict[str, Callable[[], Any]] = {
@@ -162,7 +162,7 @@ def main() -> None:
     rows = []
     for name, theirs in rates.items():
         rows.append(Row("steps of walks", name, theirs, ours, "M/s", ours / theirs, TARGET))
-    rows.append(compare_colours(given, R, samples))
+    rows.append(compare_colours(options, R, samples))
     table_bytes = alias_tables.records.nbytes + alias_tables.entries.nbytes
     facts = {
         "pixels": n,
@@ -172,7 +172,7 @@ def main() -> None:
         "steps, M/s": ours,
         "not installed": ", ".join(missing()) or "none",
     }
-    report(given, "Random walks", rows, facts)
+    report(options, "Random walks", rows, facts)
 
 
 if __name__ == "__main__":

@@ -1,33 +1,60 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Least squares within bounds between two products (`ltcl/solvers/bounded.py`): x is (rows, k), r is (height, k).
+// Least squares within bounds between two products (ltcl/solvers/bounded.py): a step by a projected
+// and conjugated gradient, with step lengths of Barzilai and Borwein.
 //
-// z is -g, or 0 where x is at a bound and -g points out. lower and upper hold one value a row; w, squares of weights,
-// counts where weighted == 1. `numbers` holds k columns by rows: alpha, the curvature <A d, A d> of the last d, or 0
-// where the next is not conjugate, lambda; from row 4 on the 2 sums of bounded_look by slices; then those of w r r.
-// Items, groups, partial sums and `scratch`: common/columns.h.
+//   bounded_direction  the direction d, and the sums that its step length needs
+//   bounded_move       x and r a step along d
+//   bounded_look       the gradient g, h = A^T w A d, and the Frank-Wolfe gap
+//
+// z is -g, or 0 where x is at a bound and -g points out. Items, groups and partial sums:
+// common/columns.h, with its optional define ADJACENT.
+//
+// Layout: x, g, d, h are (rows, k), r is (height, k), lower and upper hold one value a row.
+// `numbers` holds k columns by rows, which have names below: the step length alpha, the curvature,
+// lambda; from NUMBER_SUMS on the 2 sums of bounded_look by slices; then those of w r r.
 
 #include "common/columns.h"
 
-#define STRAIGHT 0.25f  // of d: below, clipping has bent d, which is no longer conjugate; 1/2 refuses every second d
+// Rows of `numbers`.
+#define NUMBER_ALPHA 0
+#define NUMBER_CURVATURE 1  // <A d, A d> of the last d, or 0 where the next is not conjugate
+#define NUMBER_LAMBDA 2     // the share of d that x moved
+#define NUMBER_SUMS 4
 #define NUMBER(row) numbers[(row) * k + s.origin + j]
+
+// Shorter shares of d are due to clipping, which has bent d: it is no longer conjugate. 1/2 refuses
+// every second d.
+#define STRAIGHT 0.25f
 
 static inline real bounded_free(real x, real g, real lower, real upper)
 {
     return (g > 0 ? x <= lower : x >= upper) ? 0 : -g;
 }
 
-// Sums: g.d, d.d; and the largest share of the way to its bound that an entry of x + d has gone; columns with
-// resting[column] rest. scratch: 2 more a column.
+// d = clip(x + alpha (z + beta d)) - x. Sums: g.d, d.d; and the largest share of the way to its
+// bound that an entry of x + d has gone.
 kernel void bounded_direction(
-    int rows, int k, int slices, global const int *resting, global const real *numbers, global const real *lower,
-    global const real *upper, global const real *x, global const real *g, global real *d, global real *sums,
-    local real *scratch)
+    int rows,                    // rows of x
+    int k,                       // right-hand sides
+    int slices,                  // of the sums of bounded_look
+    global const int *resting,   // [k], 1 where a column rests
+    global const real *numbers,  // see above
+    global const real *lower,    // [rows]
+    global const real *upper,    // [rows]
+    global const real *x,        // (rows, k)
+    global const real *g,        // gradient, (rows, k)
+    global real *d,              // direction, (rows, k)
+    global real *sums,           // (slices, 3, k)
+    local real *scratch)         // a real a work-item, and 2 a column
 {
     const share s = columns_share(rows, k);
-    local real *alphas = columns_totals(numbers + 4 * k, slices, 2, 2, k, s, scratch, 0), *betas = alphas + s.width;
+    global const real *looks = numbers + NUMBER_SUMS * k;
+    local real *alphas = columns_totals(looks, slices, 2, 2, k, s, scratch, 0);
+    local real *betas = alphas + s.width;
     EACH_COLUMN(j) {
-        betas[j] = NUMBER(1) > 0 ? -betas[j] / NUMBER(1) : 0;  // -z.h / <A d, A d>
-        alphas[j] = resting[s.origin + j] ? 0 : NUMBER(0);
+        const real curvature = NUMBER(NUMBER_CURVATURE);
+        betas[j] = curvature > 0 ? -betas[j] / curvature : 0;  // -z.h / <A d, A d>
+        alphas[j] = resting[s.origin + j] ? 0 : NUMBER(NUMBER_ALPHA);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     const real alpha = alphas[s.column], beta = betas[s.column];
@@ -43,29 +70,43 @@ kernel void bounded_direction(
             most = fmax(most, step / ((step > 0 ? upper[row] : lower[row]) - x[i]));
     }
     const int slice = 3 * get_group_id(0);
-    for (int n = 0; n < 3; n++)  // one loop: PoCL compiles each function of barriers anew, and more than once
+    // One loop: PoCL compiles each function of barriers anew, and more than once.
+    for (int n = 0; n < 3; n++)
         columns_sum(n == 0 ? gd : n == 1 ? dd : most, sums + (slice + n) * k, n == 2, s, scratch);
 }
 
-// `sums` are of bounded_direction, `curvatures` the sums of w Ad Ad; of 0 slices nothing moves. u = w r,
-// which may be r where w does not count. scratch: 4 more a column.
+// x += lambda d within the bounds, r -= lambda A d, u = w r.
 kernel void bounded_move(
-    int rows, int k, int height, int slices, int weighted, global real *numbers, global const real *sums,
-    global const real *curvatures, global const real *lower, global const real *upper,
-    global const real *d, global real *x, global const real *w, global const real *Ad, global real *r,
-    global real *u, local real *scratch)
+    int rows,                       // rows of x
+    int k,                          // right-hand sides
+    int height,                     // rows of r
+    int slices,                     // of the partial sums; of 0 nothing moves
+    int weighted,                   // 1: w counts
+    global real *numbers,           // see above
+    global const real *sums,        // of bounded_direction
+    global const real *curvatures,  // sums of w Ad Ad, (slices, k)
+    global const real *lower,       // [rows]
+    global const real *upper,       // [rows]
+    global const real *d,           // direction, (rows, k)
+    global real *x,                 // (rows, k)
+    global const real *w,           // squares of weights, (height, k)
+    global const real *Ad,          // A d, (height, k)
+    global real *r,                 // b - A x, (height, k)
+    global real *u,                 // may be r where w does not count
+    local real *scratch)            // a real a work-item, and 4 a column
 {
     share s = columns_share(rows, k);
     local real *totals = columns_totals(sums, slices, 3, 2, k, s, scratch, 0), *lambdas = totals;
     columns_totals(curvatures, slices, 1, 1, k, s, scratch, 3);
     EACH_COLUMN(j) {
-        const real gd = totals[j], dd = totals[s.width + j], curvature = totals[3 * s.width + j];
+        const real gd = totals[j], dd = totals[s.width + j], share_of_way = totals[2 * s.width + j];
+        const real curvature = totals[3 * s.width + j];
         const bool moves = gd < 0 && curvature > 0 && isfinite(curvature);
-        lambdas[j] = moves ? fmin(-gd / curvature, fmax(1 / totals[2 * s.width + j], 1)) : 0;
+        lambdas[j] = moves ? fmin(-gd / curvature, fmax(1 / share_of_way, 1)) : 0;
         if (get_group_id(0) == 0) {
-            NUMBER(0) = moves ? dd / curvature : NUMBER(0);  // Barzilai and Borwein
-            NUMBER(1) = lambdas[j] >= STRAIGHT ? curvature : 0;
-            NUMBER(2) = lambdas[j];
+            NUMBER(NUMBER_ALPHA) = moves ? dd / curvature : NUMBER(NUMBER_ALPHA);
+            NUMBER(NUMBER_CURVATURE) = lambdas[j] >= STRAIGHT ? curvature : 0;
+            NUMBER(NUMBER_LAMBDA) = lambdas[j];
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -75,22 +116,34 @@ kernel void bounded_move(
     s = columns_share(height, k);
     real rr = 0;
     EACH_VALUE(i, row) {
-        const real left = lambda == 0 ? r[i] : r[i] - lambda * Ad[i], weighed = weighted ? w[i] * left : left;
+        const real left = lambda == 0 ? r[i] : r[i] - lambda * Ad[i];
+        const real weighed = weighted ? w[i] * left : left;
         r[i] = left;
         u[i] = weighed;
         rr += left * weighed;
     }
-    columns_sum(rr, numbers + (4 + 2 * get_num_groups(0) + get_group_id(0)) * k, 0, s, scratch);
+    const int row = NUMBER_SUMS + 2 * get_num_groups(0) + get_group_id(0);
+    columns_sum(rr, numbers + row * k, 0, s, scratch);
 }
 
-// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w A d, which restart == 1 leaves as it is. Sums: the
-// Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), and z.h.
+// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w A d. Sums: the Frank-Wolfe gap
+// sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), and z.h.
 kernel void bounded_look(
-    int rows, int k, int restart, global const real *lower, global const real *upper, global const real *x,
-    global const real *q, global real *g, global real *h, global real *numbers, local real *scratch)
+    int rows,                  // rows of x
+    int k,                     // right-hand sides
+    int restart,               // 1: h stays as it is
+    global const real *lower,  // [rows]
+    global const real *upper,  // [rows]
+    global const real *x,      // (rows, k)
+    global const real *q,      // A^T w r, (rows, k)
+    global real *g,            // gradient, (rows, k)
+    global real *h,            // A^T w A d, (rows, k)
+    global real *numbers,      // see above
+    local real *scratch)       // a real a work-item
 {
     const share s = columns_share(rows, k);
-    const real lambda = s.first < s.end ? numbers[2 * k + s.origin + s.column] : 0;
+    global const real *lambdas = numbers + NUMBER_LAMBDA * k;
+    const real lambda = s.first < s.end ? lambdas[s.origin + s.column] : 0;
     real gap = 0, zh = 0;
     EACH_VALUE(i, row) {
         if (!restart)
@@ -99,6 +152,7 @@ kernel void bounded_look(
         gap += g[i] * (x[i] - (g[i] > 0 ? lower[row] : upper[row]));
         zh += bounded_free(x[i], g[i], lower[row], upper[row]) * h[i];
     }
-    columns_sum(gap, numbers + (4 + 2 * get_group_id(0)) * k, 0, s, scratch);
-    columns_sum(zh, numbers + (5 + 2 * get_group_id(0)) * k, 0, s, scratch);
+    global real *sums = numbers + (NUMBER_SUMS + 2 * get_group_id(0)) * k;
+    columns_sum(gap, sums, 0, s, scratch);
+    columns_sum(zh, sums + k, 0, s, scratch);
 }

@@ -1,12 +1,21 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Pixels in another order, or some of them: out = a (P x) + b y, where row i of P x is row order[i] of x, or 0 where
-// that is negative. Items stride through pieces of K right-hand sides, see common/lanes.h, and (dimension 1) pixels.
+// Pixels in another order, or some of them: out = a (P x) + b y, where row i of P x is row order[i]
+// of x, or 0 where that is negative.
+//
+// Work-items stride through pieces of K right-hand sides (dimension 0) and pixels (1). Required
+// define: K, see common/lanes.h. Layout: row-major, k right-hand sides side by side.
 
 #include "common/lanes.h"
 
 kernel void ordered_gather(
-    int rows, int k, real a, real b, global const int *order, global const real *x, global const real *y,
-    global real *out)
+    int rows,                 // rows of out
+    int k,                    // right-hand sides
+    real a,                   // factor of P x
+    real b,                   // factor of y
+    global const int *order,  // [rows], the row of x, or a negative number
+    global const real *x,     // (rows of x, k)
+    global const real *y,     // not read where b is 0; may be out
+    global real *out)         // (rows, k)
 {
     const piece p = piece_of(get_global_id(0), k);
     for (int row = get_global_id(1); row < rows; row += get_global_size(1)) {

@@ -1,27 +1,39 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// A quad-tree over a picture: level 0 is its pixels, and a cell of each further level covers 2 x 2 of the one before,
-// fewer at the edges, until one cell is left. out = a (W x) + b y, where W is
+// A quad-tree over a picture: level 0 is its pixels, and a cell of each further level covers 2 x 2
+// of the one before, fewer at the edges, until one cell is left. out = a (W x) + b y, where W is
 //
 //   pyramid_gather  sums of the pixels in each cell, a level from those of the level before
 //   pyramid_spread  the transpose: to each pixel, the sum of the cells that it lies in
 //
-// Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A launch of
-// pyramid_gather of several levels, first_level .. end_level - 1, takes one group a piece, which waits for itself between them.
+// Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A
+// launch of pyramid_gather of several levels takes one group a piece, which waits for itself
+// between them.
 //
-// Required define: K, see common/lanes.h. Layout: cells level by level, the finest first, each row-major, right-hand
-// sides side by side. sums is scratch for as many and a spare cell between levels: wide loads reach there.
+// Required define: K, see common/lanes.h. Layout: cells level by level, the finest first, each
+// row-major, right-hand sides side by side.
 
 #include "common/lanes.h"
 
 kernel void pyramid_gather(
-    int height, int width, int first_level, int end_level, int k, real a, real b, global const real *x, global real *sums,
-    global const real *y, global real *out)
+    int height,            // rows of the picture
+    int width,             // columns of the picture
+    int first_level,       // levels first_level .. end_level - 1 are made,
+    int end_level,         // those below are in `sums` already
+    int k,                 // right-hand sides
+    real a,                // factor of W x
+    real b,                // factor of y
+    global const real *x,  // the picture, (height width, k)
+    global real *sums,     // sums of cells, with a spare one between levels: wide loads reach there
+    global const real *y,  // like out; not read where b is 0
+    global real *out)      // (cells, k)
 {
     const piece p = piece_of(get_global_id(0), k);
-    int below_height = height, below_width = width, at = 0;  // of the level before, and where this one begins
+    // The level before this one, and where this one begins.
+    int below_height = height, below_width = width, at = 0;
     global const real *below = x + p.at;
     for (int level = 0; level < end_level; ++level) {
-        const int h = level ? (below_height + 1) / 2 : height, w = level ? (below_width + 1) / 2 : width;
+        const int h = level ? (below_height + 1) / 2 : height;
+        const int w = level ? (below_width + 1) / 2 : width;
         const int reach = level ? 2 : 1;
         global real *here = sums + (at + level) * k + p.at;
         for (int row = get_global_id(2); level >= first_level && row < h; row += get_global_size(2))
@@ -45,8 +57,15 @@ kernel void pyramid_gather(
 }
 
 kernel void pyramid_spread(
-    int height, int width, int levels, int k, real a, real b, global const real *x, global const real *y,
-    global real *out)
+    int height,            // rows of the picture
+    int width,             // columns of the picture
+    int levels,            // of the tree
+    int k,                 // right-hand sides
+    real a,                // factor of W^T x
+    real b,                // factor of y
+    global const real *x,  // (cells, k)
+    global const real *y,  // like out; not read where b is 0
+    global real *out)      // the picture, (height width, k)
 {
     const piece p = piece_of(get_global_id(0), k);
     for (int row = get_global_id(2); row < height; row += get_global_size(2))

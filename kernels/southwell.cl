@@ -1,23 +1,46 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // One step of Southwell's relaxation on S = shift I + scale M, in each part of the picture:
 //
-//     r -= scale M[:, i] delta for the rows i picked before;   i = argmax |r_i|, delta_i = r_i / S_ii, x_i += delta_i
+//     r -= scale M[:, i] delta  for the rows i picked before
+//     i = argmax |r_i|,   delta_i = r_i / S_ii,   x_i += delta_i
 //
-// In its range of rows a work-group applies the `pending` picks before to r, and then, unless `picks` is 0, picks a row
-// in each of its parts. Optional define: DENSE; else the slab is one of M^T in sparse rows, in each of which an item
-// looks up where its own rows begin. `places`: a number an item.
+// In its range of rows a work-group (dimension 0; right-hand side: 1) applies the `pending` picks
+// before to r, and then, unless `picks` is 0, picks a row in each of its parts.
+//
+// Optional define: DENSE, where the slab is of M in dense rows; else it is of M^T in sparse rows,
+// in each of which an item looks up where its own rows begin.
+//
+// Layout: vectors are (n, k), rows picked and their steps are (parts, k).
 
 #include "common/real.h"
 
 #define ROW_OF(part, parts, n) ((int)((long)(part) * (n) / (parts)))
 
 kernel void southwell_step(
-    int n, int parts, int pending, int picks, int k, real shift, real scale, int rows, int first, int width,
-    global const int *pointers, global const int *columns, global const real *values, global const real *inverse,
-    global real *x, global real *r, global const int *picked, global const real *delta, global int *next_picked,
-    global real *next_delta, local int *places)
+    int n,                       // rows of S
+    int parts,                   // of the picture
+    int pending,                 // picks before that r does not know of: parts, or 0
+    int picks,                   // 1: pick rows after that
+    int k,                       // right-hand sides
+    real shift,                  // factor of I
+    real scale,                  // factor of M
+    int rows,                    // rows of the slab
+    int first,                   // row of the matrix with which it begins
+    int width,                   // DENSE: columns of M
+    global const int *pointers,  // where each sparse row begins, counted from 0 within the slab
+    global const int *columns,   // of each entry, ascending in a row
+    global const real *values,   // of each entry
+    global const real *inverse,  // [n], 1 / S_ii
+    global real *x,              // the iterate
+    global real *r,              // its residual
+    global const int *picked,    // rows picked before
+    global const real *delta,    // and their steps
+    global int *next_picked,     // rows picked now
+    global real *next_delta,     // and their steps
+    local int *places)           // a number a work-item
 {
-    const int me = get_local_id(0), items = get_local_size(0), c = get_global_id(1), group = get_group_id(0);
+    const int me = get_local_id(0), items = get_local_size(0);
+    const int c = get_global_id(1), group = get_group_id(0);
     const int part_begin = ROW_OF(group, get_num_groups(0), parts);
     const int part_end = ROW_OF(group + 1, get_num_groups(0), parts);
     const int begin = ROW_OF(part_begin, parts, n), end = ROW_OF(part_end, parts, n);
@@ -31,14 +54,16 @@ kernel void southwell_step(
         r[i * k + c] -= scale * sum;
     }
 #else
-    const int from = begin + ROW_OF(me, items, end - begin), to = begin + ROW_OF(me + 1, items, end - begin);
+    const int from = begin + ROW_OF(me, items, end - begin);
+    const int to = begin + ROW_OF(me + 1, items, end - begin);
     for (int part = 0; part < pending; ++part) {
         const int row = picked[part * k + c] - first;
         if (row < 0 || row >= rows)
             continue;
         const real step = scale * delta[part * k + c];
+        // A binary search for the first column that is not below `from`.
         int j = pointers[row];
-        for (int stop = pointers[row + 1]; j < stop;) {  // a binary search
+        for (int stop = pointers[row + 1]; j < stop;) {
             const int middle = j + (stop - j) / 2, below = columns[middle] < from;
             j = below ? middle + 1 : j;
             stop = below ? stop : middle;
@@ -55,12 +80,14 @@ kernel void southwell_step(
             if (fabs(r[i * k + c]) > fabs(r[place * k + c]))
                 place = i;
         places[me] = place;
-        for (int left = items; left > 1; left = (left + 1) / 2) {  // a tree; of equal ones the first row
+        // A tree; of equal ones the first row.
+        for (int left = items; left > 1; left = (left + 1) / 2) {
             barrier(CLK_LOCAL_MEM_FENCE);
             if (me < left / 2) {
-                const int other = places[me + (left + 1) / 2];
-                const real gain = fabs(r[other * k + c]) - fabs(r[places[me] * k + c]);
-                places[me] = gain > 0 || (gain == 0 && other < places[me]) ? other : places[me];
+                const int rival = places[me + (left + 1) / 2];
+                const real gain = fabs(r[rival * k + c]) - fabs(r[places[me] * k + c]);
+                const bool wins = gain > 0 || (gain == 0 && rival < places[me]);
+                places[me] = wins ? rival : places[me];
             }
         }
         if (me == 0) {

@@ -1,21 +1,35 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Product of a sparse matrix of tiles with K right-hand sides, and steps of an iteration along one; see
-// common/product.h for the two kernels, their arguments and defines. A tile is WIDTH neighbouring columns of one
-// row: one column index for WIDTH numbers, and x is read in wide loads.
+// Product of a sparse matrix of tiles with K right-hand sides, and steps of an iteration along one.
+// The two kernels (a work-item or a work-group a row) and PRODUCT_ARGUMENTS: common/product.h.
 //
-// Required defines besides K: WIDTH; PLACE, ushort or int; VALUES, of the numbers: 0 float32, 1 float16, 2 int8.
-// Layout: pointers[rows + 1] counts tiles from 0 within the slab; columns (one a tile, the first of it) and values
-// (WIDTH a tile) follow it, and so do scales (one a tile) where values are int8: they are not read elsewhere.
-// Columns that no nonzero claims hold zeros, and no tile reaches beyond the end of its row.
+// A tile is WIDTH neighbouring columns of one row: one column index for WIDTH numbers, and x is
+// read in wide loads. Columns that no nonzero claims hold zeros, and no tile reaches beyond the end
+// of its row.
+//
+// Required defines: K, see common/product.h; WIDTH, 1 or 8; PLACE, the type of column indices,
+// ushort or int; VALUES, the type of the numbers: 0 float32, 1 float16, 2 int8.
+//
+// Layout: a slab of rows.
+//   pointers  [rows + 1], where the tiles of each row begin, counted from 0 within the slab
+//   columns   the first column of each tile
+//   values    WIDTH numbers a tile
+//   scales    one a tile where VALUES is 2; else they are not read
+//   scratch   K reals a work-item
 
 #include "common/product.h"
 
-#if WIDTH != 1 && WIDTH != 8 || !defined(PLACE)
-#error "tile.cl needs -DWIDTH=<neighbouring columns of a tile: 1 or 8>, -DPLACE=<type of column indices>"
+#if WIDTH != 1 && WIDTH != 8
+#error "tile.cl needs -DWIDTH=<neighbouring columns of a tile: 1 or 8>"
+#endif
+#ifndef PLACE
+#error "tile.cl needs -DPLACE=<type of column indices: ushort or int>"
+#endif
+#ifndef VALUES
+#error "tile.cl needs -DVALUES=<type of the numbers: 0 float32, 1 float16, 2 int8>"
 #endif
 #define X(j) (x + columns[j] * stride)
 
-// Numbers as reals, one or eight neighbours, from any address (see LOAD8 in common/real.h).
+// Numbers as reals, one or eight neighbours, from any address: see LOAD8 in common/real.h.
 #ifdef __clang__
 typedef ushort8 ushort8_packed __attribute__((aligned(2)));
 typedef uchar8 uchar8_packed __attribute__((aligned(1)));
@@ -31,15 +45,15 @@ typedef real narrow;
 #define WIDEN(p) (*(p))
 #define WIDEN8(p) LOAD8(p)
 #elif VALUES == 1
-// Sign, exponent and fraction move to their places in a float32, whose exponents count from 112 lower. No stored
-// number is subnormal. PoCL compiles vload_half() to a call.
+// Sign, exponent and fraction move to their places in a float32, whose exponents count from 112
+// lower. No stored number is subnormal. PoCL compiles vload_half() to a call.
 typedef ushort narrow;
-#define WIDEN(p) (as_float(((int)((uint)*(p) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
+#define WIDEN(p) (as_float(((int)((uint) * (p) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
 #define WIDEN8(p) \
     (as_float8((as_int8(convert_uint8(LOAD8_USHORT(p)) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
 #elif VALUES == 2
 typedef char narrow;
-#define WIDEN(p) ((real)*(p))
+#define WIDEN(p) ((real) * (p))
 #define WIDEN8(p) convert_float8(as_char8(LOAD8_UCHAR(p)))
 #else
 #error "tile.cl needs -DVALUES=<type of the numbers: 0 float32, 1 float16, 2 int8>"
@@ -54,7 +68,7 @@ typedef char narrow;
 #define SCALE8(j)
 #endif
 
-// Every `step`-th number from number `n` of the tiles on.
+// Add every `step`-th number from number `n` of the tiles on.
 static inline void tile_add(
     real *sum, global const PLACE *columns, global const narrow *values, global const uchar *scales,
     global const real *x, int stride, int n, int end, int step)
@@ -68,27 +82,29 @@ static inline void tile_add(
 }
 
 static inline lanes tile_sum(
-    global const PLACE *columns, global const narrow *values, global const uchar *scales, global const real *x,
-    int stride, int j, int end)
+    global const PLACE *columns, global const narrow *values, global const uchar *scales,
+    global const real *x, int stride, int j, int end)
 {
-    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
+    // Four sums hide the latency of the addition.
+    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
 #if WIDTH == 1
-#define PRODUCT(j) ((lanes)(WIDEN(values + (j)) SCALE(j)) * LOAD(X(j)))
+#define TILE_PRODUCT(j) ((lanes)(WIDEN(values + (j)) SCALE(j)) * LOAD(X(j)))
 #if K == 1
     real8 eight = 0;
     for (; j + 8 <= end; j += 8)
         eight += WIDEN8(values + j) SCALE8(j)
-            * (real8)(*X(j), *X(j + 1), *X(j + 2), *X(j + 3), *X(j + 4), *X(j + 5), *X(j + 6), *X(j + 7));
+                 * (real8)(*X(j), *X(j + 1), *X(j + 2), *X(j + 3), *X(j + 4), *X(j + 5), *X(j + 6),
+                           *X(j + 7));
     s0 = sum8(eight);
 #endif
     for (; j + 4 <= end; j += 4) {
-        s0 = PRODUCT(j) + s0;
-        s1 = PRODUCT(j + 1) + s1;
-        s2 = PRODUCT(j + 2) + s2;
-        s3 = PRODUCT(j + 3) + s3;
+        s0 = TILE_PRODUCT(j) + s0;
+        s1 = TILE_PRODUCT(j + 1) + s1;
+        s2 = TILE_PRODUCT(j + 2) + s2;
+        s3 = TILE_PRODUCT(j + 3) + s3;
     }
     for (; j < end; ++j)
-        s0 = PRODUCT(j) + s0;
+        s0 = TILE_PRODUCT(j) + s0;
 #else
 #define TILE(j) (WIDEN8(values + (j) * 8) SCALE(j))
 #if K == 1
@@ -105,7 +121,8 @@ static inline lanes tile_sum(
         s0 = sum8((t0 + t1) + (t2 + t3));
     }
 #endif
-    for (; j < end; ++j) {  // the K values of a pixel lie side by side: one wide load a number
+    // The K values of a pixel lie side by side: one wide load a number.
+    for (; j < end; ++j) {
         global const real *y = X(j);
         const real8 v = TILE(j);
         s0 = (lanes)(v.s0) * LOAD(y) + s0;
@@ -122,15 +139,21 @@ static inline lanes tile_sum(
 }
 
 #define SLAB_ARGUMENTS \
-    global const int *pointers, global const PLACE *columns, global const narrow *values, global const uchar *scales
+    global const int *pointers, global const PLACE *columns, global const narrow *values, \
+        global const uchar *scales
 
 kernel void tile_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    BY_ITEM(sum.vector = tile_sum(columns, values, scales, x + offset, stride, pointers[row], pointers[row + 1]));
+    global const real *from = x + offset;
+    BY_ITEM(
+        sum.vector =
+            tile_sum(columns, values, scales, from, stride, pointers[row], pointers[row + 1]));
 }
 
 kernel void tile_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    const int row_begin = pointers[get_group_id(0)] * WIDTH, end = pointers[get_group_id(0) + 1] * WIDTH;
-    BY_GROUP(tile_add(sum.item, columns, values, scales, x + offset, stride, row_begin + me, end, items));
+    const int begin = pointers[get_group_id(0)] * WIDTH;
+    const int end = pointers[get_group_id(0) + 1] * WIDTH;
+    BY_GROUP(
+        tile_add(sum.item, columns, values, scales, x + offset, stride, begin + me, end, items));
 }

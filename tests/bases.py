@@ -11,7 +11,7 @@ from ltcl.operators import CSR, Compressed, Dense, Epilogue
 from ltcl.operators.bases import Basis
 
 
-class Given(Basis):
+class MatrixBasis(Basis):
     """A basis W from any matrix (M, N)."""
 
     def __init__(self, device: Device, matrix: np.ndarray) -> None:
@@ -34,7 +34,7 @@ def rotation(n: int, seed: int = 0) -> np.ndarray:
 
 def two_sided(device: Device, R: np.ndarray, keep: float = 1.0, seed: int = 0) -> Compressed:
     """R in a random orthonormal basis, of whose coefficients a share `keep` stays."""
-    W = Given(device, rotation(len(R), seed))
+    W = MatrixBasis(device, rotation(len(R), seed))
     C = W.matrix @ R @ W.matrix.T
     C[np.abs(C) < np.quantile(np.abs(C), 1.0 - keep)] = 0.0
     return Compressed(CSR(device, scipy.sparse.csr_array(C)), W, W)
@@ -43,8 +43,8 @@ def two_sided(device: Device, R: np.ndarray, keep: float = 1.0, seed: int = 0) -
 def stands_for(R: Compressed) -> np.ndarray:
     """The float64 matrix (M, N) of it, from which its products are rounded."""
     matrix = R.core.to_dense()
-    if isinstance(R.out, Given):
+    if isinstance(R.out, MatrixBasis):
         matrix = R.out.matrix.T @ matrix
-    if isinstance(R.into, Given):
+    if isinstance(R.into, MatrixBasis):
         matrix = matrix @ R.into.matrix
     return matrix

@@ -39,7 +39,7 @@ def ctrl_c() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """What ltcl remembers during a test run is of no use to anybody else."""
+    """Timings that ltcl remembers during a test run are of no use to anybody else."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LTCL_CACHE", str(folder))

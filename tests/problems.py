@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Scene:
-    """One bounce A (N, N), first bounce F (N,), and what follows of them; all float64.
+    """A bounce A (N, N), first bounce F (N,), and the operators that follow; all float64.
 
     `weights` (N,), area / albedo, make A and S self-adjoint: diag(weights) A is symmetric.
     """
@@ -69,6 +69,7 @@ def enclosure(n: int, albedo: float, seed: int = 0) -> Scene:
 
 def residual(S: np.ndarray, x: np.ndarray, b: np.ndarray) -> float:
     """Largest relative residual over the columns, in float64."""
-    x, b = np.asarray(x, np.float64), np.asarray(b, np.float64)
+    x = np.asarray(x, np.float64)
+    b = np.asarray(b, np.float64)
     norms = np.linalg.norm(b, axis=0)
     return float(np.max(np.linalg.norm(b - S @ x, axis=0) / np.where(norms > 0, norms, 1.0)))

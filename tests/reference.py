@@ -133,10 +133,13 @@ def southwell_step(
 def philox(counters: np.ndarray, seed: int) -> np.ndarray:
     """Philox4x32-10 of counters (n, 4) and a key of 64 bits, as (n, 4) uint32."""
     c = [counters[:, i].astype(np.uint64) for i in range(4)]
-    low, key = np.uint64(0xFFFFFFFF), [seed & 0xFFFFFFFF, seed >> 32]
+    low = np.uint64(0xFFFFFFFF)
+    key = [seed & 0xFFFFFFFF, seed >> 32]
     for _ in range(10):
-        a, b = np.uint64(0xD2511F53) * c[0], np.uint64(0xCD9E8D57) * c[2]
-        high_a, high_b = a >> np.uint64(32), b >> np.uint64(32)
+        a = np.uint64(0xD2511F53) * c[0]
+        b = np.uint64(0xCD9E8D57) * c[2]
+        high_a = a >> np.uint64(32)
+        high_b = b >> np.uint64(32)
         c = [high_b ^ c[1] ^ np.uint64(key[0]), b & low, high_a ^ c[3] ^ np.uint64(key[1]), a & low]
         key = [(key[0] + 0x9E3779B9) & 0xFFFFFFFF, (key[1] + 0xBB67AE85) & 0xFFFFFFFF]
     return np.stack(c, axis=1).astype(np.uint32)
@@ -147,7 +150,8 @@ def walk_tables(
 ) -> tuple[int, np.float32, np.ndarray]:
     """Entries that count, |R_i|, and the chance to draw each column with each sign, (n, 2)."""
     sizes = np.abs(values.astype(np.float64))
-    exact, chances = math.fsum(sizes), np.zeros((n, 2))
+    exact = math.fsum(sizes)
+    chances = np.zeros((n, 2))
     if np.float32(exact) < np.finfo(np.float32).tiny:
         return 0, np.float32(0), chances
     np.add.at(chances, (columns, np.signbit(values).astype(int)), sizes / exact)
@@ -164,7 +168,8 @@ def walk(
     ends, the adjoint.
     """
     records, entries, channels, links = tables
-    row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
+    row = np.array(pixels)
+    step = np.zeros(len(pixels), np.int64)
     weight = np.ones((len(row), channels), np.float32)
     scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
     alive = np.ones(len(row), bool)
@@ -242,7 +247,8 @@ def form_factor_pair(p, q, n, m, clip: bool = True) -> np.ndarray:
     """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
     d = q[None] - p[:, None]
     r2 = (d**2).sum(axis=2)
-    here, there = np.einsum("mnc,mc->mn", d, n), -np.einsum("mnc,nc->mn", d, m)
+    here = np.einsum("mnc,mc->mn", d, n)
+    there = -np.einsum("mnc,nc->mn", d, m)
     faces = (here > 1e-6) & (there > 1e-6) if clip else r2 > 0
     return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
 
@@ -273,7 +279,8 @@ def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) 
     def smooth(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return form_factor_pair(p, q, normal, normal, clip=False)
 
-    curved, step = smooth(centre, centre), 1e-2
+    curved = smooth(centre, centre)
+    step = 1e-2
     ends = [move for edge in (step * right, step * down) for move in (-edge, edge)]
     bends = [smooth(centre + e, centre) + smooth(centre, centre + e) - 2 * curved for e in ends]
     curved = curved + sum(bends) / (24 * step**2)
@@ -281,8 +288,10 @@ def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) 
     d = centre[None] - centre[:, None]
     height = np.einsum("mnc,mc->mn", d, normal)
     rise = sum(np.abs(normal @ edge.T) for edge in (right, down)) / 2
-    above, below = height + rise > 1e-6, height - rise < -1e-6
-    r2, sizes = (d**2).sum(axis=2), geometry[12] + geometry[12][:, None]
+    above = height + rise > 1e-6
+    below = height - rise < -1e-6
+    r2 = (d**2).sum(axis=2)
+    sizes = geometry[12] + geometry[12][:, None]
     hard = (r2 < inner**2 * sizes) | below | below.T
     close = np.where(above & above.T, np.where(hard, eight, curved), 0.0)
     return np.where(r2 < outer**2 * sizes, close, one)
@@ -306,9 +315,11 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     p, q = np.broadcast_arrays(np.asarray(p, np.float64), np.asarray(q, np.float64))
     result = np.zeros(p.shape[:-1], bool)
     for box in np.asarray(blocks, np.float64):
-        low, high = box[:3] - box[3:], box[:3] + box[3:]
+        low = box[:3] - box[3:]
+        high = box[:3] + box[3:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (low - p) / (q - p), (high - p) / (q - p)
+            a = (low - p) / (q - p)
+            b = (high - p) / (q - p)
         along = q == p  # never leaves the slab, or never enters it
         inside = (low <= p) & (p <= high)
         enter = np.where(along, np.where(inside, -np.inf, np.inf), np.minimum(a, b)).max(axis=-1)
@@ -370,20 +381,24 @@ def vector_dots(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray)
 def krylov_subtract(V, w, h, square: np.ndarray | None = None) -> np.ndarray:
     """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
     left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
-    return (
-        left
-        if square is None
-        else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
-    )
+    if square is None:
+        return left
+    squares_of_h = np.sum(h.astype(np.float64) ** 2, axis=0)
+    return left / np.sqrt(square - squares_of_h)
 
 
 def krylov_cg(sums, previous, last, moves, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """alpha (k,), then p, q, x and r after a step, of w, p, q, x and r before; sums <r, r> and <w, r>."""
-    (square, product), (w, p, q, x, r) = sums, (v.astype(np.float64) for v in vectors)
+    """alpha (k,), then p, q, x and r after a step.
+
+    `sums` are <r, r> and <w, r>, `vectors` w, p, q, x and r before the step.
+    """
+    square, product = sums
+    w, p, q, x, r = _float64(*vectors)
     beta = square / previous
     alpha = square / (product - beta * square / last)
-    p, q = np.where(moves, r + beta * p, p), np.where(moves, w + beta * q, q)
     alpha = np.where(moves, alpha, 0.0)
+    p = np.where(moves, r + beta * p, p)
+    q = np.where(moves, w + beta * q, q)
     return alpha, p, q, x + alpha * p, r - alpha * q
 
 
@@ -393,13 +408,19 @@ def krylov_half(rho: np.ndarray, sigma: np.ndarray, r: np.ndarray, v: np.ndarray
 
 
 def krylov_bicgstab(sums, rho, alpha, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The next rho (k,), then x, r and p of s, t, v, p and x; sums <t, s>, <t, t>, <r*, s> and <r*, t>."""
-    (ts, tt, shadow_s, shadow_t), (s, t, v, p, x) = sums, (u.astype(np.float64) for u in vectors)
+    """The next rho (k,), then x, r and p.
+
+    `sums` are <t, s>, <t, t>, <r*, s> and <r*, t>, `vectors` s, t, v, p and x.
+    """
+    ts, tt, shadow_s, shadow_t = sums
+    s, t, v, p, x = _float64(*vectors)
     omega = ts / tt
-    following = shadow_s - omega * shadow_t
+    next_rho = shadow_s - omega * shadow_t
     r = s - omega * t
-    beta = following / rho * alpha / omega
-    return following, x + alpha * p + omega * s, r, r + beta * (p - omega * v)
+    beta = next_rho / rho * alpha / omega
+    x = x + alpha * p + omega * s
+    p = r + beta * (p - omega * v)
+    return next_rho, x, r, p
 
 
 def bounded_look(lower, upper, x, g, h) -> np.ndarray:
@@ -440,8 +461,10 @@ def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
     last sample stands for the pixels left over; joined to another by weights, it keeps a constant
     constant.
     """
-    size, rest = 2**level, pixels % 2**level
-    n, regular = -(-pixels // size), pixels // size // 2
+    size = 2**level
+    rest = pixels % 2**level
+    n = -(-pixels // size)
+    regular = pixels // size // 2
     half = (n + 1) // 2
     M = np.zeros((n, n))
     for m, t in itertools.product(range(regular), range(taps.shape[1])):
@@ -450,13 +473,15 @@ def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
         M[half - 1, n - 1] = 1
     elif half > regular:
         weights = np.sqrt([size, rest]) / np.sqrt(size + rest)
-        M[half - 1, n - 2 :], M[n - 1, n - 2 :] = weights, weights[::-1] * [1, -1]
+        M[half - 1, n - 2 :] = weights
+        M[n - 1, n - 2 :] = weights[::-1] * [1, -1]
     return M
 
 
 def wavelet_split(grid: tuple[int, int], levels: int, taps: np.ndarray) -> np.ndarray:
     """W (N, N), from pictures of h x w pixels to their coefficients after all levels."""
-    (h, w), n = grid, grid[0] * grid[1]
+    h, w = grid
+    n = grid[0] * grid[1]
     W = np.eye(n).reshape(h, w, n)
     for level in range(levels):
         corner = np.s_[: -(-h // 2**level), : -(-w // 2**level)]

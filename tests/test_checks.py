@@ -21,11 +21,9 @@ from tests import gallery
 def csr(indptr, indices, data, shape=(2, 3)):
     """A csr_array as it stands, with nothing checked: as read from a spoilt file."""
     matrix = scipy.sparse.csr_array(shape)
-    matrix.indptr, matrix.indices, matrix.data = (
-        np.asarray(indptr),
-        np.asarray(indices),
-        np.asarray(data),
-    )
+    matrix.indptr = np.asarray(indptr)
+    matrix.indices = np.asarray(indices)
+    matrix.data = np.asarray(data)
     return matrix
 
 
@@ -34,7 +32,9 @@ def of(check: Callable[..., object], *values: object) -> list[tuple[Callable[[st
     return [(lambda name, v=v: check(name, v), re.escape(repr(v))) for v in values]
 
 
-P, I, X = [0, 1, 3], [0, 0, 2], [1.0, 2.0, 3.0]
+P = [0, 1, 3]
+I = [0, 0, 2]
+X = [1.0, 2.0, 3.0]
 # The argument and the value that each refusal names.
 REFUSED: list[tuple[Callable[[str], object], str]] = [
     (lambda name: checks.finite(name, np.array([0, np.nan])), "1 NaN .* at 1;"),
@@ -112,7 +112,8 @@ def test_good_values_are_handed_on():
 
 @pytest.mark.parametrize("times", ["product", "transposed", "upload"])
 def test_no_product_drops_a_mask(device, times):
-    A, x = Dense(device, np.eye(2)), np.ma.masked_array([1.0, 2.0], [False, True])
+    A = Dense(device, np.eye(2))
+    x = np.ma.masked_array([1.0, 2.0], [False, True])
     with pytest.raises(InputTypeError, match="1 masked"):
         {"product": A.dot, "transposed": A.T.dot, "upload": device.upload}[times](x)
 
@@ -134,7 +135,8 @@ def test_finite_numbers_pass_even_where_their_sum_does_not(array):
 @pytest.mark.parametrize("form", ["csr", "csc", "coo", "lil", "dok", "bsr", "dia"])
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "int8", "bool"])
 def test_every_sparse_format_becomes_a_canonical_csr_array(form, dtype):
-    half, dense = dtype == "float16", (gallery.sparse(5, 7).toarray() * 100).astype(dtype)
+    half = dtype == "float16"
+    dense = (gallery.sparse(5, 7).toarray() * 100).astype(dtype)
     matrix = scipy.sparse.coo_array(dense.astype("float32" if half else dtype)).asformat(form)
     if half and form in (
         "csr",

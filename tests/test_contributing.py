@@ -45,7 +45,7 @@ def test_issue_templates_have_a_name_and_say_what_they_are_for() -> None:
 
 
 def test_the_rig_of_the_page_scans(device, tmp_path, monkeypatch) -> None:
-    """With a projector and a camera that are one virtual rig."""
+    """The rig of the page, with a projector and a camera that are one virtual rig."""
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(
         r"```py\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text("utf-8"), re.DOTALL
@@ -64,5 +64,6 @@ def test_the_rig_of_the_page_scans(device, tmp_path, monkeypatch) -> None:
     names: dict[str, Any] = {"ltcl": ltcl, "projector": both, "camera": both}
     exec(code, names)  # noqa: S102 - our own page
     white = np.ones((*corner.grid, 3))
-    seen, true = names["T"] @ white, room.radiance(white)
+    seen = names["T"] @ white
+    true = room.radiance(white)
     assert np.linalg.norm(seen - true) < 0.05 * np.linalg.norm(true)

@@ -28,7 +28,7 @@ def bound(S, exact_S):
 
 
 def one_channel(device, channel=1, keep=0.5, f=None):
-    """One channel S F, the float64 S that it stands for, and the exact one."""
+    """A channel S F, the float64 S that it stands for, and the exact one."""
     R = two_sided(device, SCENES[channel].R, keep, seed=channel)
     S = np.eye(N) + stands_for(R)
     true = np.eye(N) + SCENES[channel].R

@@ -20,7 +20,7 @@ PAGE = (ROOT / "docs" / "guide" / "benchmark.md").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def modules() -> Any:
-    """Those of `bench/scenes`, by name."""
+    """Modules of `bench/scenes`, by name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "bench"))
         names = "tracing", "dataset", "scoring", "baselines"
@@ -54,7 +54,8 @@ def method(tmp_path: Path) -> Any:
 def test_files_have_the_shapes_of_the_readme_and_bounces_add_up(scenes, name, colours) -> None:
     scene = scenes[name]
     h, w = scene.facts["grid"]
-    data, n = scene.photographs, h * w
+    data = scene.photographs
+    n = h * w
     assert data["patterns"].shape == data["photographs"].shape == (8, h, w, *colours)
     assert (data["patterns"].min(), data["patterns"].max()) == (0.0, np.float32(0.8))
     assert len(set(data["names"])) == 8
@@ -73,7 +74,8 @@ def test_files_have_the_shapes_of_the_readme_and_bounces_add_up(scenes, name, co
 
 
 def test_bounces_of_the_corner_are_powers_of_its_matrix(modules, scenes) -> None:
-    exact, scene = modules["dataset"].SIMULATED["corner"](4), scenes["corner"]
+    exact = modules["dataset"].SIMULATED["corner"](4)
+    scene = scenes["corner"]
     p = scene.photographs["patterns"]
     light = exact.first_bounce[:, None] * p.reshape(8, -1).T
     for k, found in enumerate(np.moveaxis(scene.bounces("second", p), 1, 0)):
@@ -87,7 +89,8 @@ def test_bounces_of_the_corner_are_powers_of_its_matrix(modules, scenes) -> None
 def test_a_method_that_writes_the_truth_has_no_error(
     modules, scenes, name, method, tmp_path
 ) -> None:
-    scene, scoring = scenes[name], modules["scoring"]
+    scene = scenes[name]
+    scoring = modules["scoring"]
     p = scene.photographs["patterns"]
     np.savez(tmp_path / "truth.npz", patterns=p, bounces=scene.bounces("second", p))
     lines = (
@@ -106,9 +109,11 @@ def test_a_method_that_writes_the_truth_has_no_error(
 
 
 def test_scores_of_wrong_results_follow_closed_forms(modules, scenes) -> None:
-    scene, scoring = scenes["corner"], modules["scoring"]
+    scene = scenes["corner"]
+    scoring = modules["scoring"]
     p = scene.photographs["patterns"]
-    (true, variance), random = scene.truth, np.random.default_rng(0)
+    true, variance = scene.truth
+    random = np.random.default_rng(0)
     std = 1e3 * np.sqrt(variance.max()) * (random.random(true.shape) < 0.9)  # 0: none is stated
     scores = scoring.judge(
         scene,
@@ -160,7 +165,8 @@ def test_a_broken_command_is_named(modules, scenes, method, lines, reason) -> No
 
 
 def test_a_broken_command_fails_alone(modules, scenes, tmp_path, monkeypatch, capsys) -> None:
-    field, found = importlib.import_module("field"), tmp_path / "found.json"
+    field = importlib.import_module("field")
+    found = tmp_path / "found.json"
     arguments = ["--data", str(scenes["corner"].folder.parent), "--json", str(found)]
     arguments += ["--method", "broken=no-such-program", "--method", "dense"]
     monkeypatch.setattr(sys, "argv", ["field.py", *arguments])

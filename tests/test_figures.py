@@ -32,7 +32,9 @@ def figures(load: Callable[[str], Any]) -> Any:
 
 @pytest.fixture
 def given(load: Callable[[str], Any], device: Device, tmp_path: Path) -> Any:
-    return load("_harness").Options(True, tmp_path / "new" / "found.json", None, device)
+    return load("_harness").Options(
+        smoke=True, json=tmp_path / "new" / "found.json", plot=None, device=device
+    )
 
 
 def conclude(figures: Any, given: Any, *claims: Any) -> list[dict[str, Any]]:
@@ -59,10 +61,8 @@ def test_a_claim_passes_only_when_it_is_as_expected(
 
 
 def test_a_failed_claim_ends_the_bench_and_is_written(figures: Any, given: Any) -> None:
-    good, bad = (
-        figures.Claim("a", "1", "1", np.bool_(True)),
-        figures.Claim("b", "3", "below 2", False),
-    )
+    good = figures.Claim("a", "1", "1", np.bool_(True))
+    bad = figures.Claim("b", "3", "below 2", False)
     with pytest.raises(SystemExit) as end:
         conclude(figures, given, good, bad)
     assert end.value.code == 1
@@ -104,7 +104,8 @@ def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_a_bounce_of_the_corner_is_that_of_the_dihedral(load: Callable[[str], Any], n: int) -> None:
-    A, exact = load("_corner").Bounce(n, 0.5), dihedral(n, albedo=0.5).A
+    A = load("_corner").Bounce(n, 0.5)
+    exact = dihedral(n, albedo=0.5).A
     for start, stop in ((0, 2 * n * n), (n, n + 1), (1, 2 * n), (0, 0)):
         np.testing.assert_allclose(A.rows(start, stop), exact[start:stop], rtol=1e-6, atol=1e-9)
     for shape in ((2 * n * n,), (2 * n * n, 3)):

@@ -51,7 +51,9 @@ def write(
 
 
 def test_a_new_file_has_the_usual_permissions_and_an_old_one_keeps_its_own(tmp_path):
-    path, usual, link = tmp_path / "a" / "b" / "out.npz", tmp_path / "usual", tmp_path / "link"
+    path = tmp_path / "a" / "b" / "out.npz"
+    usual = tmp_path / "usual"
+    link = tmp_path / "link"
     usual.touch()
     with replace_file(path) as temporary:
         assert (temporary.parent, temporary.suffix) == (path.parent, ".npz")

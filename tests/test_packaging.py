@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a user installs: one version, typed, with its command; `.ci/check_archives.py` opens the archives."""
+"""The installed package: one version, typed, with its command; `.ci/check_archives.py` opens archives."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_archives_hold_the_kernels_and_all_that_tests_need() -> None:
 
 
 def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
-    """Its schema is checked by `.ci/run`."""
+    """The schema of the citation is checked by `.ci/run`."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert (citation["cff-version"], citation["type"]) == ("1.2.0", "software")
     assert (citation["version"], citation["license"]) == (

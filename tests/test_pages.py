@@ -33,7 +33,7 @@ PUBLIC += [f"ltcl.acquisition.{name}" for name in ("geometry", "radiometry", "ri
 
 
 def public(module: types.ModuleType) -> list[str]:
-    """Its names; of a module without a list of them, its classes."""
+    """Public names of a module; its classes where it has no list of names."""
     own = [
         name
         for name, value in vars(module).items()
@@ -64,7 +64,7 @@ EXAMPLES = "\n".join(re.findall(r"```pycon\n(.*?)```", PYTHON, re.DOTALL))
 
 
 def test_every_public_name_has_an_example() -> None:
-    """In its docstring, in that of a method, or on the page; of an error the message is one."""
+    """An example is in the docstring, in that of a method, or on the page; the message of an error is one."""
     without = []
     for name in re.findall(r"^   (ltcl\.[\w.]+)$", PYTHON, re.MULTILINE):
         own = resolve(name)

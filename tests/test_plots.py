@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the plots hold; how they look is for people to judge."""
+"""Contents of the plots; how they look is for people to judge."""
 
 from __future__ import annotations
 

@@ -41,10 +41,10 @@ def test_no_more_is_kept_than_an_error_takes(
     dense = (rng.choice([-1, 1], shape) * 2.0 ** -rng.uniform(0, 20, shape)).astype(np.float32)
     x = rng.random(shape[1])
     y = dense @ x
-    kept = bench.largest(make(dense), x, y, tolerance).toarray()
+    kept = bench.keep_largest(make(dense), x, y, tolerance).toarray()
     np.testing.assert_array_equal(kept, np.where(kept != 0, dense, 0))
-    assert bench.relative(kept @ x, y) <= tolerance * (1 + 1e-9)
+    assert bench.relative_error(kept @ x, y) <= tolerance * (1 + 1e-9)
     least = np.abs(kept[kept != 0]).min()
     assert np.abs(dense[kept == 0]).max(initial=0) < least  # the largest ones
     fewer = np.where(np.abs(dense) >= least * (1 + 2**-6), dense, 0)
-    assert bench.relative(fewer @ x, y) > tolerance
+    assert bench.relative_error(fewer @ x, y) > tolerance

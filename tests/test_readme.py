@@ -61,7 +61,8 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
         _run(command, capsys)
     exec(from_photographs, names)  # noqa: S102
     rig = names["rig"]
-    seen, target = (rig.radiance(names["setup"].codes(names["c"].pattern)), names["target"])
+    seen = rig.radiance(names["setup"].codes(names["c"].pattern))
+    target = names["target"]
     scale = np.vdot(seen, target) / np.vdot(seen, seen)
     assert np.linalg.norm(scale * seen - target) < 0.02 * np.linalg.norm(target)
 

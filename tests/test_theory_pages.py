@@ -25,7 +25,7 @@ DUALITY, BEYOND, ONE_CAMERA = (
 
 
 def exists(name: str) -> bool:
-    """Whether ltcl has this dotted name, of a module, a class, or what instances of it have."""
+    """True if ltcl has this dotted name of a module, a class, or an attribute of instances."""
     value: Any = ltcl
     for part in name.split("."):
         if inspect.isclass(value) and not hasattr(value, part):
@@ -74,7 +74,7 @@ class Record:
         self.facts = self.content["facts"]
 
     def claim(self, text: str, pattern: str) -> Iterator[str]:
-        """What a pattern finds in the outcome of the claim that begins so."""
+        """Numbers that a pattern finds in the outcome of the claim that begins so."""
         (claim,) = (c for c in self.content["claims"] if c["text"].startswith(text))
         found = re.search(pattern, claim["measured"])
         assert found is not None
@@ -92,7 +92,8 @@ def percent(value: float, digits: int = 0) -> str:
 def of_beyond() -> Iterator[str]:
     """Figures of the page, in its order."""
     yield from Record("fig5").claim("ours: Chebyshev", r"at most (\d+) products")
-    products, launches = Record("methods").content["products"], Record("launches")
+    products = Record("methods").content["products"]
+    launches = Record("launches")
     relax = [
         Record("relax").row(question=question, competitor="one product")["ratio"]
         for question in (

@@ -1,19 +1,27 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Sums over the rows of arrays (rows, k), column by column, and updates with coefficients of each column.
+// Sums over the rows of arrays (rows, k), column by column, and updates with coefficients of each
+// column. Kernels that include it are launched by `Columns` in ltcl/solvers and by
+// ltcl/device/vectors.py.
 //
-// An item has neighbouring rows of one column, for caches of CPUs, or with -DADJACENT=0 every so many, so that loads of
-// neighbouring items lie side by side. A group has up to its size of the columns, from that of get_group_id(2) on. It
-// leaves partial sums at [slice][sum][column], which every group of the next kernel adds up, in one order, with the
-// same get_num_groups(0). `scratch` holds a real an item and those that a kernel names.
+// A work-item has neighbouring rows of one column, for caches of CPUs, or with -DADJACENT=0 every
+// so many, so that loads of neighbouring items lie side by side. A group has up to its size of the
+// columns, the first by get_group_id(2). It leaves partial sums at [slice][sum][column], which
+// every group of the next kernel adds up, in one order, with the same get_num_groups(0).
+//
+// `scratch` holds a real a work-item and those that a kernel names. Optional define: ADJACENT, 1 or
+// 0.
 
-#include "common/real.h"
+#ifndef LTCL_COLUMNS_H
+#define LTCL_COLUMNS_H
+
+#include "real.h"
 
 #ifndef ADJACENT
 #define ADJACENT 1
 #endif
 
-// Values first, first + step, ... below end, in the rows row, row + rows, ..., of column origin + column; the group
-// has `width` columns from `origin` on.
+// The part of a work-item: values first, first + step, ... below end, in the rows row, row + rows,
+// ..., of column origin + column; its group has `width` columns from `origin` on.
 typedef struct {
     int first, step, end, column, origin, width, row, rows;
 } share;
@@ -29,7 +37,8 @@ static inline share columns_share(int rows, int k)
     s.width = min(items, k - s.origin);
     s.column = me % s.width;
     const int together = items / s.width, parts = together * get_num_groups(0);
-    const int part = get_group_id(0) * together + me / s.width, height = (rows + parts - 1) / parts;
+    const int part = get_group_id(0) * together + me / s.width;
+    const int height = (rows + parts - 1) / parts;
     s.row = ADJACENT ? min(part * height, rows) : part;
     s.rows = ADJACENT ? 1 : parts;
     s.end = (ADJACENT ? min(s.row + height, rows) : rows) * k;
@@ -43,8 +52,10 @@ static inline real4 four(global const real *x, int i, int step)
     return step == 1 ? LOAD4(x + i) : (real4)(x[i], x[i + step], x[i + 2 * step], x[i + 3 * step]);
 }
 
-// The item's sum of x * y * weights, without weights where that is 0: four sums at a time, none waits for another.
-static inline real dot_share(global const real *x, global const real *y, global const real *weights, share s)
+// The item's sum of x * y * weights, without weights where that is 0: four sums at a time, none of
+// which waits for another.
+static inline real
+dot_share(global const real *x, global const real *y, global const real *weights, share s)
 {
     real4 sums = 0;
     int i = s.first;
@@ -55,28 +66,40 @@ static inline real dot_share(global const real *x, global const real *y, global 
     return (sums.s0 + sums.s1) + (sums.s2 + sums.s3);
 }
 
-// Leave the sum of the items' values, or the largest, at sums[column]. `scratch` holds a real an item.
-static inline void columns_sum(real value, global real *sums, int largest, share s, local real *scratch)
+// Leave the sum of the items' values, or the largest, at out[column]. `scratch` holds a real an
+// item.
+static inline void
+columns_sum(real value, global real *out, int largest, share s, local real *scratch)
 {
     scratch[get_local_id(0)] = value;
     fold(scratch, get_local_size(0), s.width, largest ? 0 : s.width);
-    EACH_COLUMN(j) sums[s.origin + j] = scratch[j];
+    EACH_COLUMN(j)
+        out[s.origin + j] = scratch[j];
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// The partial sums of the group's columns, added up over the slices, from sum `largest` on the largest: that of `sum` at
-// [(first + sum) * width + j] behind the first real an item of `scratch`. Returns where those of `first` begin.
+// Add up the partial sums of the group's columns over the slices.
+//   partials   (slices, count, k)
+//   slices     groups that left them
+//   count      sums of each column
+//   largest    from this sum on, the largest partial in place of the sum
+//   k          columns
+//   scratch    a real an item; behind it (first + count, width) totals
+//   first      totals that are kept before these
+// Returns where these totals begin: that of sum n of column j is at [n * width + j].
 static inline local real *columns_totals(
-    global const real *partials, int slices, int sums, int largest, int k, share s, local real *scratch, int first)
+    global const real *partials, int slices, int count, int largest, int k, share s,
+    local real *scratch, int first)
 {
     const int me = get_local_id(0), items = get_local_size(0);
     local real *totals = scratch + items + first * s.width;
-    for (int start = 0; start < sums * s.width; start += items) {
-        const int width = min(items, sums * s.width - start), together = items / width;
+    for (int start = 0; start < count * s.width; start += items) {
+        const int width = min(items, count * s.width - start), together = items / width;
         const int entry = start + me % width;
         real sum = 0;
         for (int slice = me / width; slice < slices && me < together * width; slice += together) {
-            const real partial = partials[(slice * sums + entry / s.width) * k + s.origin + entry % s.width];
+            const int row = slice * count + entry / s.width;
+            const real partial = partials[row * k + s.origin + entry % s.width];
             sum = entry < largest * s.width ? sum + partial : fmax(sum, partial);
         }
         scratch[me] = sum;
@@ -87,3 +110,5 @@ static inline local real *columns_totals(
     }
     return totals;
 }
+
+#endif

@@ -1,18 +1,24 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The number type of every kernel, wide loads and stores at any address of a real, and the epilogue of products.
+// The number type of every kernel, wide loads and stores, the epilogue of a product, sums.
 //
-// Products are written a * b + c, which compilers contract, never fma(): PoCL compiles that to a call on vectors (1.7
-// times slower), and vload8 too: twice as slow as a load of a vector type whose alignment is lowered.
+// Products are written a * b + c, which compilers contract, never fma(): PoCL compiles that to a
+// call on vectors (1.7 times slower). It compiles vload8 to a call, too: twice as slow as a load of
+// a vector type whose alignment is lowered.
+
+#ifndef LTCL_REAL_H
+#define LTCL_REAL_H
 
 typedef float real, real1;
 typedef float2 real2;
 typedef float4 real4;
 typedef float8 real8;
 
+// The member of a family for n values: OF(real, 8) is real8.
 #define PASTE(name, n) name##n
-#define OF(name, n) PASTE(name, n)  // the one of n values: OF(real, 8) is real8
+#define OF(name, n) PASTE(name, n)
 
-// INLINE: for functions of several values at once, which a call would pass through memory.
+// Loads and stores of n neighbouring values at any address of a real.
+// INLINE is for functions of several values at once, which a call would pass through memory.
 #ifdef __clang__
 typedef real2 real2_packed __attribute__((aligned(4)));
 typedef real4 real4_packed __attribute__((aligned(4)));
@@ -36,7 +42,8 @@ typedef real8 real8_packed __attribute__((aligned(4)));
 
 // out = a sum + b y + c x, one value; y is not read where b is 0, nor x where c is.
 static inline void finish(
-    int i, real sum, real a, real b, real c, global const real *x, global const real *y, global real *out)
+    int i, real sum, real a, real b, real c, global const real *x, global const real *y,
+    global real *out)
 {
     out[i] = a * sum + (b == 0 ? 0 : b * y[i]) + (c == 0 ? 0 : c * x[i]);
 }
@@ -47,17 +54,24 @@ static inline real sum8(real8 v)
     return (h.s0 + h.s1) + (h.s2 + h.s3);
 }
 
-// Sum and largest over a work-group as a binary tree: the same order every time, any group size. All items call it.
-// values[j], j < period, becomes the sum of values[j], values[j + period], ... below count; from j = largest on the
-// largest of them.
+// Sums, or maxima, over a work-group as a binary tree: the same order every time, for any size of
+// the group. All items call it.
+//   values   values[j], j < period, becomes the sum of values[j], values[j + period], ...
+//   count    number of values
+//   period   number of results
+//   largest  from this result on, the largest value in place of the sum
 static inline void fold(local real *values, int count, int period, int largest)
 {
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int rows = (count + period - 1) / period; rows > 1; rows = (rows + 1) / 2) {
-        const int upper = (rows + 1) / 2 * period;  // rounds up, so the rows need not be a power of two
+        // Rounded up, so the rows need not be a power of two.
+        const int upper = (rows + 1) / 2 * period;
         for (int j = get_local_id(0); j + upper < count; j += get_local_size(0))
-            values[j] = j % period < largest ? values[j] + values[j + upper] : fmax(values[j], values[j + upper]);
+            values[j] = j % period < largest ? values[j] + values[j + upper]
+                                             : fmax(values[j], values[j + upper]);
         count = upper;
         barrier(CLK_LOCAL_MEM_FENCE);
     }
 }
+
+#endif

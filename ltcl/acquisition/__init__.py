@@ -3,7 +3,7 @@
 
     task          acquire and finalize, with the `settings` of a scan, by a `rig`: virtual,
                   rendered, photographed by a person, on a cable (rigs/)
-    calibrate     facts that are measured once (`exposure`, `session`, radiometry/, geometry/), and
+    calibrate     facts that are measured once (`metering`, `session`, radiometry/, geometry/), and
                   their checks (`consistency`); its record, `calibration`
     scanning/     patterns in order, and T from the pictures; a plan before, a report after
     agreement     photographs that deviate from the others are refused by number; `anchor`: did

@@ -26,7 +26,8 @@ from ltcl.acquisition import anchor, consistency, radiometry
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.calibration import Calibration
-from ltcl.acquisition.exposure import (
+from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
+from ltcl.acquisition.metering import (
     MAX_EXPOSURE_RATIO,
     SATURATED_CODE,
     WHITE_LEVEL,
@@ -39,7 +40,6 @@ from ltcl.acquisition.exposure import (
     offered_exposures,
     scan_exposures,
 )
-from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
 from ltcl.acquisition.radiometry import Radiance, Response
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
@@ -195,7 +195,7 @@ def expected_photographs(
     times = CaptureTimes(black=(2.0, 3.0), white=(1.0, 2.0, 3.0), scan=(2.0, 3.0))
     repeats = effort.repeats(frames, camera_pixels)
     groups = effort.requests(grid, channels, repeats, times)
-    captures = sum(len(group) for group in groups)
+    captures = sum(map(len, groups))
     return EXPECTED_PROBES + effort.exposures * len(ramps) + stripes + captures
 
 

@@ -30,7 +30,7 @@ from ltcl import checks
 from ltcl.acquisition import rigs
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
-from ltcl.acquisition.exposure import expected_exposures
+from ltcl.acquisition.metering import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES

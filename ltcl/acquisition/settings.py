@@ -91,10 +91,12 @@ class ScanSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON without the response; a Correspondence is recorded as "given"."""
+        geometry = self.geometry if isinstance(self.geometry, str) else "given"
+        exposures = None if self.exposures is None else list(self.exposures)
         return {
-            "geometry": self.geometry if isinstance(self.geometry, str) else "given",
+            "geometry": geometry,
             "strategy": self.strategy,
-            "exposures": None if self.exposures is None else list(self.exposures),
+            "exposures": exposures,
             "frames": self.frames,
             "block": self.block,
             "order": self.order,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which devices there are, which is best, and which one a user means.
+"""Discovery: the devices of this machine, their ranking, and the one that a user selects.
 
 Rank: GPUs (most compute units first), accelerators, CPUs (newest driver first); a simulator only
 when it is named. A driver that crashes takes the process with it: `ltcl doctor` tries each in a
@@ -14,18 +14,28 @@ import re
 import sys
 import threading
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ltcl.device import kernels
+from ltcl.device import driver_errors
 from ltcl.device import pocl_linker as linker
 from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
 
-KINDS = ("gpu", "accelerator", "cpu", "simulator")  # the best first
-_CONDA = "conda install -c conda-forge pyopencl pocl-cpu"  # which the wheels on PyPI lack there
-_FIXES = {"x86_64": "python -m pip install 'pyopencl[pocl]'", "darwin": _CONDA, "win32": _CONDA}
-_HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")  # may hide every driver
+# The best first.
+KINDS = ("gpu", "accelerator", "cpu", "simulator")
+KIND_NAMES = {"gpu": "GPU", "cpu": "CPU"}
+# Commands that install a driver, by machine or system; PyPI has wheels of PoCL for Linux on x86_64.
+CONDA_COMMAND = "conda install -c conda-forge pyopencl pocl-cpu"
+INSTALL_COMMANDS = {
+    "x86_64": "python -m pip install 'pyopencl[pocl]'",
+    "darwin": CONDA_COMMAND,
+    "win32": CONDA_COMMAND,
+}
+APT_COMMAND = "sudo apt install pocl-opencl-icd"
+# Variables of the environment that may hide every driver.
+HIDING_VARIABLES = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
 _opening = threading.Lock()
@@ -33,7 +43,7 @@ _opening = threading.Lock()
 
 @dataclass(frozen=True)
 class Description:
-    """One device. `index` is what `open_device` takes: "platform:device"."""
+    """Description of a device. `index` is what `open_device` takes: "platform:device"."""
 
     index: str
     name: str
@@ -47,44 +57,63 @@ class Description:
     @property
     def rank(self) -> tuple:
         """Sort key, the best first; the driver's version is the last dotted number of its name."""
-        version = re.findall(r"\d+(?:\.\d+)+", self.driver)[-1:] or ["0"]
-        newest = [-int(number) for number in version[0].split(".")]
-        units = -self.compute_units if self.kind == "gpu" else 0
-        return KINDS.index(self.kind), units, (*newest, 0, 0, 0)[:4], self.index
+        versions = re.findall(r"\d+(?:\.\d+)+", self.driver)
+        version = versions[-1] if versions else "0"
+        newest_first = [-int(number) for number in version.split(".")]
+        padded = (*newest_first, 0, 0, 0)[:4]
+        most_units_first = -self.compute_units if self.kind == "gpu" else 0
+        return KINDS.index(self.kind), most_units_first, padded, self.index
 
 
 def list_devices() -> list[Description]:
-    """Every OpenCL device, the best first; an empty list where no driver is installed.
+    """List every OpenCL device, the best first; an empty list if no driver is installed.
 
     >>> all(":" in device.index for device in list_devices())
     True
     """
-    kernels.refuse_forked()
+    driver_errors.refuse_forked()
     import pyopencl as cl
 
-    # Its caches hold pickles, and where they cannot be written no kernel starts.
+    # Its caches hold pickles, and if they cannot be written no kernel starts.
     cl._PYOPENCL_NO_CACHE = True
-    kinds, devices = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu"}, []
-    with contextlib.suppress(cl.Error):  # the loader calls "no platform" an error
-        for p, platform in enumerate(cl.get_platforms()):
-            brand = platform.name.strip()
-            with contextlib.suppress(cl.Error):  # DEVICE_NOT_FOUND
-                for d, handle in enumerate(platform.get_devices()):
-                    kind = next(
-                        (name for flag, name in kinds.items() if handle.type & flag), "accelerator"
-                    )
-                    kind = "simulator" if "oclgrind" in brand.lower() else kind
-                    driver = f"{brand} {handle.driver_version.strip()}"
-                    sizes = (
-                        handle.max_compute_units,
-                        handle.global_mem_size,
-                        handle.max_mem_alloc_size,
-                    )
-                    devices.append(
-                        Description(f"{p}:{d}", handle.name.strip(), kind, driver, *sizes, handle)
-                    )
+    devices: list[Description] = []
+    # The loader calls "no platform" an error.
+    with contextlib.suppress(cl.Error):
+        for number, platform in enumerate(cl.get_platforms()):
+            # A platform without devices is an error, too.
+            with contextlib.suppress(cl.Error):
+                devices.extend(_platform_devices(number, platform))
     linker.provide(device.driver for device in devices)
     return sorted(devices, key=lambda device: device.rank)
+
+
+def _platform_devices(platform_number: int, platform: Any) -> Iterator[Description]:
+    """Descriptions of the devices of one platform."""
+    brand = platform.name.strip()
+    for number, handle in enumerate(platform.get_devices()):
+        yield Description(
+            index=f"{platform_number}:{number}",
+            name=handle.name.strip(),
+            kind=_kind(brand, handle.type),
+            driver=f"{brand} {handle.driver_version.strip()}",
+            compute_units=handle.max_compute_units,
+            memory=handle.global_mem_size,
+            max_allocation=handle.max_mem_alloc_size,
+            handle=handle,
+        )
+
+
+def _kind(brand: str, device_type: int) -> str:
+    """Kind of a device, by the flags of its type."""
+    import pyopencl as cl
+
+    if "oclgrind" in brand.lower():
+        return "simulator"
+    if device_type & cl.device_type.GPU:
+        return "gpu"
+    if device_type & cl.device_type.CPU:
+        return "cpu"
+    return "accelerator"
 
 
 def open_device(select: str | Device | None = None) -> Device:
@@ -96,13 +125,13 @@ def open_device(select: str | Device | None = None) -> Device:
         "gpu", "cpu" or "accelerator"; an index "platform:device" as `ltcl devices` prints it; a
         part of the name of device or driver; or "all": the best, with the others of its platform,
         over which the rows of matrices that are not compressed are spread by measured speed.
-        Without it, ``LTCL_DEVICE`` says so, else the best is taken.
+        Default: the environment variable ``LTCL_DEVICE``, else the best device.
 
     Raises
     ------
     DeviceError
-        No device at all (with the fix for this system), or none that `select` means (with those
-        there are).
+        There is no device at all (the message has the fix for this system), or none that `select`
+        means (the message lists the devices).
 
     Examples
     --------
@@ -116,50 +145,85 @@ def open_device(select: str | Device | None = None) -> Device:
         raise InputTypeError(
             f"device is {select!r}; it must be a Device, a name or an index like '0:1'"
         )
-    devices, select = list_devices(), select or os.environ.get("LTCL_DEVICE") or ""
-    every = select.strip().lower() == "all"
-    description, others = choose(devices, "" if every else select), []
-    if every:
-        platform = description.index.partition(":")[0] + ":"
-        others = [
-            open_device(d.index)
-            for d in devices
-            if d.index.startswith(platform) and d != description
-        ]
-        description = replace(description, index="all") if others else description
+    devices = list_devices()
+    if not select:
+        select = os.environ.get("LTCL_DEVICE", "")
+    if select.strip().lower() == "all":
+        return _open_all(devices)
+    return _open(choose(devices, select))
+
+
+def _open_all(devices: list[Description]) -> Device:
+    """Open the best device, with the others of its platform."""
+    best = choose(devices, None)
+    platform = best.index.partition(":")[0] + ":"
+    others = []
+    for description in devices:
+        if description.index.startswith(platform) and description != best:
+            others.append(open_device(description.index))
+    if others:
+        best = replace(best, index="all")
+    return _open(best, tuple(others))
+
+
+def _open(description: Description, others: tuple[Device, ...] = ()) -> Device:
+    """Open the described device, or find it if it is open."""
     linker.require(description.driver)
     with _opening:
-        device = _opened.get(description.index) or Device(description)
-        device.others = tuple(others)
-        return _opened.setdefault(description.index, device)
+        device = _opened.get(description.index)
+        if device is None:
+            device = Device(description)
+            _opened[description.index] = device
+        device.others = others
+        return device
 
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
-    command = _FIXES.get(sys.platform) or _FIXES.get(
-        os.uname().machine, "sudo apt install pocl-opencl-icd"
-    )
-    folder = "PoCL needs a folder that it can write, which POCL_CACHE_DIR names"
-    fix = f"install a driver: {command}, or that of your GPU's vendor; {folder}"
     if not devices:
-        set_by_user = [f"{name}={os.environ[name]}" for name in _HIDING if os.environ.get(name)]
-        unset = f"unset {' and '.join(set_by_user)}, or " if set_by_user else ""
-        raise DeviceError(f"no OpenCL device was found; {unset}{fix}")
+        raise DeviceError(f"no OpenCL device was found; {_unset_advice()}{_install_advice()}")
     known = "; ".join(f"{device.index} {device.name} ({device.kind})" for device in devices)
-    if not select and devices[0].kind == "simulator":
-        raise DeviceError(f"only a simulator was found, {known}; name it, or {fix}")
     if not select:
-        return devices[0]
+        best = devices[0]
+        if best.kind == "simulator":
+            raise DeviceError(
+                f"only a simulator was found, {known}; name it, or {_install_advice()}"
+            )
+        return best
+
     name = select.strip().lower()
     for device in devices:
-        names = f"{device.name}\n{device.driver}".lower()
-        if name in (device.kind, device.index) or (name not in KINDS and name in names):
+        if name in (device.kind, device.index):
             return device
-    kind = (
-        {"gpu": "GPU", "cpu": "CPU"}.get(name, name)
-        if name in KINDS
-        else "device of this index or name"
-    )
+        names = f"{device.name}\n{device.driver}".lower()
+        if name not in KINDS and name in names:
+            return device
+    missing = "device of this index or name"
+    if name in KINDS:
+        missing = KIND_NAMES.get(name, name)
     raise DeviceError(
-        f"device is {select!r}, but there is no {kind} here; the devices are: {known}"
+        f"device is {select!r}, but there is no {missing} here; the devices are: {known}"
     )
+
+
+def _install_advice() -> str:
+    """Advice to install a driver, for this system."""
+    command = INSTALL_COMMANDS.get(sys.platform)
+    if command is None:
+        command = INSTALL_COMMANDS.get(os.uname().machine, APT_COMMAND)
+    return (
+        f"install a driver: {command}, or that of your GPU's vendor; "
+        "PoCL needs a folder that it can write, which POCL_CACHE_DIR names"
+    )
+
+
+def _unset_advice() -> str:
+    """Advice to unset variables that may hide every driver; empty if none is set."""
+    set_by_user = []
+    for name in HIDING_VARIABLES:
+        value = os.environ.get(name)
+        if value:
+            set_by_user.append(f"{name}={value}")
+    if not set_by_user:
+        return ""
+    return f"unset {' and '.join(set_by_user)}, or "

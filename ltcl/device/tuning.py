@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is timed once per device and then remembered: the fastest of several kernel variants, machine speeds.
+"""Measurements made once per device and then remembered: fastest kernel variants, machine speeds.
 
 `LTCL_TUNE=0` turns timing off: the first variant is taken, speeds are constants. Variants agree to
-rounding. The memory is a JSON file in the user's cache, or where `LTCL_CACHE` says; it may be
-deleted.
+rounding. The memory is a JSON file in the user's cache folder, or in that of `LTCL_CACHE`; it may
+be deleted.
 """
 
 from __future__ import annotations
@@ -26,40 +26,52 @@ import scipy
 import scipy.linalg
 
 from ltcl import files
-from ltcl.device import kernels, vectors
+from ltcl.device import sources, vectors
 from ltcl.errors import DeviceError, FileError, MemoryLimitError
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
 
-# Under LTCL_TUNE=0: of a launch; bytes a second, of a CPU or not; a second, of a factorization.
-SECONDS, BANDWIDTH, FLOPS = 20e-6, {True: 2e10, False: 2e12}, 5e10
+# Speeds under LTCL_TUNE=0: seconds of a launch, bytes per second of a CPU (True) or another device,
+# operations per second of a factorization.
+SECONDS = 20e-6
+BANDWIDTH = {True: 2e10, False: 2e12}
+FLOPS = 5e10
+
+# Runs of which the best counts.
+REPEATS = 5
+# Bytes of each of the three arrays of a triad: beyond the caches.
+TRIAD_BYTES = 1 << 26
+# Rows of the matrix that is factorized.
+FACTORIZED_ROWS = 768
 
 log = logging.getLogger(__name__)
-_REPEATS = 5
-_TRIAD_BYTES = 1 << 26  # of one of its three arrays: beyond the caches
-_FACTORIZED = 768  # rows
 
 
 def choose(
     device: Device, file: str, problem: str, variants: Mapping[str, Callable[[], None]]
 ) -> str:
-    """The fastest of `variants`, each of which queues a launch; remembered for all of this `problem`."""
+    """Name of the fastest of `variants`, each of which queues a launch.
+
+    The answer is remembered for the device, the kernel file and the `problem`. Variants that fail
+    are left out; if all do, `DeviceError` is raised.
+    """
     names = list(variants)
-    if len(names) == 1 or os.environ.get("LTCL_TUNE") == "0":
+    if len(names) == 1 or _is_off():
         return names[0]
-    version = f"{file} {zlib.crc32(kernels.load(file).encode()):08x}"
+    checksum = zlib.crc32(sources.load(file).encode())
+    version = f"{file} {checksum:08x}"
     key = "|".join((device.name, device.driver, version, problem, ",".join(names)))
-    if (known := recall(key)) in names:
-        return known
+    remembered = recall(key)
+    if remembered in names:
+        return remembered
+
     times = {}
     for name, launch in variants.items():
         try:
             times[name] = _time(launch, device.finish)
-        except (
-            DeviceError,
-            MemoryLimitError,
-        ) as error:  # the latter where a group needs too many registers
+        # A MemoryLimitError tells that a group needs too many registers.
+        except (DeviceError, MemoryLimitError) as error:
             log.info("%s of %s fails and is left out: %s", name, file, error)
     if not times:
         raise DeviceError(
@@ -73,80 +85,96 @@ def choose(
 
 def seconds(device: Device, key: str, launch: Callable[[], object]) -> float:
     """Seconds that `launch` takes on `device`, waiting included."""
-    return _measured(
-        (device.name, device.driver, key), SECONDS, lambda: _time(launch, device.finish)
-    )
+
+    def measure() -> float:
+        return _time(launch, device.finish)
+
+    return _measured((device.name, device.driver, key), SECONDS, measure)
 
 
 def bandwidth(device: Device) -> float:
-    """Bytes a second that the device moves at best, by a triad a b + c y: two reads, one write."""
-    nbytes = min(_TRIAD_BYTES, device.max_allocation // 4)
+    """Bytes per second that the device moves at best: a triad a b + c y reads two, writes one."""
+    nbytes = min(TRIAD_BYTES, device.max_allocation // 4)
 
     def measure() -> float:
         b, c, out = (vectors.fill(device.empty(nbytes // 4), 1.0) for _ in range(3))
-        return 3 * nbytes / _time(lambda: vectors.axpby(0.5, b, 1.0, c, out), device.finish)
+        triad_seconds = _time(lambda: vectors.axpby(0.5, b, 1.0, c, out), device.finish)
+        return 3 * nbytes / triad_seconds
 
     key = (device.name, device.driver, f"bandwidth by {nbytes} bytes")
     return _measured(key, BANDWIDTH[device.is_cpu], measure)
 
 
 def factorization_flops() -> float:
-    """Operations a second of a float64 LU factorization on this host."""
+    """Operations per second of a float64 LU factorization on this host."""
 
     def measure() -> float:
-        matrix = np.random.default_rng(0).standard_normal((_FACTORIZED, _FACTORIZED))
-        return 2 / 3 * _FACTORIZED**3 / _time(lambda: scipy.linalg.lu_factor(matrix), lambda: None)
+        rng = np.random.default_rng(0)
+        matrix = rng.standard_normal((FACTORIZED_ROWS, FACTORIZED_ROWS))
+        lu_seconds = _time(lambda: scipy.linalg.lu_factor(matrix), lambda: None)
+        return 2 / 3 * FACTORIZED_ROWS**3 / lu_seconds
 
     key = (platform.node(), f"{os.cpu_count()} cores", f"scipy {scipy.__version__}", "LU, flops")
     return _measured(key, FLOPS, measure)
 
 
+def _is_off() -> bool:
+    return os.environ.get("LTCL_TUNE") == "0"
+
+
 def _measured(key: tuple[str, ...], default: float, measure: Callable[[], float]) -> float:
-    """What is remembered as `key`, else measured now; `default` where timing is off."""
-    if os.environ.get("LTCL_TUNE") == "0":
+    """The number remembered as `key`, else measured now; `default` if timing is off."""
+    if _is_off():
         return default
     value = recall("|".join(key))
-    if not (isinstance(value, float) and 0 < value < math.inf):
+    is_usable = isinstance(value, float) and 0 < value < math.inf
+    if not is_usable:
         value = measure()
         remember("|".join(key), value)
     return value
 
 
 def _time(run: Callable[[], object], wait: Callable[[], object]) -> float:
-    """Best of a few runs."""
+    """Best of a few runs, in seconds."""
 
     def once() -> None:
         run()
         wait()
 
-    once()  # builds
-    return min(timeit.repeat(once, number=1, repeat=_REPEATS, timer=time.perf_counter))
+    # The first run builds kernels.
+    once()
+    return min(timeit.repeat(once, number=1, repeat=REPEATS, timer=time.perf_counter))
 
 
 def folder() -> Path:
     """The cache folder; it may not exist yet."""
-    return Path(
-        os.environ.get("LTCL_CACHE") or platformdirs.user_cache_dir("ltcl", appauthor=False)
-    )
+    chosen_by_user = os.environ.get("LTCL_CACHE")
+    if chosen_by_user:
+        return Path(chosen_by_user)
+    return Path(platformdirs.user_cache_dir("ltcl", appauthor=False))
 
 
 def make_folder() -> Path:
-    """The cache folder, created for its owner only where it is missing."""
+    """The cache folder; if it is missing it is created, for its owner only."""
     path = folder()
-    path.mkdir(
-        mode=0o700, parents=True, exist_ok=True
-    )  # an existing folder keeps its mode: it is the user's
+    # An existing folder keeps its mode: it is the user's.
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
     return path
 
 
 def recall(key: str) -> Any:
-    """What is remembered as `key`, or None."""
+    """The value remembered as `key`, or None."""
     return _memory().get(key)
 
 
 def remember(key: str, value: Any) -> None:
-    """Remember `value` (plain JSON) as `key`, in a file replaced whole; an unwritable folder forgets it."""
-    content = json.dumps({**_memory(), key: value}, indent=1, sort_keys=True)
+    """Remember `value` (plain JSON) as `key`; nothing is remembered in an unwritable folder.
+
+    The file is replaced whole.
+    """
+    memory = _memory()
+    memory[key] = value
+    content = json.dumps(memory, indent=1, sort_keys=True)
     try:
         with files.replace_file(make_folder() / "tuning.json") as temporary:
             temporary.write_text(content, encoding="utf-8")
@@ -155,6 +183,7 @@ def remember(key: str, value: Any) -> None:
 
 
 def _memory() -> dict[str, Any]:
+    """All that is remembered; nothing if the file is missing or damaged."""
     try:
         content = json.loads((folder() / "tuning.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

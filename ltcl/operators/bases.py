@@ -156,8 +156,9 @@ class SubsetBasis(Basis):
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The arrays of W, or name and grid, and the places."""
-        arrays = super().to_arrays() if self.of is None else self.of.to_arrays()
-        return {**arrays, "places": self.places}
+        if self.of is not None:
+            return {**self.of.to_arrays(), "places": self.places}
+        return {**super().to_arrays(), "places": self.places}
 
     def _transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool

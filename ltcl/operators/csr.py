@@ -123,7 +123,9 @@ class CSR(SparseRows):
             pattern = None
         bytes_per_entry = 8 if pattern is None else 4
         device.require(matrix.nnz * bytes_per_entry, f"a sparse matrix of {matrix.nnz} nonzeros")
-        self.pattern = Pattern.from_csr(device, matrix) if pattern is None else pattern
+        if pattern is None:
+            pattern = Pattern.from_csr(device, matrix)
+        self.pattern = pattern
         self.slabs = self.pattern.with_values(matrix.data)
         self.nnz: int = matrix.nnz
         self._host = matrix

@@ -120,9 +120,10 @@ def together(comm: Any, make: Callable[[], Any]) -> Any:
     error = None
     try:
         result = make()
-    except (LtclError, MemoryError, OSError) as problem:
-        kind = type(problem) if isinstance(problem, LtclError) else LtclError
-        error = (kind, str(problem) or "the host has no memory left")
+    except LtclError as problem:
+        error = (type(problem), str(problem))
+    except (MemoryError, OSError) as problem:
+        error = (LtclError, str(problem) or "the host has no memory left")
     errors = comm.allgather(error)
     are_equal = len(set(errors)) == 1
     for rank, rank_error in enumerate(errors):

@@ -11,7 +11,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device, open_device
-from ltcl.device.vectors import rounded
+from ltcl.device.arrays import rounded
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR, Pattern
@@ -75,9 +75,9 @@ def interreflections(
 
 def underlying_system(matrix: Any) -> IdentityPlus | None:
     """The S of an operator that is S diag(d); None for any other matrix."""
-    if not isinstance(matrix, ScaledColumns) or matrix.shift.any():
-        return None
-    return matrix.A if isinstance(matrix.A, IdentityPlus) else None
+    if isinstance(matrix, ScaledColumns) and isinstance(matrix.A, IdentityPlus):
+        return None if matrix.shift.any() else matrix.A
+    return None
 
 
 def _has_entries(matrix: Any) -> bool:
@@ -144,8 +144,11 @@ def _interreflection(
             return _sparse_R(rows, divisor, lit, first)
 
         return upload_matrix(device, matrix, sparse_rows, added_entries=len(F))
-    operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)
-    return ScaledColumns(operator, 1.0 / divisor, 1.0 if lit.all() else lit)
+    if not isinstance(matrix, Operator):
+        matrix = Host(device, matrix)
+    # One number joins the epilogue of the product.
+    shift = 1.0 if lit.all() else lit
+    return ScaledColumns(matrix, 1.0 / divisor, shift)
 
 
 def _check_first_bounce(T: Any, F: np.ndarray) -> None:

@@ -26,8 +26,8 @@ from ltcl.operators.epilogue import widths
 from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.rows import Slab
 
-# Rows of a block whose inverse is kept: small beside the matrix.
-INVERTED = 128
+# Rows of a block whose inverse is kept, unless they are given: small beside the matrix.
+DEFAULT_BLOCK_ROWS = 128
 # Bytes of M in a strip and in a panel: many beside the cost of starting one.
 STRIP_BYTES = 1 << 17
 PANEL_BYTES = 1 << 23
@@ -187,7 +187,7 @@ class Relaxation:
     def _block_rows(self, nbytes: int, block: int | None) -> int:
         n = max(1, self.n)
         if not block and self.inverses:
-            block = INVERTED
+            block = DEFAULT_BLOCK_ROWS
         elif not block:
             block = STRIP_BYTES * n // max(1, nbytes)
         return max(1, min(block, n))

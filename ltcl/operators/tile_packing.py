@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device.vectors import rounded
+from ltcl.device.arrays import rounded
 from ltcl.errors import InputError
 
 WIDTHS = (1, 8)

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Array
+from ltcl.device import Array, Device
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR
@@ -100,10 +100,9 @@ class Tables:
     ) -> None:
         """Build rows whose entries begin at `base`; dense ones have a `width` and no pointers."""
         kernel = self.device.kernel("walk", "walk_tables", **TABLE_DEFINES)
-        group = 1 if self.device.is_cpu else 64
         kernel(
             rows,
-            group,
+            walk_group(self.device),
             rows=rows,
             first=first,
             base=base,
@@ -185,6 +184,11 @@ class Linked(Tables):
         return moments
 
 
+def walk_group(device: Device) -> int:
+    """Work-items of a group: a CPU runs one walk or row after the other."""
+    return 1 if device.is_cpu else 64
+
+
 def _mean_squares(channels: Sequence[Any]) -> Any:
     """The sum over channels of (R_cij / |R_ci|)^2, a csr_array (N, N)."""
     squares: Any = 0
@@ -240,7 +244,10 @@ def _without_identity(S: CSR | Dense) -> CSR | Dense:
 
 
 def _count_entries(M: CSR | Dense) -> int:
-    return M.nnz if isinstance(M, CSR) else M.shape[0] * M.shape[1]
+    if isinstance(M, CSR):
+        return M.nnz
+    rows, columns = M.shape
+    return rows * columns
 
 
 def _in_format(M: CSR | Dense, matrix: Any) -> CSR | Dense:

@@ -27,6 +27,7 @@ from ltcl.operators.walk_tables import (
     squares,
     tables,
     tables_of_columns,
+    walk_group,
 )
 
 __all__ = [
@@ -187,7 +188,7 @@ class Walker:
         kernel = self._kernel("walk_rows", width, walks)
         kernel(
             -(-units // walks),
-            self._group,
+            walk_group(tables.device),
             units=units,
             chunks=count,
             first=CHUNK * chunk_range.start,
@@ -238,7 +239,7 @@ class Walker:
         kernel = self._kernel("walk_columns", 1, walks)
         kernel(
             -(-units // walks),
-            self._group,
+            walk_group(tables.device),
             units=units,
             first=samples.start,
             end=samples.stop,
@@ -259,10 +260,6 @@ class Walker:
         lengths = np.arange(len(self.lengths.coefficients))
         mean_steps = np.sum(self.lengths.go_on**lengths)
         return int(LAUNCH_STEPS_PER_UNIT * self.tables.device.compute_units / mean_steps)
-
-    @property
-    def _group(self) -> int:
-        return 1 if self.tables.device.is_cpu else 64
 
     def _walks_per_item(self, units: int) -> int:
         """Many walks an item if few items run, so that their loads do not wait for each other."""

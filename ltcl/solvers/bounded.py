@@ -26,11 +26,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ltcl.device import vectors
+from ltcl.device.kernels import Launch
 from ltcl.operators import Operator
 from ltcl.solvers.column_reductions import ColumnReductions, safe_ratio
 from ltcl.solvers.result import Solution, Status
@@ -222,10 +224,10 @@ class _Search:
         distance = safe_ratio(gap, self.errors, self.errors > 0.0)
         bound = np.minimum(self.errors - distance, self.errors)
         self.least = np.fmax(self.least, bound)
-        excess = self._excess_of(self.errors)
+        excess = self._excess_above_least(self.errors)
         self.excess = np.where(np.isfinite(self.errors), excess, np.inf)
 
-    def _excess_of(self, errors: np.ndarray) -> np.ndarray:
+    def _excess_above_least(self, errors: np.ndarray) -> np.ndarray:
         """Return what errors are above the least one, with all that rounding may hide."""
         excess = errors - self.least + 2.0 * self.hidden
         return np.maximum(excess, ROUNDING_SHARE * self.scale)
@@ -259,7 +261,7 @@ class _Search:
         saturated = self.descent.saturated(self.x)
         self.saturated = np.where(self.is_worse, False, saturated)
         self.errors = np.where(self.is_worse, self.initial, self.errors)
-        self.excess = np.where(self.is_worse, self._excess_of(self.initial), self.excess)
+        self.excess = np.where(self.is_worse, self._excess_above_least(self.initial), self.excess)
 
 
 class _Descent:
@@ -293,85 +295,108 @@ class _Descent:
         self.g = vectors.fill(self.x.like(), 0.0)
         # A^T u
         self._q = vectors.fill(self.x.like(), 0.0)
-        self._bind(is_weighted=w is not None)
+        self._is_weighted = w is not None
+        self._allocate()
+        self._bind()
         self.refresh()
 
-    def _bind(self, *, is_weighted: bool) -> None:
-        """Allocate the numbers that stay on the device, and bind the launches of a step."""
+    def _allocate(self) -> None:
+        """Allocate the vectors and numbers that stay on the device."""
         device = self.A.device
-        columns = ColumnReductions(self.x, _DIRECTION, _DOTS, _MOVE, _LOOK)
-        k = columns.k
-        slices = columns.slices
-        rows = self.b.shape[0]
-        self._slices = slices
+        self._columns = ColumnReductions(self.x, _DIRECTION, _DOTS, _MOVE, _LOOK)
+        k = self._columns.k
+        self._slices = self._columns.slices
         self._is_resting = np.zeros(k, bool)
         self._resting = device.upload(self._is_resting, np.int32)
-        first_numbers = np.zeros((NUMBER_ROWS + 3 * slices, k))
+        numbers = np.zeros((NUMBER_ROWS + 3 * self._slices, k))
         # The first alpha.
-        first_numbers[0] = 1.0
-        numbers = device.upload(first_numbers)
-        self._numbers = numbers
+        numbers[0] = 1.0
+        self._numbers = device.upload(numbers)
+        self._sums = self._columns.sums(3)
+        self._curvatures = self._columns.sums(1)
+        self._limits: dict[str, Any] = {
+            "lower": device.upload(self._box[0]),
+            "upper": device.upload(self._box[1]),
+        }
+        self._d = vectors.fill(self.x.like(), 0.0)
+        self._h = vectors.fill(self.x.like(), 0.0)
+        self._Ad = self.b.like()
 
-        lower = device.upload(self._box[0])
-        upper = device.upload(self._box[1])
-        d = vectors.fill(self.x.like(), 0.0)
-        h = vectors.fill(self.x.like(), 0.0)
-        Ad = self.b.like()
-        sums = columns.sums(3)
-        curvatures = columns.sums(1)
+    def _bind(self) -> None:
+        """Bind the launches of a step, and those that start anew."""
+        self._look_anew = self._bind_look(restart=1)
+        # Without slices nothing moves, and r is weighted alone.
+        self._weigh_r = self._bind_move(slices=0)
+        self._launches = (
+            self._bind_direction(),
+            self.A.bind(self._d, self._Ad),
+            self._bind_curvature(),
+            self._bind_move(slices=self._slices),
+            self.A.bind(self._u, self._q, transpose=True),
+            self._bind_look(restart=0),
+        )
 
-        box = {"lower": lower, "upper": upper}
-        looks = {"x": self.x, "q": self._q, "g": self.g, "h": h, "numbers": numbers}
-        self._look_anew = columns.bind(_LOOK, restart=1, **box, **looks)
-        look = columns.bind(_LOOK, restart=0, **box, **looks)
-        direction = columns.bind(
+    def _bind_direction(self) -> Launch:
+        """Bind the kernel of the next d."""
+        return self._columns.bind(
             _DIRECTION,
             extra=2,
-            slices=slices,
+            slices=self._slices,
             resting=self._resting,
-            numbers=numbers,
+            numbers=self._numbers,
             x=self.x,
             g=self.g,
-            d=d,
-            sums=sums,
-            **box,
+            d=self._d,
+            sums=self._sums,
+            **self._limits,
         )
-        dots = columns.bind(
+
+    def _bind_curvature(self) -> Launch:
+        """Bind the sums of w^2 (A d)^2."""
+        return self._columns.bind(
             _DOTS,
-            rows=rows,
+            rows=self.b.shape[0],
             first=0,
             pairs=0,
-            weighted=int(is_weighted),
+            weighted=int(self._is_weighted),
             weights=self._weights,
-            a=Ad,
-            b=Ad,
-            c=Ad,
-            partials=curvatures,
+            a=self._Ad,
+            b=self._Ad,
+            c=self._Ad,
+            partials=self._curvatures,
         )
-        moves = {
-            "extra": 4,
-            "height": rows,
-            "weighted": int(is_weighted),
-            "numbers": numbers,
-            "sums": sums,
-            "curvatures": curvatures,
-            "d": d,
-            "x": self.x,
-            "w": self._weights,
-            "Ad": Ad,
-            "r": self.r,
-            "u": self._u,
-        }
-        # Without slices nothing moves, and r is weighted alone.
-        self._weigh_r = columns.bind(_MOVE, slices=0, **box, **moves)
-        move = columns.bind(_MOVE, slices=slices, **box, **moves)
-        self._launches = (
-            direction,
-            self.A.bind(d, Ad),
-            dots,
-            move,
-            self.A.bind(self._u, self._q, transpose=True),
-            look,
+
+    def _bind_move(self, slices: int) -> Launch:
+        """Bind the kernel that moves x along d, and r and u with it."""
+        return self._columns.bind(
+            _MOVE,
+            extra=4,
+            height=self.b.shape[0],
+            slices=slices,
+            weighted=int(self._is_weighted),
+            numbers=self._numbers,
+            sums=self._sums,
+            curvatures=self._curvatures,
+            d=self._d,
+            x=self.x,
+            w=self._weights,
+            Ad=self._Ad,
+            r=self.r,
+            u=self._u,
+            **self._limits,
+        )
+
+    def _bind_look(self, restart: int) -> Launch:
+        """Bind the kernel of g and h, and of the sums that depend on them."""
+        return self._columns.bind(
+            _LOOK,
+            restart=restart,
+            x=self.x,
+            q=self._q,
+            g=self.g,
+            h=self._h,
+            numbers=self._numbers,
+            **self._limits,
         )
 
     def refresh(self) -> None:

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ltcl.device import Array, vectors
-from ltcl.device.kernels import Launch
+from ltcl.device.kernels import Kernel, Launch
+from ltcl.solvers import krylov_state
+from ltcl.solvers.krylov_state import STATE_ROWS
 from ltcl.solvers.stopping import SLOTS
-
-# Rows of numbers that a method keeps in its state; the residuals of SLOTS steps follow them.
-STATE_ROWS = 16
 
 # Values that an item should have before there are more groups.
 VALUES_PER_ITEM = 32
@@ -26,22 +25,8 @@ VALUES_PER_ITEM = 32
 # Most slices, of which each has a group.
 MAX_SLICES = 256
 
-_OPERANDS = "abc"
-
-
-def pair_codes(*pairs: str) -> int:
-    """Return the argument `pairs` of the kernel vector_dots for pairs of its operands a, b and c.
-
-    Four bits name the left and the right operand of each pair, the first pair lowest.
-
-    >>> bin(pair_codes("ab", "cc"))
-    '0b10100100'
-    """
-    codes = 0
-    for place, (left, right) in enumerate(pairs):
-        code = _OPERANDS.index(left) | _OPERANDS.index(right) << 2
-        codes |= code << (4 * place)
-    return codes
+# Defines of the kernels in a file, beside those of `common/columns.h`.
+DEFINES = {"krylov": krylov_state.DEFINES}
 
 
 def safe_ratio(numerator: np.ndarray, denominator: np.ndarray, where: np.ndarray) -> np.ndarray:
@@ -70,7 +55,11 @@ class ColumnReductions:
         self.device = x.device
         self.k = x.columns
         self.rows = x.shape[0]
-        self._kernels = {name: vectors.kernel_of(self.device, name) for name in kernels}
+        self._kernels: dict[str, Kernel] = {}
+        for name in kernels:
+            file = name.partition("_")[0]
+            defines = DEFINES.get(file, {})
+            self._kernels[name] = vectors.kernel_of(self.device, name, **defines)
         if self.device.is_cpu:
             items = 16 if self.k <= 16 else 64
             most = min(4 * self.device.compute_units, MAX_SLICES)

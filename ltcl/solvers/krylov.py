@@ -8,6 +8,7 @@ BiCGStab, 6.11 for restarted GMRES. Coefficients of CG and BiCGStab stay on the 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,8 +19,16 @@ from ltcl.device import Array, vectors
 from ltcl.device.kernels import Launch
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.operators import Operator
-from ltcl.solvers.column_reductions import STATE_ROWS, ColumnReductions, pair_codes
+from ltcl.solvers import krylov_state
+from ltcl.solvers.column_reductions import ColumnReductions
 from ltcl.solvers.krylov_space import krylov_cycle
+from ltcl.solvers.krylov_state import (
+    PHASE_BROKEN,
+    PHASE_FRESH,
+    PHASE_RESTS,
+    PHASE_WAITS,
+    row_in_copy,
+)
 from ltcl.solvers.method import IterativeMethod
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import CountedOperator, Monitor
@@ -63,13 +72,7 @@ class CG(IterativeMethod):
 
 
 class _CGIteration:
-    """The state of one solve with CG: w = S r, directions p, q = S p.
-
-    State rows of the kernel krylov_cg, for even and for odd steps: <r, r>, alpha, and 1 for a
-    column that met no positive curvature.
-    """
-
-    INDEFINITE = 2, 6
+    """The state of one solve with CG: w = S r, directions p, q = S p."""
 
     def __init__(
         self, system: CountedOperator, x: Array, r: Array, monitor: Monitor, weights: Any
@@ -98,7 +101,7 @@ class _CGIteration:
             "vector_dots",
             across=2,
             first=0,
-            pairs=pair_codes("aa", "ba"),
+            pairs=vectors.dot_pairs("aa", "ba"),
             weighted=int(weights is not None),
             weights=on_device,
             a=r,
@@ -121,7 +124,9 @@ class _CGIteration:
             x=x,
             r=r,
         )
-        self.launches = [system.S.bind(r, w), dots, self.update, self._keep_direction]
+        # Not a method of this object: device memory is freed by reference counting alone.
+        keep_direction = functools.partial(self.update.set, restart=0)
+        self.launches = [system.S.bind(r, w), dots, self.update, keep_direction]
 
     def _upload_weights(self, weights: Any) -> Array:
         """Upload the weights in units of the largest one, repeated for all columns."""
@@ -131,9 +136,6 @@ class _CGIteration:
         shape = (-1, *[1] * (len(r.shape) - 1))
         relative = (weights / weights.max()).reshape(shape)
         return r.device.upload(np.broadcast_to(relative, r.shape))
-
-    def _keep_direction(self) -> None:
-        self.update.set(restart=0)
 
     def run(self) -> None:
         """Take steps until the monitor ends the solve, or no column has a next step."""
@@ -146,7 +148,8 @@ class _CGIteration:
             step = steps.stop
             if monitor.check(self.x, self.r, readings.norms, np.inf):
                 return
-            is_indefinite = readings.state[self.INDEFINITE[step % 2]] > 0.0
+            indefinite_row = row_in_copy(krylov_state.CG_INDEFINITE, step)
+            is_indefinite = readings.state[indefinite_row] > 0.0
             if is_indefinite.any() and is_indefinite[monitor.unsolved].all():
                 monitor.status = Status.INDEFINITE
                 return
@@ -176,23 +179,7 @@ class BiCGStab(IterativeMethod):
 
 
 class _BiCGStabIteration:
-    """The state of one solve with BiCGStab; in Saad's names shadow is r*, half is s; g = S^T r*.
-
-    State rows of the kernels, for even and for odd steps: rho and the phase of a column; then, only
-    once: alpha, |r*|^2, and the square that <r*, v> is compared with, |S^T r*|^2 or |r*|^2.
-    """
-
-    RHO = 0, 4
-    PHASE = 1, 5
-    SHADOW_SQUARE = 9
-    COMPARED_SQUARE = 10
-
-    # Phases of a column: it goes on; has restarted and made no step since; waits for a restart by
-    # the host; has no step even after a restart; rests, since it is solved.
-    FRESH = 1.0
-    WAITS = 2.0
-    BROKEN = 3.0
-    RESTS = 4.0
+    """The state of one solve with BiCGStab; in Saad's names shadow is r*, half is s; g = S^T r*."""
 
     def __init__(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         self.system = system
@@ -235,8 +222,8 @@ class _BiCGStabIteration:
         # 4. to 9.
         self.launches = [S.bind(self.p, v), to_half, S.bind(half, t), dots_of_t, to_next]
 
-        self.numbers = np.zeros((STATE_ROWS, r.columns))
-        self.phase = np.full(r.columns, self.WAITS)
+        self.numbers = np.zeros((krylov_state.STATE_ROWS, r.columns))
+        self.phase = np.full(r.columns, PHASE_WAITS)
         self.step = 0
         self.has_transpose = True
 
@@ -247,7 +234,7 @@ class _BiCGStabIteration:
             "vector_dots",
             across=len(names),
             first=0,
-            pairs=pair_codes(*names),
+            pairs=vectors.dot_pairs(*names),
             weighted=0,
             # Not read.
             weights=a,
@@ -267,36 +254,37 @@ class _BiCGStabIteration:
             self.system.products += 2 * len(steps)
             self.step = steps.stop
             self.numbers = readings.state
-            self.phase = self.numbers[self.PHASE[self.step % 2]]
+            self.phase = self.numbers[row_in_copy(krylov_state.BICGSTAB_PHASE, self.step)]
             if monitor.check(self.x, self.r, readings.norms, np.inf):
                 return
-            is_broken = self.phase == self.BROKEN
+            is_broken = self.phase == PHASE_BROKEN
             if is_broken.any() and is_broken[monitor.unsolved].all():
                 monitor.status = Status.NO_STEP
                 return
             if not np.array_equal(monitor.norms, readings.norms[-1]):
                 # The monitor has recomputed r, to which p does not belong.
-                self.phase = np.where(is_broken, self.phase, self.WAITS)
+                self.phase = np.where(is_broken, self.phase, PHASE_WAITS)
 
     def _restart_columns(self) -> None:
         """Restart the columns that wait, and let those rest that are solved."""
         monitor = self.monitor
-        parity = self.step % 2
-        waits = (self.phase == self.WAITS) | (self.phase == self.RESTS)
+        phase_row = row_in_copy(krylov_state.BICGSTAB_PHASE, self.step)
+        rho_row = row_in_copy(krylov_state.BICGSTAB_RHO, self.step)
+        waits = (self.phase == PHASE_WAITS) | (self.phase == PHASE_RESTS)
         restarts = monitor.unsolved & waits
-        rests = ~monitor.unsolved & (self.phase != self.BROKEN)
+        rests = ~monitor.unsolved & (self.phase != PHASE_BROKEN)
 
         changed = self.numbers.copy()
-        phase = np.where(rests, self.RESTS, self.phase)
-        changed[self.PHASE[parity]] = np.where(restarts, self.FRESH, phase)
+        phase = np.where(rests, PHASE_RESTS, self.phase)
+        changed[phase_row] = np.where(restarts, PHASE_FRESH, phase)
         if restarts.any():
             self._restart_vectors(restarts)
             squares = monitor.norms**2
-            for row in (self.RHO[parity], self.SHADOW_SQUARE):
+            for row in (rho_row, krylov_state.BICGSTAB_SHADOW):
                 changed[row] = np.where(restarts, squares, changed[row])
-            changed[self.COMPARED_SQUARE] = changed[self.SHADOW_SQUARE]
+            changed[krylov_state.BICGSTAB_AGAINST] = changed[krylov_state.BICGSTAB_SHADOW]
             if self.has_transpose and self._apply_transpose():
-                changed[self.COMPARED_SQUARE] = vectors.dot(self.g, self.g)
+                changed[krylov_state.BICGSTAB_AGAINST] = vectors.dot(self.g, self.g)
         if not np.array_equal(changed, self.numbers):
             self.state.set_rows(0, self.r.device.upload(changed))
         if restarts.any() and self.has_transpose:

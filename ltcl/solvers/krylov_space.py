@@ -196,8 +196,8 @@ def krylov_cycle(
     """Improve `x` and its residual `r`, whose norms the monitor knows, by a few steps of GMRES."""
     beta = monitor.norms
     active = monitor.unsolved
-    left = monitor.rule.maxiter - monitor.iterations
-    steps = max(1, min(steps, r.shape[0], left))
+    remaining = monitor.rule.maxiter - monitor.iterations
+    steps = max(1, min(steps, r.shape[0], remaining))
     space = KrylovSpace(system.S, r, beta, steps)  # 1.
     while True:
         is_invariant = space.extend(active)

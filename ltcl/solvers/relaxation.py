@@ -22,7 +22,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.operators.relaxation import INVERTED, Steps, Sweeps, relaxation
+from ltcl.operators.relaxation import DEFAULT_BLOCK_ROWS, Steps, Sweeps, relaxation
 from ltcl.solvers.method import IterativeMethod
 from ltcl.solvers.stopping import SLOTS, CountedOperator, Monitor
 
@@ -39,7 +39,7 @@ class BlockGaussSeidel(IterativeMethod):
     """
 
     name: ClassVar[str] = "block_gauss_seidel"
-    block: int | None = INVERTED
+    block: int | None = DEFAULT_BLOCK_ROWS
     omega: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
@@ -50,8 +50,8 @@ class BlockGaussSeidel(IterativeMethod):
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it with an iterate."""
-        how = relaxation(system.S, self.name, self.block, self.omega)
-        sweeps = Sweeps(how, x, system.b, r)
+        plan = relaxation(system.S, self.name, self.block, self.omega)
+        sweeps = Sweeps(plan, x, system.b, r)
         sweeps.sweep()
         system.products += 1
         _repeat(sweeps.sweep, system, sweeps.before, r, monitor)

@@ -176,8 +176,8 @@ class Monitor:
         if done == 0:
             return 1
         required = self._required_steps()
-        left = self.rule.maxiter - done
-        most = min(required, 2.0 * SLOTS - 1.0, 2.0 * left - 1.0)
+        remaining = self.rule.maxiter - done
+        most = min(required, 2.0 * SLOTS - 1.0, 2.0 * remaining - 1.0)
         half = int((most + 1.0) / 2.0)
         return max(1, min(half, done))
 

@@ -65,7 +65,7 @@ class Survey:
     def krylov_products(self, rtol: float) -> float:
         """Return the products of a Krylov method to `rtol`; infinite if it stalls."""
         last = self.residuals[-1]
-        made = len(self.residuals) - 1
+        products = len(self.residuals) - 1
         if last <= rtol:
             # Residuals never grow: the first one within rtol.
             return float(np.argmax(np.array(self.residuals) <= rtol))
@@ -73,7 +73,7 @@ class Survey:
         if factor >= 1.0:
             return math.inf
         missing = math.log(rtol / last) / math.log(factor)
-        return made + float(np.ceil(missing))
+        return products + float(np.ceil(missing))
 
     def __str__(self) -> str:
         real = np.real(self.ritz)

@@ -4,8 +4,7 @@
 from ltcl.store.array_log import ArrayLog
 from ltcl.store.block_store import BlockStore
 from ltcl.store.formats import load, load_inverse, save, save_inverse
-from ltcl.store.record import CompressedRecord, StoreRecord
-from ltcl.store.stored_rows import StoredRows
+from ltcl.store.record import CompressedRecord, StoredRows, StoreRecord
 
 __all__ = [
     "ArrayLog",

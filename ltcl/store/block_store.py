@@ -26,7 +26,7 @@ from ltcl import checks
 from ltcl.errors import FileError
 from ltcl.files import as_path, fill_folder, input_file, locked, restore, sweep
 from ltcl.store.array_log import ArrayLog
-from ltcl.store.document import is_store, read_document, write_document
+from ltcl.store.document import StoreLayout, is_store, read_document, write_document
 from ltcl.store.final_store import (
     BINSPARSE,
     Block,
@@ -36,9 +36,7 @@ from ltcl.store.final_store import (
     write_final,
 )
 from ltcl.store.guards import about, check_declared, sparse_floats
-from ltcl.store.layout import StoreLayout
-from ltcl.store.record import CSR, EXTRAS, CompressedRecord, StoreRecord
-from ltcl.store.stored_rows import StoredRows
+from ltcl.store.record import CSR, EXTRAS, CompressedRecord, StoredRows, StoreRecord
 from ltcl.transport.noise import Noise
 
 # A file of a final store: place of the array, its group, its name.

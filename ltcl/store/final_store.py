@@ -21,8 +21,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import InputError
 from ltcl.files import flush_tree
-from ltcl.store.document import write_document
-from ltcl.store.layout import StoreLayout
+from ltcl.store.document import StoreLayout, write_document
 from ltcl.transport import first_bounce
 
 # Names of the arrays of a block: binsparse's, and SciPy's.

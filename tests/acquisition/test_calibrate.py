@@ -12,8 +12,8 @@ import pytest
 import ltcl
 from ltcl.acquisition import Shots, VirtualRig, camera_map
 from ltcl.acquisition.calibrate import measure
-from ltcl.acquisition.exposure import bracket
 from ltcl.acquisition.geometry import GrayCode
+from ltcl.acquisition.metering import bracket
 from ltcl.acquisition.radiometry import calibrate
 from ltcl.errors import AcquisitionError, InputError
 

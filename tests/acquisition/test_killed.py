@@ -22,7 +22,7 @@ from ltcl.errors import AcquisitionError, FileError, LtclError
 from ltcl.store import BlockStore
 from tests.store.stores import contents
 
-from .stopping import SETTINGS, acquire_and_end, set_up
+from .stopping import acquire_and_end, set_up
 
 random = np.random.default_rng()
 KILLS = int(os.environ.get("LTCL_KILLS", "3"))
@@ -45,7 +45,15 @@ def committed(path: Path) -> tuple[bool, bool, int]:
     return False, False, calibration_photographs(path)
 
 
-@pytest.mark.parametrize("strategy", SETTINGS)
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        "pixel",
+        "adaptive",
+        pytest.param("hadamard", marks=pytest.mark.slow),
+        pytest.param("block", marks=pytest.mark.slow),
+    ],
+)
 def test_ended_and_resumed(tmp_path: Path, strategy: str) -> None:
     """Three ends each, so that all stages are met; then to the end."""
     whole = tmp_path / "whole" / "T.zarr"

@@ -80,7 +80,8 @@ def test_items_that_are_done_leave_memory(client):
 
 def test_a_function_is_sent_once_to_each_worker(client, monkeypatch):
     """And not to the scheduler at each look at the workers: it may hold a large T."""
-    asked, run = [], client.run
+    asked = []
+    run = client.run
 
     def count(function: Any, *arguments: Any, workers: Any = None, **options: Any) -> Any:
         asked.append(len(workers))
@@ -131,7 +132,8 @@ def test_a_worker_without_device_is_named_and_takes_no_work(client, caplog, sele
             os.environ["LTCL_DEVICE"] = select
         else:
             module: Any = pyopencl
-            module.platforms, module.get_platforms = module.get_platforms, list
+            module.platforms = module.get_platforms
+            module.get_platforms = list
 
     def show() -> None:
         import pyopencl
@@ -202,7 +204,7 @@ random = np.random.default_rng(81)
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory, device) -> Path:
-    """Its frames, T, and what one process makes of both."""
+    """Frames, T, and the patterns that one process makes of both."""
     folder = tmp_path_factory.mktemp("film")
     ltcl.save(folder / "T.npz", ltcl.Transport(SCENE.T, GRID))
     for number in range(FRAMES):
@@ -234,7 +236,8 @@ def test_frames_have_the_bytes_of_a_serial_run(client, film, device, tmp_path, s
 
 
 def test_killed_workers_leave_every_frame_once_and_whole(client, film, tmp_path):
-    T, counts = ltcl.load(film / "T.npz"), []
+    T = ltcl.load(film / "T.npz")
+    counts = []
 
     def progress(step: str, done: int, total: int | None) -> None:
         counts.append(done)
@@ -283,7 +286,8 @@ def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path)
         "--appearance",
     ]
     words += ["--batch", "4", "--out", str(tmp_path / "out"), "--quiet"]
-    file, dask = str(tmp_path / "scheduler.json"), [sys.executable, "-m", "dask"]
+    file = str(tmp_path / "scheduler.json")
+    dask = [sys.executable, "-m", "dask"]
     commands = ["scheduler --host 127.0.0.1 --port 0", "worker --nthreads 1 --no-nanny"]
     started = [
         [*dask, *each.split(), "--no-dashboard", "--scheduler-file", file] for each in commands
@@ -355,7 +359,8 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
     for name in ("a", "b"):
         shutil.copy(film / "T.npz", tmp_path / f"{name}.npz")
     (tmp_path / "c.npz").write_bytes(b"no transport")
-    address, out = client.scheduler.address, tmp_path / "out"
+    address = client.scheduler.address
+    out = tmp_path / "out"
     scenes = [
         "compensate",
         "--transports",

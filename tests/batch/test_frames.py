@@ -92,16 +92,15 @@ def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, 
         np.testing.assert_allclose(coarse, exact / 2.0, atol=1e-4)
     for frame in list(open_frames(source))[:5]:
         name = f"appearance/appearance_{frame.number:06}"
-        shown, light = (
-            images.read(tmp_path / f"png/{name}.png"),
-            images.read(tmp_path / f"exr/{name}.exr"),
-        )
+        shown = images.read(tmp_path / f"png/{name}.png")
+        light = images.read(tmp_path / f"exr/{name}.exr")
         np.testing.assert_allclose(shown, frame.picture(), rtol=0.02, atol=1e-3)
         np.testing.assert_allclose(light, 0.5 * frame.picture(), rtol=0.02)
 
 
 def test_grey_coloured_black_and_bright_frames_are_what_each_is_alone(T, tmp_path):
-    grey, colour = seen(LIGHT[:4]), np.stack(list(seen(LIGHT[4:7])), axis=-1)
+    grey = seen(LIGHT[:4])
+    colour = np.stack(list(seen(LIGHT[4:7])), axis=-1)
     pictures = [grey[0], colour, 4.0 * grey[2], np.zeros(GRID), 0.5 * grey[3]]
     done = compensate_frames(
         T, fill(tmp_path / "in", pictures), tmp_path / "out", format="exr", rtol=1e-4
@@ -120,7 +119,8 @@ def test_grey_coloured_black_and_bright_frames_are_what_each_is_alone(T, tmp_pat
 def test_one_gain_for_all_frames_from_a_sample_of_all(T, tmp_path):
     scale = np.linspace(1.0, 0.2, 9)
     scale[2] = 5.0  # not in the sample
-    pictures, common = scale[:, None, None] * seen(LIGHT[:9]), {"gain": "auto", "rtol": 1e-4}
+    pictures = scale[:, None, None] * seen(LIGHT[:9])
+    common = {"gain": "auto", "rtol": 1e-4}
     source = fill(tmp_path / "in", pictures)
     done = compensate_frames(T, source, tmp_path / "out", batch=3, format="exr", **common)
     sample = ltcl.compensate(T, pictures[[0, 4, 8]], **common)
@@ -146,7 +146,8 @@ def test_background_and_weights_serve_all_frames_and_sizes_are_scaled_when_asked
 
 
 def test_videos_in_and_out_also_where_sound_outlasts_the_picture(T, tmp_path, caplog):
-    film, out = tmp_path / "film.mkv", tmp_path / "out.avi"
+    film = tmp_path / "film.mkv"
+    out = tmp_path / "out.avi"
     write_video(film, seen(LIGHT), fps=30.0)
     data = film.read_bytes()
     place = (
@@ -155,7 +156,8 @@ def test_videos_in_and_out_also_where_sound_outlasts_the_picture(T, tmp_path, ca
     (duration,) = struct.unpack_from(">d", data, place)
     film.write_bytes(data[:place] + struct.pack(">d", 1.2 * duration) + data[place + 8 :])
     common: dict[str, Any] = {"out": tmp_path / "patterns", "video": out, "rtol": 1e-4, "batch": 4}
-    done, shown = compensate_frames(T, film, **common), open_frames(out)
+    done = compensate_frames(T, film, **common)
+    shown = open_frames(out)
     assert f"{film}: 13 of 16" in caplog.text
     assert (shown.count, shown.fps) == (COUNT, pytest.approx(30.0))
     assert [record.name for record in done.records][:2] == ["film.mkv:1", "film.mkv:2"]
@@ -190,7 +192,7 @@ def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, 
 
 
 class Projector:
-    """Its curve, as a bound method, which has no identity of its own."""
+    """A curve as a bound method, which has no identity of its own."""
 
     def __init__(self, gamma: float) -> None:
         self.gamma = gamma
@@ -214,10 +216,8 @@ class Projector:
     ],
 )
 def test_another_run_is_refused_by_what_differs(T, source, tmp_path, changed, text):
-    out, common = (
-        tmp_path / "out",
-        {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "T": T},
-    )
+    out = tmp_path / "out"
+    common = {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "T": T}
     if "exact" in changed:
         common["exact"] = ltcl.Transport(SCENE.T, GRID)
     if "source" in changed:  # one of its files is another

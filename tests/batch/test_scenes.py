@@ -25,7 +25,8 @@ def where(request) -> Any:
 
 def test_one_task_each_and_those_that_fail_are_named(where, tmp_path):
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(6), grid=(2, 3)))
-    paths, calls = [tmp_path / f"{name}.npz" for name in ("T", "none", "T", "nor")], []
+    paths = [tmp_path / f"{name}.npz" for name in ("T", "none", "T", "nor")]
+    calls = []
 
     def light(path: Path) -> float:
         return float(ltcl.load(path).first_bounce.sum())
@@ -39,7 +40,7 @@ def test_one_task_each_and_those_that_fail_are_named(where, tmp_path):
 
 @pytest.mark.parametrize("kind", [errors.LtclError, *errors.LtclError.__subclasses__(), FileError])
 def test_every_error_comes_back_from_a_worker(kind):
-    """Where Dask was imported after ltcl it pickles errors by tblib, which may leave out `__init__`."""
+    """Dask that was imported after ltcl pickles errors by tblib, which may leave out `__init__`."""
     install(kind)
     error = kind("a file")
     copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - ours

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which device is best and which one a user means; an opened one: memory, threads, processes."""
+"""Discovery and selection of devices; memory, threads and processes of an opened one."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
 def test_arrays_and_matrices_beyond_the_memory_are_refused_with_both_sizes(
     device, small_device, monkeypatch
 ):
-    """On a CPU also where the host has filled up since."""
-    most = (small_device.max_allocation - SPARE_BYTES) // 4
-    small_device.empty(most)
+    """A CPU refuses them also when the host has filled up since it was opened."""
+    largest = (small_device.max_allocation - SPARE_BYTES) // 4
+    small_device.empty(largest)
     with pytest.raises(MemoryLimitError, match=r"3\.988 KiB .*\(1021,\).* 4 KiB"):
-        small_device.empty(most + 1)
+        small_device.empty(largest + 1)
     monkeypatch.setattr(device, "memory", 1 << 20)
     device.require(1 << 20, "this")
     with pytest.raises(MemoryLimitError, match=r"that .*1\.5 MiB.* 1 MiB"):
@@ -51,7 +51,8 @@ def test_memory_is_used_again_and_unused_blocks_make_room(device, monkeypatch):
     device.empty(1000)
     before = device.allocations
     device.empty(100)
-    assert device.allocations == before + 1  # nothing unused was left
+    # No unused block was left.
+    assert device.allocations == before + 1
 
 
 def test_memory_may_be_used_again_while_kernels_are_queued(device):
@@ -65,7 +66,7 @@ def test_memory_may_be_used_again_while_kernels_are_queued(device):
 
 
 def test_threads_open_one_device(device, monkeypatch):
-    """Where none is open yet; opening takes long enough for all of them to ask."""
+    """No device is open yet, and opening takes long enough for all threads to ask."""
     monkeypatch.setattr("ltcl.device.discovery._opened", {})
     together = threading.Barrier(8)
 
@@ -74,7 +75,8 @@ def test_threads_open_one_device(device, monkeypatch):
         return ltcl.open_device(device.description.index)
 
     with ThreadPoolExecutor(8) as pool:
-        assert len({id(opened) for opened in pool.map(work, range(8))}) == 1
+        opened = list(pool.map(work, range(8)))
+    assert all(each is opened[0] for each in opened)
 
 
 FORK = """
@@ -85,13 +87,21 @@ from ltcl.device import vectors
 device = ltcl.open_device(sys.argv[1])
 x = vectors.fill(device.empty(1000), 1.0)
 kernel = device.kernel("vector", "vector_fill")
-launch = kernel.bind(1000, 64, 1000, 2.0, x)
+launch = kernel.bind(1000, 64, count=1000, value=2.0, out=x)
 S = ltcl.operators.Dense(device, np.eye(3))
 device.finish()
 uses = [
-    lambda: ltcl.open_device(sys.argv[1]), lambda: device.empty(3), lambda: device.finish(), lambda: x.get(),
-    lambda: x.set(np.ones(1000)), lambda: vectors.norm(x), launch, lambda: kernel(1, 1, 1, 1.0, x),
-    lambda: device.kernel("vector", "vector_dots"), lambda: S @ np.ones(3), lambda: x.copy(),
+    lambda: ltcl.open_device(sys.argv[1]),
+    lambda: device.empty(3),
+    lambda: device.finish(),
+    lambda: x.get(),
+    lambda: x.set(np.ones(1000)),
+    lambda: x.copy(),
+    lambda: vectors.norm(x),
+    launch,
+    lambda: kernel(1, 1, count=1, value=1.0, out=x),
+    lambda: device.kernel("vector", "vector_dots"),
+    lambda: S @ np.ones(3),
     lambda: ltcl.solve(S, np.ones(3), "cg"),
 ]
 child = os.fork()
@@ -123,7 +133,8 @@ def test_a_forked_process_is_refused_and_does_not_hang(device):
 
 def test_opening_a_device_leaves_the_environment_alone_and_reads_no_pickles(device):
     code = (
-        "import os, ltcl; before = dict(os.environ); ltcl.open_device(); assert dict(os.environ) == before;"
+        "import os, ltcl; before = dict(os.environ); ltcl.open_device();"
+        "assert dict(os.environ) == before;"
         "import pyopencl; assert pyopencl._PYOPENCL_NO_CACHE"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
@@ -171,9 +182,12 @@ def test_selection(select, device):
 )
 def test_selection_of_nothing_lists_what_there_is(select, kind):
     """A simulator is never taken unasked."""
-    devices, best = ([BIG, SIMULATOR], ".*4:1 Radeon") if select else ([SIMULATOR], "")
-    with pytest.raises(DeviceError, match=f"{select or ''}.*{kind}{best}.*0:0 Oclgrind Simulator"):
+    devices = [BIG, SIMULATOR] if select else [SIMULATOR]
+    with pytest.raises(DeviceError) as error:
         discovery.choose(devices, select)
+    assert kind in str(error.value)
+    for device in devices:
+        assert f"{device.index} {device.name}" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +228,8 @@ def test_the_environment_names_the_default(device, monkeypatch):
     monkeypatch.setenv("LTCL_DEVICE", "no such device")
     with pytest.raises(DeviceError, match="no such device"):
         ltcl.open_device()
-    assert ltcl.open_device(index) is device  # an argument overrides it
+    # An argument overrides it.
+    assert ltcl.open_device(index) is device
     with pytest.raises(InputTypeError, match="device is 0"):
         ltcl.open_device(0)  # pyright: ignore[reportArgumentType]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Kernels: their sources, compilation, typed launches, launches that are bound once, and OpenCL's errors."""
+"""Kernels: sources, compilation, launches with named arguments, bound launches, errors."""
 
 from __future__ import annotations
 
@@ -14,39 +14,74 @@ import pyopencl as cl
 import pytest
 from pyopencl import _cl
 
-from ltcl.device import kernels, vectors
+from ltcl.device import sources, vectors
 from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
+from ltcl.solvers import krylov_state
 
 TWINS = (Path(__file__).parents[1] / "reference.py").read_text(encoding="utf-8")
-FILES = sorted(path.stem for path in kernels.folder().glob("*.cl"))
+FILES = sorted(path.stem for path in sources.folder().glob("*.cl"))
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_every_kernel_has_a_twin_and_every_line_its_mark(name):
-    file, number, seen, text = "", 0, [], kernels.load(name)
+    text = sources.load(name)
+    file = ""
+    number = 0
+    seen = []
     for line in text.splitlines():
         mark = re.fullmatch(r'#line (\d+) "(.+)"', line)
         if mark:
-            number, file = int(mark[1]), mark[2]
+            number = int(mark[1])
+            file = mark[2]
             continue
-        assert (kernels.folder() / file).read_text().splitlines()[number - 1] == line
+        assert (sources.folder() / file).read_text().splitlines()[number - 1] == line
         seen.append((file, number))
         number += 1
-    assert len(set(seen)) == len(seen)  # each include comes once
+    # Each include comes once.
+    assert len(set(seen)) == len(seen)
     for kernel in re.findall(r"\bkernel\s+void\s+(\w+)", text):
         assert kernel.startswith(f"{name}_")
-        assert re.search(rf"^def {re.sub('_(group|sum)$', '', kernel)}", TWINS, re.MULTILINE), (
-            kernel
-        )
+        twin = re.sub("_(group|sum)$", "", kernel)
+        assert re.search(rf"^def {twin}", TWINS, re.MULTILINE), kernel
+
+
+HEADER = "common/lanes.h"
+# One value of each define of each file.
+DEFINES = {
+    "K": 2,
+    "STRIP": 2,
+    "WIDTH": 8,
+    "PLACE": "int",
+    "VALUES": 2,
+    "TAPS": 4,
+    "PAIRS": 1,
+    "LANES": 8,
+    "BLOCKS": 1,
+    "CHUNK": 2,
+    "WALKS": 2,
+    "CHANNELS": 2,
+    "LINKED": 1,
+    **krylov_state.DEFINES,
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_compiler_reads_the_files_as_they_are(device, name):
+    """Editors and offline compilers, too: headers have guards, and name each other by place."""
+    path = sources.folder() / f"{name}.cl"
+    text = "\n".join(f'#include "{header.as_posix()}"' for header in (path.parent / HEADER, path))
+    options = [f"-D{define}={value}" for define, value in DEFINES.items()]
+    program = cl.Program(device.context, text).build([*sources.OPTIONS, *options])
+    assert f"{name}_" in program.kernel_names
 
 
 @pytest.fixture
 def own_kernels(tmp_path, monkeypatch):
     """A folder of kernels in which a test writes its own."""
-    monkeypatch.setattr(kernels, "folder", lambda: tmp_path)
-    kernels.load.cache_clear()
+    monkeypatch.setattr(sources, "folder", lambda: tmp_path)
+    sources.load.cache_clear()
     yield tmp_path
-    kernels.load.cache_clear()
+    sources.load.cache_clear()
 
 
 def test_messages_name_file_line_and_defines(device, own_kernels):
@@ -59,7 +94,8 @@ def test_messages_name_file_line_and_defines(device, own_kernels):
     ) as error:
         device.kernel("own", "own_a", K=3, LANES=8)
     assert device.driver in str(error.value)
-    if device.kind != "simulator":  # Oclgrind blots the #line marks out
+    # Oclgrind removes the #line marks.
+    if device.kind != "simulator":
         assert re.search(r"part\.h\W+2\b", str(error.value))
 
 
@@ -76,24 +112,25 @@ def test_missing_and_wrong_defines_and_names_are_refused(device, file):
 
 def test_a_program_is_built_once(small_device, monkeypatch):
     small_device.kernel("vector", "vector_fill")
-    monkeypatch.setattr(kernels, "build", lambda *_: pytest.fail("built again"))
+    monkeypatch.setattr(sources, "build", lambda *_: pytest.fail("built again"))
     small_device.kernel("vector", "vector_axpby")
 
 
 @pytest.mark.parametrize("group", [1, 64])
 def test_items_are_rounded_up_to_whole_groups(device, group):
-    x, kernel = device.empty(1000), device.kernel("vector", "vector_fill")
+    x = device.empty(1000)
+    kernel = device.kernel("vector", "vector_fill")
     for count in (1, 63, 64, 65, 1000):
-        kernel(count, group, count, 2, vectors.fill(x, -1))
+        kernel(count, group, count=count, value=2, out=vectors.fill(x, -1))
         np.testing.assert_array_equal(x.get(), np.where(np.arange(1000) < count, 2, -1))
     before = device.launches.total()
-    kernel(0, group, 1000, 3, x)
-    kernel.bind((64, 0), (64, 1), 1000, 3, x)()
+    kernel(0, group, count=1000, value=3, out=x)
+    kernel.bind((64, 0), (64, 1), count=1000, value=3, out=x)()
     assert device.launches.total() == before
 
 
 def test_numbers_take_the_types_of_the_source(device, own_kernels):
-    """Which may stand in a macro."""
+    """Arguments may stand in a macro."""
     (own_kernels / "own.cl").write_text(
         "#define NUMBERS_ARGUMENTS int i, uint u, \\\n    ulong l, float f\n"
         "kernel void own_a(NUMBERS_ARGUMENTS, global float *out, local float *s)\n"
@@ -101,13 +138,14 @@ def test_numbers_take_the_types_of_the_source(device, own_kernels):
     )
     out = device.empty(4)
     kernel = device.kernel("own", "own_a")
+    launch = kernel.bind(1, 1, i=0, u=0, l=0, f=0, out=out, s=device.local(1))
     for number in (1, True, np.int64(1), np.uint8(1)):
         for real in (number, 1.0, np.float64(1)):
-            kernel(
-                1, 1, number, number, int(number) << 32, real, vectors.fill(out, 0), device.local(1)
-            )
+            vectors.fill(out, 0)
+            launch.set(i=number, u=number, l=int(number) << 32, f=real)
+            launch()
             assert out.get().tolist() == [1, 1, 1, 1]
-    kernel(1, 1, -1, 2**31, 2**63, -1e300, out, device.local(1))
+    kernel(1, 1, i=-1, u=2**31, l=2**63, f=-1e300, out=out, s=device.local(1))
     assert out.get().tolist() == [-1, 2**31, 2**31, -math.inf]
 
 
@@ -118,12 +156,15 @@ def test_groups_are_clamped_to_what_kernel_and_device_allow(device, size):
     assert 1 <= np.prod(group) <= device.max_group
     assert kernel.group(group) == group
     x = device.empty(5)
-    kernel(5 if isinstance(size, int) else (5, 1), size, 5, 0.5, x)
+    items = 5 if isinstance(size, int) else (5, 1)
+    kernel(items, size, count=5, value=0.5, out=x)
     assert x.get().tolist() == [0.5] * 5
 
 
 def test_a_bound_launch_keeps_its_arrays_and_runs_again_with_changed_arguments(device):
-    x, y, z = (vectors.fill(device.empty(1000), value) for value in (1, 10, 2))
+    x = vectors.fill(device.empty(1000), 1)
+    y = vectors.fill(device.empty(1000), 10)
+    z = vectors.fill(device.empty(1000), 2)
     kernel = device.kernel("vector", "vector_axpby")
     launch = kernel.bind(1000, 64, count=1000, a=2.0, x=z, b=1.0, y=y, out=y)
     # Another launch has arguments of its own.
@@ -132,7 +173,8 @@ def test_a_bound_launch_keeps_its_arrays_and_runs_again_with_changed_arguments(d
     del z
     gc.collect()
     for _ in range(10):
-        vectors.fill(device.empty(1000), -1)  # would take the blocks of arrays that are gone
+        # This would take the blocks of arrays that are gone.
+        vectors.fill(device.empty(1000), -1)
     launch()
     assert (y.get() == 14).all()
     launch.set(a=-1)
@@ -189,7 +231,8 @@ def test_threads_may_launch_one_kernel(device):
 
 
 def test_arguments_that_the_driver_refuses_are_errors_of_ltcl(device):
-    kernel, local = device.kernel("vector", "vector_fill"), device.local(1)
+    kernel = device.kernel("vector", "vector_fill")
+    local = device.local(1)
     for act in (
         lambda: kernel(1, 1, count=1, value=0.5, out=local),
         lambda: kernel.bind(1, 1, count=1, value=0.5, out=device.empty(3)).set(out=local),

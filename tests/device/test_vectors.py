@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Arrays on the device, and what a solver does between two products, against NumPy in float64."""
+"""Arrays on the device, and arithmetic between two products against NumPy in float64."""
 
 from __future__ import annotations
 
@@ -28,12 +28,10 @@ def operands(device, shape, count=2) -> tuple[Any, ...]:
 def test_values_come_back_as_they_went(device, shape, dtype):
     values = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
     array = device.upload(values, dtype)
-    assert (array.shape, array.dtype, array.size, array.nbytes) == (
-        shape,
-        dtype,
-        values.size,
-        values.nbytes,
-    )
+    assert array.shape == shape
+    assert array.dtype == dtype
+    assert array.size == values.size
+    assert array.nbytes == values.nbytes
     assert array.columns == (1 if len(shape) == 1 else shape[1])
     for same in (array, array.copy(), array.like().copy_from(array), array.like().set(values)):
         assert same.get().dtype == dtype
@@ -65,12 +63,14 @@ def test_rows_are_copied_out_and_in(device, tail):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_elementwise_kernels_meet_their_twins(shaped, shape):
-    """Also where the result overwrites an operand."""
+    """The result may overwrite an operand."""
     x, y, X, Y = operands(shaped, shape)
-    d, out = gallery.vectors(shape[0], None, 3), shaped.empty(shape)
+    d = gallery.vectors(shape[0], None, 3)
+    out = shaped.empty(shape)
     fill = reference.vector_fill(x.size, 0.3).astype(np.float32)
     np.testing.assert_array_equal(vectors.fill(out, 0.3).get().ravel(), fill)
-    error = 2 * reference.gamma(2) * (np.abs(x) + np.abs(y))  # each product and the sum round once
+    # Each product and the sum round once.
+    error = 2 * reference.gamma(2) * (np.abs(x) + np.abs(y))
     assert vectors.axpby(0.75, X, -1.5, Y, out) is out
     total = out.get()
     close(total, reference.vector_axpby(0.75, x, -1.5, y), error)
@@ -90,7 +90,8 @@ def test_dot_and_norm_stay_accurate_as_vectors_grow(shaped, rows, k):
     products = vectors.dot(X, Y)
     assert products.dtype == np.float64
     close(products, reference.vector_dot(x, y), reference.dot_error(x, y))
-    np.testing.assert_array_equal(vectors.dot(X, Y), products)  # to the bit, each time
+    # The same bits each time.
+    np.testing.assert_array_equal(vectors.dot(X, Y), products)
     # Half the relative error of the square, and the square is a sum without cancellation.
     squares = reference.vector_dot(x, x)
     for norm in (vectors.norm(X), vectors.norms(Y, X)[1]):
@@ -102,11 +103,10 @@ def test_dot_and_norm_stay_accurate_as_vectors_grow(shaped, rows, k):
 
 
 def test_sums_lose_no_tail_and_hide_no_nan(shaped):
-    """In sequence, 2^24 + 1 = 2^24 in float32: sums of ones would stop growing there."""
-    ones = vectors.fill(shaped.empty(1 << 20), 5.0)
-    assert vectors.dot(ones, ones).tolist() == [
-        25.0 * (1 << 20)
-    ]  # partial sums are small integers times 25
+    """Sums of ones in sequence would stop growing: 2^24 + 1 = 2^24 in float32."""
+    fives = vectors.fill(shaped.empty(1 << 20), 5.0)
+    # Partial sums are small integers times 25.
+    assert vectors.dot(fives, fives).tolist() == [25.0 * (1 << 20)]
     norms = vectors.norm(shaped.upload([[1.0, 1.0], [np.nan, np.inf]]))
     assert np.isnan(norms[0])
     assert np.isinf(norms[1])
@@ -118,7 +118,8 @@ def test_sums_lose_no_tail_and_hide_no_nan(shaped):
 @pytest.mark.parametrize("shape", [*SHAPES, (20_001, 3), (5, 2000)])
 def test_a_step_moves_all_vectors_and_adds_up_the_squares(shaped, shape):
     p, x, r, d, P, X, R, D = operands(shaped, shape, 4)
-    groups, k = vectors.step_groups(X), X.columns
+    groups = vectors.step_groups(X)
+    k = X.columns
     partials = vectors.fill(shaped.empty((3, groups, k)), np.nan)
     squares = []
     for slot, (keep, gain) in enumerate([(0.5, 0.25), (0.0, 1.5)]):
@@ -139,14 +140,18 @@ def test_a_step_moves_all_vectors_and_adds_up_the_squares(shaped, shape):
 )
 def test_partial_sums_meet_their_twin(shaped, slots, groups, k):
     values = gallery.vectors(slots * groups, k).reshape(slots, groups, k)
-    partials, out = shaped.upload(values), shaped.empty((slots, k))
+    partials = shaped.upload(values)
+    out = shaped.empty((slots, k))
     vectors.queue_sum_partials(partials, slots, out)
     error = reference.gamma(groups) * reference.vector_sums(np.abs(values))
     close(out.get(), reference.vector_sums(values), error)
 
 
 def test_refusals(device):
-    x, y, z, huge = device.empty(3), device.empty((3, 1)), device.empty((3, 2)), (1 << 30, 1 << 30)
+    x = device.empty(3)
+    y = device.empty((3, 1))
+    z = device.empty((3, 2))
+    huge = (1 << 30, 1 << 30)
     refused(
         InputError,
         (r"\(3,\), \(3, 1\)", vectors.axpby, 1, x, 1, y, x),

@@ -11,7 +11,7 @@ import pytest
 from ltcl.errors import InputError
 from ltcl.operators import Compressed, Dense, IdentityPlus, ScaledColumns, compressed
 from tests import gallery
-from tests.bases import Given, rotation, two_sided
+from tests.bases import MatrixBasis, rotation, two_sided
 from tests.operators import helpers
 
 N = 33
@@ -37,7 +37,7 @@ def test_errors_of_compressed_operators_are_handed_on(device):
     assert A.T.error == 0.25
     assert IdentityPlus(A).error == 0.25
     assert ScaledColumns(A, np.ones(5), 1.0).error == 0.25
-    assert Compressed(A, Given(device, rotation(5)), None).error == 0.25
+    assert Compressed(A, MatrixBasis(device, rotation(5)), None).error == 0.25
     assert ScaledColumns(A, masked).error == 1.0
     assert IdentityPlus(Compressed(R, None, None, 0.125)).error == 0.125
     S = IdentityPlus(A, solution_error=0.01)
@@ -70,13 +70,13 @@ def test_a_diagonal_of_many_pixels_has_to_be_given(device, monkeypatch):
 
 
 def test_sides_and_bytes_of_compressed_operators(device):
-    W = Given(device, rotation(N))
-    V = Given(device, rotation(N, 1))
+    W = MatrixBasis(device, rotation(N))
+    V = MatrixBasis(device, rotation(N, 1))
     core = Dense(device, np.eye(N))
     assert Compressed(core, W, W).two_sided
     for sides in ((None, None), (W, None), (None, W), (W, V)):
         assert not Compressed(core, *sides).two_sided
-    tall = Given(device, gallery.signed(N + 12, N, 2) / 4)
+    tall = MatrixBasis(device, gallery.signed(N + 12, N, 2) / 4)
     assert not Compressed(Dense(device, np.eye(N + 12)), tall, tall).two_sided
     assert Compressed(core, W, W).nbytes == core.nbytes + W.nbytes
     assert Compressed(core, W, V).nbytes == core.nbytes + 2 * W.nbytes

@@ -28,7 +28,7 @@ from ltcl.operators import (
 from ltcl.operators.relaxation import relaxation
 from ltcl.operators.walks import rows_of_R, tables
 from tests import gallery
-from tests.bases import Given, rotation
+from tests.bases import MatrixBasis, rotation
 from tests.operators import helpers
 
 N = 33
@@ -38,9 +38,9 @@ NO_WAVELETS = ("bior2.2", "rbio1.3", "dmey", "db99", "morl", "", None, 2)
 
 
 def test_what_is_no_operator_is_refused(device, small_device):
-    W = Given(device, rotation(N))
-    tall = Given(device, gallery.signed(N + 1, N))
-    skew = Given(device, gallery.signed(N, N))
+    W = MatrixBasis(device, rotation(N))
+    tall = MatrixBasis(device, gallery.signed(N + 1, N))
+    skew = MatrixBasis(device, gallery.signed(N, N))
     core = Dense(device, np.eye(N))
     dropped = Dense(device, np.eye(N))
     dropped.error = 0.1
@@ -83,7 +83,7 @@ def test_what_is_no_operator_is_refused(device, small_device):
         ("d has 1 NaN", ScaledColumns, b, np.array([1.0, np.nan])),
         (rf"out .*{N + 1} .* {N}", Compressed, core, tall, W),
         (rf"into .*{N + 1} ", Compressed, core, None, tall),
-        ("into .*device", Compressed, core, W, Given(small_device, np.eye(N))),
+        ("into .*device", Compressed, core, W, MatrixBasis(small_device, np.eye(N))),
         ("error is -1.0", Compressed, core, W, W, -1.0),
         ("error is nan", Compressed, core, W, W, np.nan),
         # An error of coefficients is none of pixels.

@@ -18,8 +18,10 @@ from tests import reference
 
 def parallel(n: int, gap: int) -> np.ndarray:
     """F of unit squares x and y apart in planes `gap` apart, (n, n): differences of the primitive of C-13."""
-    x, y = np.arange(-1.0, n + 1)[:, None], np.arange(-1.0, n + 1)
-    across_x, across_y = np.hypot(x, gap), np.hypot(y, gap)
+    x = np.arange(-1.0, n + 1)[:, None]
+    y = np.arange(-1.0, n + 1)
+    across_x = np.hypot(x, gap)
+    across_y = np.hypot(y, gap)
     arcs = y * across_x * np.arctan2(y, across_x) + x * across_y * np.arctan2(x, across_y)
     primitive = (arcs - gap**2 / 2 * np.log(x**2 + y**2 + gap**2)) / (2 * np.pi)
     return np.diff(np.diff(primitive, 2, axis=0), 2, axis=1)
@@ -27,7 +29,9 @@ def parallel(n: int, gap: int) -> np.ndarray:
 
 def perpendicular(n: int) -> np.ndarray:
     """F of unit squares d apart along a seam, p and q away from it, (n, n, n): C-15, exact below 8."""
-    d, p, q = np.arange(-1.0, n + 1)[:, None, None], np.arange(n + 1.0)[:, None], np.arange(n + 1.0)
+    d = np.arange(-1.0, n + 1)[:, None, None]
+    p = np.arange(n + 1.0)[:, None]
+    q = np.arange(n + 1.0)
     across = np.hypot(p, q)
     log = scipy.special.xlogy(across**2 - d**2, across**2 + d**2) / 4
     primitive = (d * across * np.arctan2(d, across) - log) / (2 * np.pi)
@@ -36,7 +40,8 @@ def perpendicular(n: int) -> np.ndarray:
 
 def slope(angle: float, length: float = 1.0, width: float = 1.0) -> Wall:
     """A wall that rises from the edge of the floor along y, `angle` degrees from the floor."""
-    x, z = length * float(np.cos(np.radians(angle))), length * float(np.sin(np.radians(angle)))
+    x = length * float(np.cos(np.radians(angle)))
+    z = length * float(np.sin(np.radians(angle)))
     return Wall("slope", corner=(x, 0.0, z), right=(0, width, 0), down=(-x, 0.0, -z))
 
 

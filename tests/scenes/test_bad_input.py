@@ -17,10 +17,12 @@ from ltcl.scenes.camera import SceneCamera, frame
 from ltcl.scenes.scene import transport_matrix
 from ltcl.scenes.walls import Wall, refuse_crossing
 
-FLOOR, SCREEN = WALLS[2], Wall("screen", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1))
+FLOOR = WALLS[2]
+SCREEN = Wall("screen", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1))
 CORNER = box(5, sides=3)
 SHADED = replace(dihedral(2), blocks=(Block(corner=(0.4, 0.4, 0.4), size=(0.1, 0.1, 0.1)),))
-PATCHES, BLOCK = cut(WALLS, 1), [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
+PATCHES = cut(WALLS, 1)
+BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
 UNEVEN = np.zeros((75, 75))
 UNEVEN[74, 0] = 0.1
 ONE = np.array([[0.0, 1.0 + 5e-7], [1.0 + 5e-7, 0.0]])  # as far above 1 as a scene lets pass

@@ -13,18 +13,23 @@ from ltcl.scenes.walls import Vector, Wall
 from tests.scenes.closed_forms import closed_room, parallel, perpendicular, sampled, slope
 
 FLOOR = WALLS[2]
-X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X = (1.0, 0.0, 0.0)
+Y = (0.0, 1.0, 0.0)
+Z = (0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
 def test_faces_of_the_cube_meet_the_closed_forms(n: int) -> None:
     """All pairs of all walls, which touch along an edge, at a corner, or lie apart."""
-    patches, meeting, facing = cut(WALLS, n), perpendicular(n), parallel(n, n)
+    patches = cut(WALLS, n)
+    meeting = perpendicular(n)
+    facing = parallel(n, n)
     F = form_factors(WALLS, n)
     apart = np.abs(patches.centre[:, None] - patches.centre) * n
     across = (np.abs(patches.normal[:, None]) + np.abs(patches.normal)) > 0.5
     for i, j in np.random.default_rng(0).integers(len(F), size=(300, 2)):
-        along, away = apart[i, j][~across[i, j]], apart[i, j][across[i, j]]
+        along = apart[i, j][~across[i, j]]
+        away = apart[i, j][across[i, j]]
         if len(along) == 2:
             expected = facing[tuple(np.round(along).astype(int))] if away[0] > 0.5 else 0.0
         else:
@@ -51,7 +56,8 @@ NARROW = [X, (float(np.cos(np.radians(8))), float(np.sin(np.radians(8))), 0.0), 
 @pytest.mark.parametrize("n", [1, 4, 9])
 def test_closed_rooms_lose_no_light(edges: list[Vector], n: int) -> None:
     walls = closed_room(*edges)
-    F, area = form_factors(walls, n), cut(walls, n).area
+    F = form_factors(walls, n)
+    area = cut(walls, n).area
     np.testing.assert_allclose(F.sum(axis=1), 1, rtol=1e-7 if edges[-1] != Z else 1e-9)
     assert F.min() >= 0
     np.testing.assert_allclose(area[:, None] * F, (area[:, None] * F).T, rtol=1e-14)

@@ -54,8 +54,10 @@ def test_products_meet_their_twin(shaped, name):
     G = reference.form_factor_entries(
         A._geometry.get()[:, : len(patches)], A._blocks.get()[: len(blocks or ())]
     )
-    kernel, near = albedo[:, None] * G * A._area.get().astype(np.float64), A._near.to_dense()
-    matrix, dense = kernel + near, A.to_dense()
+    kernel = albedo[:, None] * G * A._area.get().astype(np.float64)
+    near = A._near.to_dense()
+    matrix = kernel + near
+    dense = A.to_dense()
     # An entry is some 30 roundings; corrections cancel kernel values, which then count with their
     # size.
     size = np.abs(kernel) + np.abs(near) + np.abs(matrix)
@@ -64,7 +66,8 @@ def test_products_meet_their_twin(shaped, name):
         assert np.count_nonzero(off) <= 0.01 * off.size
         matrix = dense
     for k in helpers.COLUMNS if name == "53 tiles" else (None, 5):
-        x, y = gallery.vectors(len(patches), k), gallery.vectors(len(patches), k, 2)
+        x = gallery.vectors(len(patches), k)
+        y = gallery.vectors(len(patches), k, 2)
         for apply, twin, bound in ((A.apply, matrix, size), (A.apply_transpose, matrix.T, size.T)):
             out = apply(shaped.upload(x), None, scale=-0.75, add=shaped.upload(y)).get()
             error = 32 * reference.product_error(bound, x, -0.75, y)
@@ -85,8 +88,10 @@ def smooth(patches: Patches) -> np.ndarray:
 )
 def test_products_are_those_of_the_exact_matrix(device, walls, n):
     """F x within 1e-4 of the largest value for smooth x; F within `error` where areas are equal."""
-    patches, F = cut(walls, n), form_factors(walls, n)
-    A, x = FormFactor(patches, device=device), smooth(cut(walls, n))
+    patches = cut(walls, n)
+    F = form_factors(walls, n)
+    A = FormFactor(patches, device=device)
+    x = smooth(cut(walls, n))
     np.testing.assert_array_less(np.abs(A @ x - F @ x).max(axis=0), 1e-4 * (F @ x).max(axis=0))
     if np.ptp(patches.area) < 1e-9 * patches.area.max():
         assert np.linalg.norm(A.to_dense() - F, 2) <= A.error == 1e-4
@@ -121,8 +126,10 @@ def test_a_scene_gives_its_operators(device, block):
 
 def test_launches_in_slabs_give_the_same(device, monkeypatch):
     patches = cut(WALLS, 3)
-    A, x = FormFactor(patches, 0.5, device=device), device.upload(gallery.vectors(54, 5))
-    whole, seen = A.apply(x).get(), visibility(patches, BLOCK, device)
+    A = FormFactor(patches, 0.5, device=device)
+    x = device.upload(gallery.vectors(54, 5))
+    whole = A.apply(x).get()
+    seen = visibility(patches, BLOCK, device)
     monkeypatch.setattr("ltcl.scenes.form_factor.PAIRS_PER_LAUNCH", 7 * 56)
     monkeypatch.setattr(sys.modules[Rays.__module__], "TESTS_PER_LAUNCH", 54 * 16 * 7)
     helpers.same_rows(

@@ -16,7 +16,8 @@ from ltcl.scenes.gloss.beams import exchange
 from ltcl.scenes.walls import Wall
 from ltcl.transport.diagnostics import reciprocity_defect
 
-PROJECTOR, CAMERA = (1.5, 0.9, 0.8), (0.8, 1.6, 0.4)
+PROJECTOR = (1.5, 0.9, 0.8)
+CAMERA = (0.8, 1.6, 0.4)
 
 
 def corner(n: int = 3, gloss: Any = 0.6, exponent: Any = 10, **options: Any) -> GlossyScene:
@@ -39,14 +40,13 @@ def test_bins_hold_equal_projected_solid_angles(k: int) -> None:
 
 @pytest.mark.parametrize(("k", "exponent"), [(2, 1), (4, 20), (8, 0.5), (8, 512)])
 def test_lobes_return_all_light_and_are_reciprocal(k: int, exponent: float) -> None:
-    shine, vectors = (
-        brdf.lobe(exponent, k),
-        brdf.from_square(np.random.default_rng(0).random((40, 2))),
-    )
+    shine = brdf.lobe(exponent, k)
+    vectors = brdf.from_square(np.random.default_rng(0).random((40, 2)))
     for means in (shine.between.mean(axis=1), shine.towards(vectors).mean(axis=1)):
         assert means == pytest.approx(1, rel=1e-12)
     assert ((shine.between == shine.between.T) & (shine.between > 0)).all()
-    there, back = shine.direct(vectors, vectors[::-1]), shine.direct(vectors[::-1], vectors)
+    there = shine.direct(vectors, vectors[::-1])
+    back = shine.direct(vectors[::-1], vectors)
     assert there == pytest.approx(back, rel=1e-12)
 
 
@@ -58,7 +58,8 @@ UNEQUAL = (
 
 @pytest.mark.parametrize("walls", [WALLS, UNEQUAL])
 def test_beams_exchange_the_same_light_both_ways(walls: tuple[Wall, ...]) -> None:
-    G, area = exchange(walls, 3, directions=16, rays=64), cut(walls, 3).area
+    G = exchange(walls, 3, directions=16, rays=64)
+    area = cut(walls, 3).area
     E = np.repeat(area, 16)[:, None] * G.toarray()
     np.testing.assert_allclose(E, E.T, atol=1e-6 * E.max())
     assert G.sum(axis=1).max() <= 1 + 1e-12
@@ -73,7 +74,7 @@ def test_beams_exchange_the_same_light_both_ways(walls: tuple[Wall, ...]) -> Non
 
 @pytest.mark.parametrize("gloss", [0.0, 0.7, [0, 1, 0.2, 0, 0.5, 0.9]])
 def test_white_furnace(gloss: Any) -> None:
-    """In a closed room, light that is 1 everywhere and to all sides is `albedo` after a bounce."""
+    """Light that is 1 everywhere and to all sides of a closed room is `albedo` after a bounce."""
     place: dict[str, Any] = {"projector": (0.5, 0.5, 0.5), "camera": (0.3, 0.6, 0.4)}
     room = glossy(box(2), 2, 0.8, gloss, 30, **place, directions=16, rays=16)
     assert room.A @ np.ones(room.A.shape[1]) == pytest.approx(0.8, rel=1e-12)
@@ -83,13 +84,15 @@ def test_white_furnace(gloss: Any) -> None:
 
 def test_transport_solves_equation_28_and_bounces_equation_29() -> None:
     scene = corner(albedo=0.6)
-    A, pattern = scene.A @ np.eye(scene.A.shape[0]), np.random.default_rng(1).random(scene.grid)
+    A = scene.A @ np.eye(scene.A.shape[0])
+    pattern = np.random.default_rng(1).random(scene.grid)
     expected = scene.P @ np.linalg.solve(np.eye(len(A)) - A, scene.K @ scene.Q.toarray())
     (T,) = scene.matrices()
     np.testing.assert_allclose(T, expected, atol=2e-8)
     direct = (scene.P @ scene.K @ scene.Q).toarray()
     np.testing.assert_allclose(direct, np.diag(scene.first_bounce), atol=1e-15)
-    bounces, light = scene.bounces(pattern, 40), scene.K @ (scene.Q @ pattern.ravel())
+    bounces = scene.bounces(pattern, 40)
+    light = scene.K @ (scene.Q @ pattern.ravel())
     assert bounces.sum(axis=0).ravel() == pytest.approx(T @ pattern.ravel(), rel=1e-6)
     for bounce in bounces[:4]:
         assert bounce.ravel() == pytest.approx(scene.P @ light, rel=1e-6)
@@ -110,12 +113,12 @@ def first_bounce_by_integration(gloss: float, exponent: float) -> float:
     """Light from left to right wall of `dihedral(1)` to the camera, by rays in closed form, without bins."""
     shine = brdf.lobe(exponent, 16)
     u, v, a, b = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(12).T + 2.0**-13
-    radius, angle = np.sqrt(a), 2 * np.pi * b
-    x, y, z = (
-        radius * np.cos(angle),
-        radius * np.sin(angle),
-        np.sqrt(1 - a),
-    )  # z along +x, off the right wall
+    radius = np.sqrt(a)
+    angle = 2 * np.pi * b
+    # z along +x, off the right wall
+    x = radius * np.cos(angle)
+    y = radius * np.sin(angle)
+    z = np.sqrt(1 - a)
     distance = np.where(x < 0, -u / x, np.inf)  # to y = 0; x here is along +y of the room
     reached = distance * z, v + distance * y
     room = np.column_stack([z, x, y])[(reached[0] < 1) & (reached[1] > 0) & (reached[1] < 1)]
@@ -124,10 +127,8 @@ def first_bounce_by_integration(gloss: float, exponent: float) -> float:
         normal: tuple[int, int, int], place: Any, centre: Any, other: np.ndarray
     ) -> np.ndarray:
         # Any frame does for an isotropic lobe.
-        axes, away = (
-            np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1),
-            place - centre,
-        )
+        axes = np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1)
+        away = place - centre
         towards = np.broadcast_to(away / np.linalg.norm(away), room.shape)
         return 1 - gloss + gloss * shine.direct(towards @ axes, other @ axes)
 
@@ -137,7 +138,8 @@ def first_bounce_by_integration(gloss: float, exponent: float) -> float:
 
 
 def test_first_bounce_approaches_an_integral_without_bins() -> None:
-    expected, errors = first_bounce_by_integration(0.8, 8), []
+    expected = first_bounce_by_integration(0.8, 8)
+    errors = []
     for directions in (4, 16, 64):
         scene = corner(1, 0.8, 8, albedo=0.5, directions=directions, rays=16384 // directions)
         errors.append(abs(scene.bounces(np.array([[1, 0]]), 1)[1, 0, 1] / 0.25 / expected - 1))

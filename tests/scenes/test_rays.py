@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What rays meet first, and what a viewer, a projector or a camera sees of walls."""
+"""First hits of rays; the view of walls from a viewer, a projector or a camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ EYE = SceneCamera(eye=(0.5, 0, 0.5), target=(0.5, 1, 0.5))
 
 
 def test_blocks_stop_rays_as_the_twin_says() -> None:
-    block, rng = Block((0.2, 0.3, 0.1), (0.4, 0.3, 0.5)), np.random.default_rng(1)
+    block = Block((0.2, 0.3, 0.1), (0.4, 0.3, 0.5))
+    rng = np.random.default_rng(1)
     boxes = np.array([(block.low, block.high)])
     start, end = rng.random((2, 3000, 3))
     middle_and_half = np.concatenate([boxes.mean(axis=1), np.array([block.size]) / 2], axis=1)
@@ -31,16 +32,15 @@ def test_blocks_stop_rays_as_the_twin_says() -> None:
     hits = cast(block.faces(), start[twin], (end - start)[twin], boxes)
     outside = ((start < block.low) | (start > block.high)).any(axis=1)[twin]
     assert (hits.wall[outside] >= 0).all()
-    places, aims = (
-        [(0.6, 0.4, 0.3)] * 2 + [(0, 0, 0.6)],
-        [(1, 0.9, 0.9), (0.6, 0.9, 0.3), (1, 1, 0.6)],
-    )
+    places = [(0.6, 0.4, 0.3)] * 2 + [(0, 0, 0.6)]
+    aims = [(1, 0.9, 0.9), (0.6, 0.9, 0.3), (1, 1, 0.6)]
     assert clear((), np.array(places, float), np.array(aims), boxes).all()
     assert not clear((), np.array([[0.6, 0.4, 0.3]]), np.array([0.0, 0.4, 0.3]), boxes).any()
 
 
 def test_sight_is_in_the_frame_of_each_patch_and_keeps_to_shadows() -> None:
-    patches, place = cut(WALLS, 2), np.array([0.3, 0.6, 0.4])
+    patches = cut(WALLS, 2)
+    place = np.array([0.3, 0.6, 0.4])
     seen = sight("camera", place, WALLS, patches)
     assert (seen.share == 1).all()
     away = place - patches.centre
@@ -79,10 +79,8 @@ def test_a_pinhole_shows_a_screen_as_it_is() -> None:
 @pytest.mark.parametrize("size", [61, 200])
 def test_reading_undoes_drawing_of_smooth_pictures(size: int) -> None:
     """Also seen at an angle and for any rounding of the image's height; negative values pass."""
-    oblique, (y, x) = (
-        SceneCamera(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5)),
-        np.mgrid[:16, :16] / 16,
-    )
+    oblique = SceneCamera(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5))
+    y, x = np.mgrid[:16, :16] / 16
     picture = np.stack([np.sin(3 * x) - 0.5, x * y, 1 - y], axis=-1).astype(np.float32)
     seen = read(
         oblique, [SCREEN], draw(oblique, [SCREEN], picture, size, supersample=4), grid=(16, 16)
@@ -95,7 +93,9 @@ def test_a_block_hides_what_is_behind_it_and_seams_show_no_cracks(device) -> Non
         10, sides=3, occluder=Block((0.3, 0.35, 0), (0.35, 0.3, 0.5), albedo=0.6), device=device
     )
     picture = scene.sample(np.ones((300, 300)))
-    floor, top, left = picture[:, 20:30], picture[:, -10:], picture[:, 40:50]
+    floor = picture[:, 20:30]
+    top = picture[:, -10:]
+    left = picture[:, 40:50]
     assert not floor[4:6, 4:6].any()  # under the block
     assert not left.any()  # its face -x, seen from behind
     assert (floor[9], top) == (pytest.approx(1), pytest.approx(1))

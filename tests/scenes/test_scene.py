@@ -52,7 +52,8 @@ def test_transport_solves_equation_4_and_hands_everything_on(corner: Scene) -> N
 def test_transport_of_unequal_patches(size: int) -> None:
     """Reciprocal form factors with row sums below one, albedos, some 0, and areas."""
     rng = np.random.default_rng(5)
-    area, shared = rng.uniform(0.5, 2.0, size), rng.random((size, size))
+    area = rng.uniform(0.5, 2.0, size)
+    shared = rng.random((size, size))
     F = (np.triu(shared, 1) + np.triu(shared, 1).T) / area[:, None]
     F *= 0.95 / max(F.sum(axis=1).max(), 1e-300)
     albedo = rng.uniform(0, 0.99, size)
@@ -78,7 +79,9 @@ def test_view_shows_each_wall_where_it_stands(corner: Scene) -> None:
 def test_a_lamp_follows_cosine_inverse_square_and_the_shadow_of_a_block() -> None:
     """A thin plate at half the lamp's height: its shadow on the floor is twice as large, and straight."""
     plate = Block(corner=(0.4, 0.4, 0.5), size=(0.2, 0.2, 1e-6))
-    lamp, n, room = (0.5, 0.5, 1.0), 20, box(20, sides=3)
+    lamp = (0.5, 0.5, 1.0)
+    n = 20
+    room = box(20, sides=3)
     shaded = replace(room, blocks=(plate,))
     floor, dim = (scene.irradiance(lamp)[:, 2 * n :] for scene in (room, shaded))
     x = np.abs((np.arange(n) + 0.5) / n - 0.5)
@@ -90,10 +93,12 @@ def test_a_lamp_follows_cosine_inverse_square_and_the_shadow_of_a_block() -> Non
 
 
 def test_patches_lie_in_the_order_of_the_picture() -> None:
-    n, patches = 3, cut(WALLS, 3)
+    n = 3
+    patches = cut(WALLS, 3)
     assert patches.area.sum() == pytest.approx(6)
     for r, w, c in [(0, 0, 0), (2, 1, 0), (1, 5, 2)]:
-        wall, number = WALLS[w], r * len(WALLS) * n + w * n + c
+        wall = WALLS[w]
+        number = r * len(WALLS) * n + w * n + c
         right, down = np.array([wall.right, wall.down]) / n
         np.testing.assert_allclose(
             patches.centre[number], wall.corner + (c + 0.5) * right + (r + 0.5) * down
@@ -106,7 +111,8 @@ def test_patches_lie_in_the_order_of_the_picture() -> None:
 
 def test_faces_of_a_block_look_outwards_and_close_it() -> None:
     block = Block(corner=(0.2, 0.3, 0.1), size=(0.4, 0.3, 0.5))
-    middle, flux = (block.low + block.high) / 2, 0.0
+    middle = (block.low + block.high) / 2
+    flux = 0.0
     for face in block.faces():
         outwards = face.outline.mean(axis=0) - middle
         np.testing.assert_allclose(np.cross(outwards, face.normal), 0, atol=1e-15)
@@ -139,7 +145,8 @@ def test_albedo_is_spread_over_walls_and_colours(albedo: Any, expected: Any) -> 
 
 def test_picture_has_saturated_blue_and_orange_white_and_black() -> None:
     picture = landscape(120, 192)
-    r, b = picture[..., 0], picture[..., 2]
+    r = picture[..., 0]
+    b = picture[..., 2]
     vivid = (b > 2 * r) & (b > 0.15), (r > 2 * b) & (r > 0.3)
     for there in (*vivid, picture.min(-1) > 0.5, picture.max(-1) < 0.02):
         assert there.mean() > 0.01
@@ -147,7 +154,8 @@ def test_picture_has_saturated_blue_and_orange_white_and_black() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 300), (200, 1), (640, 640), (320, 1024)])
 def test_other_shapes_are_cut_around_the_sun(shape: tuple[int, int]) -> None:
-    picture, whole = landscape(*shape), landscape(640, 1024)
+    picture = landscape(*shape)
+    whole = landscape(640, 1024)
     assert (picture.shape, picture.dtype) == ((*shape, 3), np.float32)
     assert 0 <= picture.min() <= picture.max() <= 1
     if shape == (640, 640):  # 0.64 of the rest is to the left
@@ -182,7 +190,8 @@ def test_closed_box_of_uniform_albedo_reaches_the_bound_of_equation_14(albedo: f
 
 
 def test_bounces_of_a_dihedral_alternate() -> None:
-    n, scene = 6, dihedral(6, albedo=0.9)
+    n = 6
+    scene = dihedral(6, albedo=0.9)
     light = np.zeros((n, 2 * n))
     light[2, 1] = 1
     for bounce in range(1, 5):
@@ -251,11 +260,13 @@ SCENES = [
 def test_a_wrong_grid_is_found(scene, tmp_path, caplog):
     """Half and double the width, rows as columns, all in a row; with texture or noise the right one fits."""
     transport = scene.transport()
-    (h, w), T = transport.grid, transport.to_numpy()
+    h, w = transport.grid
+    T = transport.to_numpy()
     for width in {w // 2, 2 * w, h, h * w} - {w}:
         if h * w % width == 0:
             assert other_grid(T, (h * w // width, width)) == (h, w), width
-    texture, noise = random.uniform(0.1, 1.0, (h * w, 1)), random.normal(size=T.shape)
+    texture = random.uniform(0.1, 1.0, (h * w, 1))
+    noise = random.normal(size=T.shape)
     for right in (T, scipy.sparse.csr_array(T), texture * T, T + 0.1 * T.mean() * noise):
         assert other_grid(right, (h, w)) is None
     np.save(tmp_path / "T.npy", T)
@@ -269,7 +280,8 @@ def test_a_wrong_grid_is_found(scene, tmp_path, caplog):
 
 def test_to_numpy_is_T(tmp_path):
     scene = scenes.dihedral(4).transport()
-    T, grid = scene.to_numpy(), scene.grid
+    T = scene.to_numpy()
+    grid = scene.grid
     three = [T, 0.5 * T, 0.2 * T]
     ltcl.save(tmp_path / "T.zarr", ltcl.Transport(T, grid))
     for built, dense in (

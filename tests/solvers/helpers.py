@@ -18,7 +18,7 @@ from ltcl.errors import ConvergenceError, InputError
 from ltcl.operators import CSR, Compressed, IdentityPlus
 from ltcl.solvers import METHODS as ALL
 from ltcl.solvers import Solution, Status
-from tests.bases import Given, rotation, stands_for, two_sided
+from tests.bases import MatrixBasis, rotation, stands_for, two_sided
 from tests.problems import Scene, enclosure
 
 SAMPLED = ("monte_carlo", "hybrid")
@@ -95,7 +95,7 @@ def compressed(
 def subset(device: Device, sign: float = 1.0) -> tuple[IdentityPlus, np.ndarray]:
     """S = I + sign V^T C V with 19 of 43 coefficients, and its float64 matrix."""
     # Row sums are near the spectrum, as free bounds suppose.
-    V = Given(device, rotation(N, 6)[:SOME])
+    V = MatrixBasis(device, rotation(N, 6)[:SOME])
     scene = enclosure(SOME, 0.4)
     R = Compressed(CSR(device, scipy.sparse.csr_array(scene.R if sign > 0 else scene.A)), V, V)
     return IdentityPlus(R, sign), np.eye(N) + sign * stands_for(R)

@@ -10,7 +10,7 @@ import scipy.sparse
 import ltcl
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, SubsetBasis, Tiles, Wavelet
 from ltcl.solvers import Status
-from tests.bases import Given, rotation
+from tests.bases import MatrixBasis, rotation
 from tests.problems import lambertian, residual
 from tests.solvers.helpers import (
     CLOSED,
@@ -155,7 +155,7 @@ def test_a_start_and_units_are_kept(device):
 
 def on_the_device(device):
     """An S whose numbers are nowhere on the host: pixels, but in a basis."""
-    W = Given(device, np.eye(N))
+    W = MatrixBasis(device, np.eye(N))
     return IdentityPlus(Compressed(Dense(device, CLOSED.R), W, W))
 
 

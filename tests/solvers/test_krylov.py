@@ -12,11 +12,12 @@ import pytest
 import scipy.linalg
 
 import ltcl
-from ltcl.device import Array
+from ltcl.device import Array, vectors
 from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
 from ltcl.solvers.bounded import minimise
-from ltcl.solvers.column_reductions import STATE_ROWS, ColumnReductions, pair_codes
+from ltcl.solvers.column_reductions import ColumnReductions
+from ltcl.solvers.krylov_state import STATE_ROWS
 from tests import gallery, reference
 from tests.bases import rotation
 from tests.problems import enclosure, lambertian, residual
@@ -249,7 +250,7 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
         "vector_dots",
         across=2,
         first=0,
-        pairs=pair_codes("ab", "cc"),
+        pairs=vectors.dot_pairs("ab", "cc"),
         weighted=1,
         weights=weighing,
         a=W,

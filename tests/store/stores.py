@@ -47,7 +47,7 @@ def transport(rows: int = 10, columns: int = 12, channel: int = 0) -> scipy.spar
 
 
 def variance(T: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
-    """As many variances, each telling where it belongs."""
+    """Variances, as many, each telling where it belongs."""
     values = np.arange(1, T.nnz + 1, dtype=np.float32)
     return scipy.sparse.csr_array((values, T.indices, T.indptr), shape=T.shape)
 
@@ -93,7 +93,7 @@ def contents(path: Path) -> dict[str, str]:
 
 
 def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -> None:
-    """What an acquisition does: begin or resume, write what is missing, `report` every block, finish."""
+    """The steps of an acquisition: begin or resume, write what is missing, `report` every block, finish."""
     sizes: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5, "channels": 3}
     store = BlockStore.open(path) if path.exists() else make(path, **sizes)
     if not store.final:
@@ -125,7 +125,7 @@ def status_of(child: int) -> int:
 
 
 def at_line(number: int, act: Callable[[], None]) -> list[int]:
-    """From here on `act` at the line of ltcl's code with that number; returns the lines so far, growing."""
+    """Call `act` at the line of ltcl's code with that number; returns the lines so far, growing."""
     count = [0]
 
     def line(frame: FrameType, event: str, _: Any) -> Any:
@@ -143,7 +143,7 @@ def at_line(number: int, act: Callable[[], None]) -> list[int]:
 
 
 def interrupt() -> None:
-    """As Ctrl-C does."""
+    """End the process as Ctrl-C does."""
     raise KeyboardInterrupt
 
 

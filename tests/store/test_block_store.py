@@ -96,7 +96,8 @@ def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_plain_zarr_reads_it_and_checks_it(tmp_path: Path, dtype: str) -> None:
-    path, T = tmp_path / "T.zarr", transport(12, 12).astype(dtype) * 0.1
+    path = tmp_path / "T.zarr"
+    T = transport(12, 12).astype(dtype) * 0.1
     ltcl.save(path, ltcl.Transport(T, (3, 4), on_dark="mask"))
     assert {name for name, _ in zarr.open_group(path, mode="r").groups()} == {"channel_0", "extra"}
     group = zarr.open_group(path / "channel_0" / "block_000000.0", mode="r")
@@ -134,7 +135,8 @@ def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
     expected = []
     for channel in range(3):
         T = transport(12, 12, channel)
-        F, sigma = T.diagonal(), np.sqrt(variance(T).diagonal())
+        F = T.diagonal()
+        sigma = np.sqrt(variance(T).diagonal())
         expected.append(np.where(sigmas * sigma < F, F, 0.0))
     np.testing.assert_array_equal(store.extra("first_bounce"), expected)
     assert (np.count_nonzero(expected) < 33) == (sigmas > 0)
@@ -143,7 +145,8 @@ def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
 @pytest.mark.parametrize("final", [False, True])
 def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
     store = make(tmp_path / "T.zarr", provenance={"rig": "virtual", "seed": 3})
-    types, shapes = ("bool", "uint8", "int64", "float16", "float64"), ((), (0,), (3,), (2, 0, 4))
+    types = ("bool", "uint8", "int64", "float16", "float64")
+    shapes = ((), (0,), (3,), (2, 0, 4))
     arrays = {
         f"an.array-{dtype}-{len(shape)}": np.ones(shape, dtype)
         for dtype in types
@@ -210,11 +213,9 @@ def test_bad_blocks_are_refused(tmp_path: Path) -> None:
 
 
 def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
-    path, other, record = (
-        tmp_path / "T.zarr",
-        tmp_path / "other",
-        ltcl.store.StoreRecord((np.eye(6),), (2, 3)),
-    )
+    path = tmp_path / "T.zarr"
+    other = tmp_path / "other"
+    record = ltcl.store.StoreRecord((np.eye(6),), (2, 3))
     fill(make(path))
     with pytest.raises(FileError, match="overwrite=True"):
         make(path)

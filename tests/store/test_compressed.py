@@ -27,7 +27,8 @@ from ltcl.store import CompressedRecord, formats
 from tests.problems import enclosure, lambertian
 
 random = np.random.default_rng()
-GRID, N = (6, 7), 42
+GRID = (6, 7)
+N = 42
 F = np.linspace(0.3, 0.5, 3 * N).reshape(3, N)
 CORES: dict[str, Any] = {
     "csr": CSR,
@@ -81,7 +82,8 @@ TRANSPORTS: dict[str, Any] = {
 def test_the_same_transport_comes_back(
     device: Any, tmp_path: Path, extension: str, name: str
 ) -> None:
-    C, path = TRANSPORTS[name](device), tmp_path / f"C{extension}"
+    C = TRANSPORTS[name](device)
+    path = tmp_path / f"C{extension}"
     ltcl.save(path, C)
     if name == "dark":
         with pytest.raises(FileError, match="on_dark='mask'"):
@@ -148,7 +150,8 @@ ALIEN: list[tuple[str, str, Any, str]] = [
 @pytest.fixture(scope="module")
 def inverse() -> ltcl.Inverse:
     scenes = [lambertian(N, rho, seed=3) for rho in (0.2, 0.5, 0.8)]
-    matrices, first_bounce = [scene.T for scene in scenes], np.stack([scene.F for scene in scenes])
+    matrices = [scene.T for scene in scenes]
+    first_bounce = np.stack([scene.F for scene in scenes])
     T = ltcl.Transport(matrices, GRID, first_bounce=first_bounce, mixing=np.eye(3) + 0.1)
     return ltcl.invert(T, 1e-2, basis="db2")
 
@@ -207,7 +210,8 @@ def mutants(array: np.ndarray) -> Any:
         yield from (np.array("nothing"), np.array(3.0))
     elif array.size:
         yield np.full(array.shape, "a")
-        integers, reals = (-1, 0, 1, 35, 200, 1 << 31, 1 << 62), (-1.0, 0.0, 1e30, np.nan)
+        integers = (-1, 0, 1, 35, 200, 1 << 31, 1 << 62)
+        reals = (-1.0, 0.0, 1e30, np.nan)
         for value in integers if array.dtype.kind in "iu" else reals:
             wide = np.result_type(array.dtype, np.min_scalar_type(value))
             changed = array.astype(wide if array.dtype.kind in "iu" else array.dtype)
@@ -221,7 +225,8 @@ def test_whatever_arrays_say_there_is_a_transport_or_one_line(
     device: Any, tmp_path: Path, core: str
 ) -> None:
     """No array is believed: kernels never see an index that is beyond."""
-    path, refusals = tmp_path / "C.npz", []
+    path = tmp_path / "C.npz"
+    refusals = []
     ltcl.save(path, compressed(device, core=core))
     with np.load(path) as archive:
         arrays = dict(archive)

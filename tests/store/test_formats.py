@@ -112,7 +112,8 @@ def test_npy_keeps_the_matrix_alone(tmp_path: Path, T: Any, caplog: Any) -> None
 @pytest.mark.parametrize("make", [sparse, dense])
 @pytest.mark.parametrize("grids", [(None, None), ((3, 4), None), ((3, 4), (2, 6))])
 def test_mtx_keeps_one_matrix_and_the_grids(tmp_path: Path, make: Any, grids: Any) -> None:
-    path, T = tmp_path / "T.MTX", tuple(make(seed=k).astype(np.float64) for k in (1, 2, 3))
+    path = tmp_path / "T.MTX"
+    T = tuple(make(seed=k).astype(np.float64) for k in (1, 2, 3))
     formats.write(path, StoreRecord(T[:1], *grids))
     same(read(path), StoreRecord(T[:1], *grids))
     np.testing.assert_array_equal(
@@ -219,7 +220,7 @@ def test_any_variable_by_its_name(tmp_path: Path, extension: str) -> None:
     ],
 )
 def test_matlab_5(tmp_path: Path, LTM: Any, compressed: bool) -> None:
-    """With other variables, and in colour."""
+    """Files with other variables, and in colour."""
     others = {"name": "text", "cell": {"a": 1}, "grid": [3, 4], "z": 1j * np.eye(2)}
     scipy.io.savemat(tmp_path / "T.mat", {**others, "LTM": LTM}, do_compression=compressed)
     record = read(tmp_path / "T.mat")
@@ -229,15 +230,14 @@ def test_matlab_5(tmp_path: Path, LTM: Any, compressed: bool) -> None:
 
 
 def test_sparse_matrices_of_matlab_7_3(tmp_path: Path) -> None:
-    path, T = tmp_path / "T.mat", sparse().tocsc()
+    path = tmp_path / "T.mat"
+    T = sparse().tocsc()
     with h5py.File(path, "w", userblock_size=512) as file:
         group = file.create_group("LTM")
         group.attrs["MATLAB_sparse"] = np.uint64(12)
-        group["data"], group["ir"], group["jc"] = (
-            T.data,
-            T.indices.astype("u8"),
-            T.indptr.astype("u8"),
-        )
+        group["data"] = T.data
+        group["ir"] = T.indices.astype("u8")
+        group["jc"] = T.indptr.astype("u8")
     np.testing.assert_array_equal(as_dense(read(path).matrices[0]), T.toarray())
 
 
@@ -245,8 +245,9 @@ def test_sparse_matrices_of_matlab_7_3(tmp_path: Path) -> None:
 @pytest.mark.parametrize("make", [np.asarray, scipy.sparse.coo_array])
 @pytest.mark.parametrize("field", ["real", "integer"])
 def test_mtx_of_others(tmp_path: Path, make: Any, symmetry: str, field: str) -> None:
-    """With other line ends, and with and without the last."""
-    path, T = tmp_path / "T.mtx", np.arange(16.0).reshape(4, 4)
+    """Files with other line ends, and with and without the last."""
+    path = tmp_path / "T.mtx"
+    T = np.arange(16.0).reshape(4, 4)
     T = {"general": T, "symmetric": T + T.T, "skew-symmetric": T - T.T}[symmetry]
     scipy.io.mmwrite(
         path, make(T), symmetry=symmetry, field=field, comment="ltcl knows nothing of me"
@@ -335,7 +336,8 @@ def test_hostile_hdf5(tmp_path: Path, name: str, value: Any, text: str) -> None:
     ],
 )
 def test_sparse_groups_that_lie(tmp_path: Path, name: str, change: Any, text: str) -> None:
-    path, T = tmp_path / "T.h5", sparse().tocsc()
+    path = tmp_path / "T.h5"
+    T = sparse().tocsc()
     formats.write(path, StoreRecord((sparse(),), (3, 4)))
     with h5py.File(path, "r+") as file:
         place: Any = file["T"] if name != "MATLAB_sparse" else file["T"].attrs
@@ -347,7 +349,8 @@ def test_sparse_groups_that_lie(tmp_path: Path, name: str, change: Any, text: st
 @pytest.mark.parametrize("claims", [(), ("file_size",), ("file_size", "compress_size")])
 def test_a_small_archive_cannot_declare_terabytes(tmp_path: Path, claims: tuple[str, ...]) -> None:
     """The sizes lie in all three places: local header, directory, and the array's own header."""
-    array, info = npy("'<f4'", "(3000000, 3000000)"), zipfile.ZipInfo("T.npy")
+    array = npy("'<f4'", "(3000000, 3000000)")
+    info = zipfile.ZipInfo("T.npy")
     with zipfile.ZipFile(tmp_path / "T.npz", "w") as archive:
         archive.writestr(info, array)
         for name in claims:  # goes into the directory on closing

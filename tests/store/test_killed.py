@@ -39,12 +39,14 @@ def end_at_lines(
     """Folder of a store whose `work` (path, report) ended at a line, and the blocks it reported."""
     act, status = ENDS[end]
     prepare(folder / "count" / "T.zarr")
-    trace, count = sys.gettrace(), stores.at_line(-1, act)
+    trace = sys.gettrace()
+    count = stores.at_line(-1, act)
     work(folder / "count" / "T.zarr", lambda *_: None)
     sys.settrace(trace)
     shutil.rmtree(folder / "count")
     for line in random.choice(count[0], MOMENTS or count[0], replace=False).tolist():
-        path, log = folder / str(line) / "T.zarr", folder / f"{line}.log"
+        path = folder / str(line) / "T.zarr"
+        log = folder / f"{line}.log"
         prepare(path)
         with log.open("wb", buffering=0) as file:
 
@@ -60,7 +62,7 @@ def end_at_lines(
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What an undisturbed acquisition leaves."""
+    """Files that an undisturbed acquisition leaves."""
     path = tmp_path_factory.mktemp("finished") / "T.zarr"
     stores.acquire(path)
     return stores.contents(path)
@@ -90,7 +92,8 @@ def test_an_acquisition_that_ends_at_any_line(
 
 
 def test_killed_from_outside(tmp_path: Path, finished: dict[str, str]) -> None:
-    path, seconds = tmp_path / "T.zarr", 0.0
+    path = tmp_path / "T.zarr"
+    seconds = 0.0
     for _ in range(MOMENTS or 100):
         started = time.perf_counter()
         child = stores.in_child(lambda: stores.acquire(path))
@@ -134,8 +137,9 @@ def test_one_store_is_there_at_every_line_of_replacing_it(
 
 
 def test_writers_at_once(tmp_path: Path) -> None:
-    """Of distinct blocks nothing is lost; of one array one of them wins; after the end all are refused."""
-    path, T = tmp_path / "T.zarr", stores.transport(12, 60)
+    """Distinct blocks are never lost; one writer of an array wins; after the end all are refused."""
+    path = tmp_path / "T.zarr"
+    T = stores.transport(12, 60)
     store = stores.make(path, shape=(12, 60), grid=(6, 10), camera_grid=(3, 4))
 
     def work(first: int) -> None:
@@ -159,9 +163,10 @@ def test_writers_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["write", "replace", "open", "fsync", "mkdir"])
 def test_a_full_disk_loses_nothing(tmp_path: Path, name: str) -> None:
-    """At each call of the system in turn, until the commit gets through."""
+    """The process ends at each call of the system in turn, until the commit gets through."""
     store = stores.fill(stores.make(tmp_path / "T.zarr"), final=False)
-    before, works = stores.batch(store, stores.transport(), 1), itertools.repeat(mock.DEFAULT)
+    before = stores.batch(store, stores.transport(), 1)
+    works = itertools.repeat(mock.DEFAULT)
     for failing in range(60):
         calls = itertools.chain(
             [mock.DEFAULT] * failing, [OSError(28, "No space left on device")], works

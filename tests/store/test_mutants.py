@@ -36,7 +36,8 @@ COUNT = int(os.environ.get("LTCL_MUTANTS", "400"))
 
 def mutant(good: bytes, draw: random.Random) -> bytes:
     """The same bytes but for some damage."""
-    data, how = bytearray(good), draw.randrange(4)
+    data = bytearray(good)
+    how = draw.randrange(4)
     if how == 0:
         for _ in range(draw.choice((1, 1, 4))):
             data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
@@ -45,14 +46,17 @@ def mutant(good: bytes, draw: random.Random) -> bytes:
     elif how == 2:
         data += draw.randbytes(draw.choice((1, 8, 40)))
     else:  # of the head
-        place, size = draw.randrange(min(len(data), 400)), draw.choice((1, 4, 8))
+        place = draw.randrange(min(len(data), 400))
+        size = draw.choice((1, 4, 8))
         data[place : place + size] = draw.choices((0, 255, 57, 69, draw.randrange(256)), k=size)
     return bytes(data)
 
 
 def main(folder: Path, count: int) -> None:
     """Print how many were read and refused, each other error, and the growth of memory."""
-    draw, raw, refused = random.Random(1), [], 0  # noqa: S311 - damage, no secrets
+    draw = random.Random(1)  # noqa: S311 - damage, no secrets
+    raw = []
+    refused = 0
     good = sorted(path for path in folder.iterdir() if path.name != "mutants")
     for path in good:  # so that memory is counted from a process that has read each once
         formats.read(path)
@@ -84,7 +88,8 @@ def main(folder: Path, count: int) -> None:
 
 def write_samples(folder: Path, device: Device) -> None:
     """Small good files of each kind and layout."""
-    grid, rgb = (3, 4), tuple(sparse(seed=seed, pattern=seed) for seed in range(3))
+    grid = (3, 4)
+    rgb = tuple(sparse(seed=seed, pattern=seed) for seed in range(3))
     for extension in (".npz", ".npy", ".mtx", ".h5", ".mat", ".zarr"):
         formats.write(folder / f"dense{extension}", StoreRecord((dense(),), grid))
         if extension != ".npy":

@@ -61,7 +61,8 @@ def test_a_missing_grid_is_asked_for(tmp_path, shape, grids, text):
 
 
 def test_first_bounce_is_the_callers_then_the_files_then_the_diagonal(tmp_path):
-    diagonal, twos = dense().diagonal().tolist(), [2.0] * 12
+    diagonal = dense().diagonal().tolist()
+    twos = [2.0] * 12
     np.savez(tmp_path / "T.npz", T=dense(), grid=[3, 4], first_bounce=twos)
     np.savez(tmp_path / "plain.npz", T=dense(), grid=[3, 4])
     for name, F, expected in (
@@ -111,7 +112,7 @@ def test_paths_that_lead_nowhere(tmp_path):
 
 
 def test_a_store_whose_every_entry_is_known_is_dense_elsewhere(tmp_path):
-    """As an array it can be written as .npy, and its first bounce can be exact."""
+    """A full store becomes an array: it can be written as .npy, and its first bounce can be exact."""
     T = np.random.default_rng(0).uniform(0.1, 0.2, (3, 6, 6)) + np.eye(6)
     store.save(tmp_path / "T.zarr", Transport(T, (2, 3)))
     exact = store.load(tmp_path / "T.zarr", first_bounce="exact")

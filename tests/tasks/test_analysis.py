@@ -84,7 +84,7 @@ def test_a_bad_tolerance_is_refused(device, rtol):
 
 
 def test_every_iterative_method_has_an_entry(device):
-    """One-way light leaves Krylov methods without a forecast."""
+    """Light that goes one way leaves Krylov methods without a forecast."""
     scene = enclosure(40, 0.45)
     (channel,) = ltcl.analyze(transport(scene, device)).channels
     assert set(channel.products) == set(channel.certificates) == set(ITERATIVE)

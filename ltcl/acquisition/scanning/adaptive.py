@@ -379,7 +379,8 @@ class PictureLog:
         values = []
         variances = []
         for channel in range(layout.channels):
-            block = self._store.block(channel, batch)
+            # Batches of a scan have variances.
+            block: Any = self._store.block(channel, batch)
             values.append(np.reshape(block.matrix.data, (-1, pixels)))
             variances.append(np.reshape(block.variance, (-1, pixels)))
         if len(values[0]) != expected:

@@ -366,9 +366,12 @@ def _shared_mean(value: np.ndarray, together: np.ndarray) -> np.ndarray:
 
 def _known_entries(store: BlockStore, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
     """Rows, columns, entries of T and their variances, of all known entries in a store."""
-    for block in range(store.layout.blocks("columns")):
-        C, variance = store.block(channel, block)
-        first, _ = store.layout.span(block, "columns")
+    for number in range(store.layout.blocks("columns")):
+        # Batches of a scan have variances.
+        block: Any = store.block(channel, number)
+        C = block.matrix
+        variance = block.variance
+        first, _ = store.layout.span(number, "columns")
         column = first + np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
         known = np.isfinite(variance)
         yield C.indices[known], column[known], C.data[known], variance[known]

@@ -290,4 +290,6 @@ def choose(plans: dict[str, Plan]) -> tuple[str, str]:
     listed = ", ".join(f"{name} {100 * error:.2g} %" for name, error in errors.items())
     difference = "fewer" if takes_fewer else "no fewer"
     reason = f"relative error of a picture T p: {listed}; adaptive takes {difference} photographs"
-    return ("adaptive" if takes_fewer and is_similar else best), reason
+    if takes_fewer and is_similar:
+        return "adaptive", reason
+    return best, reason

@@ -89,7 +89,15 @@ def repeated(order: np.ndarray, start: int, n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("exposures", [(0.5,), (0.5, 2.0, 8.0)], ids=["one exposure", "three"])
 @pytest.mark.parametrize("change", [exchanged, late, missing, repeated])
-@pytest.mark.parametrize("strategy", BATCHES)
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        "pixel",
+        "adaptive",
+        pytest.param("hadamard", marks=pytest.mark.slow),
+        pytest.param("block", marks=pytest.mark.slow),
+    ],
+)
 def test_refused_and_put_right(
     tmp_path: Path,
     folder: Path,

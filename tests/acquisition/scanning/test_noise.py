@@ -30,7 +30,14 @@ def bounces(T: np.ndarray, image: np.ndarray, count: int) -> np.ndarray:
     return np.array(terms)
 
 
-@pytest.fixture(scope="session", params=["pixel", "hadamard", "adaptive"])
+@pytest.fixture(
+    scope="session",
+    params=[
+        "pixel",
+        pytest.param("hadamard", marks=pytest.mark.slow),
+        pytest.param("adaptive", marks=pytest.mark.slow),
+    ],
+)
 def scans(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[list[Path], np.ndarray]:

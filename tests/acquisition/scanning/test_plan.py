@@ -80,6 +80,7 @@ def test_auto_weighs_the_noise(
     assert chosen == strategy
 
 
+@pytest.mark.slow
 def test_auto_chooses_the_better_picture() -> None:
     """T p of a dihedral, scanned with every strategy: none is far better than that of auto."""
     error = {}
@@ -90,7 +91,14 @@ def test_auto_chooses_the_better_picture() -> None:
     assert error["auto"] <= 1.5 * min(error.values())
 
 
-@pytest.mark.parametrize("strategy", ["pixel", "hadamard", "block"])
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        "hadamard",
+        pytest.param("pixel", marks=pytest.mark.slow),
+        pytest.param("block", marks=pytest.mark.slow),
+    ],
+)
 def test_photographs_by_hand_are_all_counted(strategy: str) -> None:
     """Photographs of the calibration and after each batch are counted too."""
     grid = (8, 16)
@@ -104,6 +112,7 @@ def test_photographs_by_hand_are_all_counted(strategy: str) -> None:
     assert plan.photographs == pytest.approx(camera.count, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["pixel", "hadamard", "block"])
 def test_photographs_of_an_aligned_camera_in_colour_are_all_counted(strategy: str) -> None:
     grid = (8, 16)

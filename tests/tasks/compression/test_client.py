@@ -22,7 +22,8 @@ from ltcl.tasks.compression.coefficients import coefficients
 from ltcl.tasks.compression.sources import source
 
 from_array: Any = dask.array.from_array  # whose chunks are no str
-GRID, N = (8, 16), 128
+GRID = (8, 16)
+N = 128
 SMALLEST = 32 * N * 16  # bytes of the smallest block, 16 rows
 
 
@@ -45,7 +46,10 @@ class Rows:
     """Rows that no more than `most` are read of in the process that made them."""
 
     def __init__(self, matrix: np.ndarray, most: int = 0) -> None:
-        self.matrix, self.shape, self.most, self.process = matrix, matrix.shape, most, os.getpid()
+        self.matrix = matrix
+        self.shape = matrix.shape
+        self.most = most
+        self.process = os.getpid()
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         if os.getpid() == self.process:
@@ -94,7 +98,8 @@ def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     options: dict[str, Any] = {"grid": GRID, "basis": "db2", "memory": SMALLEST}
     serial = ltcl.compress(matrix, 0.02, **options)
     C = ltcl.compress(HOLDERS["dask"](matrix, None), 0.02, client=client, **options)
-    arrays, others = C.to_arrays(), serial.to_arrays()
+    arrays = C.to_arrays()
+    others = serial.to_arrays()
     for name in others.keys() - {
         "system_0.solution_error",
         "system_0.error_bound",

@@ -143,7 +143,8 @@ def test_what_is_dropped_is_reported():
     R = C.systems[0].R
     assert isinstance(R, Compressed)
     assert R.into is not None
-    W, core = R.into.to_dense(), R.core.to_dense()
+    W = R.into.to_dense()
+    core = R.core.to_dense()
     exact = W @ (dense_systems(T)[0] - np.eye(T.shape[0])) @ W.T
     kept = core != 0
     assert report.kept == pytest.approx(np.count_nonzero(kept) / T.shape[0], rel=1e-3)
@@ -171,7 +172,8 @@ def test_solves_run_on_coefficients_and_refuse_what_is_not_in_them(corner):
 
 @pytest.mark.parametrize("scene", ["dihedral", "colour"])
 def test_a_budget_is_kept_or_refused_with_what_it_takes(scene):
-    T, bases = SCENES[scene](), ["db2", "haar"]
+    T = SCENES[scene]()
+    bases = ["db2", "haar"]
     free = core_bytes(ltcl.compress(T, 0.02, basis=bases))
     with pytest.raises(InputError, match=rf"budget is {free // 4} .* 0\.02 needs \d+") as refused:
         ltcl.compress(T, 0.02, free // 4, basis=bases)
@@ -213,7 +215,10 @@ class Rows:
     def __init__(
         self, matrix: Any, columns: int = 128, more: int = 0, shape: Any = (128, 128)
     ) -> None:
-        self.matrix, self.columns, self.more, self.shape = matrix, columns, more, shape
+        self.matrix = matrix
+        self.columns = columns
+        self.more = more
+        self.shape = shape
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         return self.matrix[start : stop + self.more, : self.columns]
@@ -242,7 +247,8 @@ ROWS: list[tuple[Any, Any, str]] = [
     (np.zeros((2, 3, 4)), InputError, r"T has shape \(2, 3, 4\)"),
     ("T.npz", InputTypeError, "T is a str"),
 ]
-DARK, WORDS = np.arange(128) != 2, r"first_bounce .* 1 of 128 pixels.*\(0, 2\)"
+DARK = np.arange(128) != 2
+WORDS = r"first_bounce .* 1 of 128 pixels.*\(0, 2\)"
 LinearOperator: Any = scipy.sparse.linalg.LinearOperator
 FORWARD = LinearOperator((128, 128), matvec=np.array, dtype=np.float64)
 VALUES: list[tuple[str, Any, tuple[Any, ...]]] = [
@@ -359,7 +365,8 @@ def test_rows_from_elsewhere_give_the_same_bits(holder, room):
 
 @pytest.mark.parametrize("form", ["csr", "dense", "SciPy's"])
 def test_operators_give_their_rows_by_products(form, room, device):
-    matrix, F = room.matrices[0], room.first_bounce if form == "SciPy's" else None
+    matrix = room.matrices[0]
+    F = room.first_bounce if form == "SciPy's" else None
     operator = (
         FORMATS[form](device, matrix) if F is None else scipy.sparse.linalg.aslinearoperator(matrix)
     )
@@ -376,7 +383,9 @@ def test_rows_may_be_dropped_where_no_memory_holds_them(basis, monkeypatch):
     rtol = {"db2": 0.05, "db2 rows": 0.2, "pixels": 0.6}[basis]
     C = ltcl.compress(T, rtol, basis=basis, memory=1 << 20, norm="worst")
     monkeypatch.undo()
-    (S,), R, (report,) = dense_systems(T), C.systems[0].to_dense(), C.compression.channels
+    (S,) = dense_systems(T)
+    R = C.systems[0].to_dense()
+    (report,) = C.compression.channels
     assert worst_error(S, R) <= C.error <= rtol
     assert np.linalg.norm(R - S) <= report.dropped + report.quantisation + 1e-6 * np.linalg.norm(S)
 

@@ -21,7 +21,8 @@ from tests import gallery
 from tests.operators.helpers import FORMATS
 from tests.problems import enclosure, lambertian
 
-GRID, N = (5, 6), 30
+GRID = (5, 6)
+N = 30
 random = np.random.default_rng(5)
 SCENES = {
     "weak": lambertian(N, 0.3, seed=1, density=0.2),
@@ -67,7 +68,8 @@ def test_the_error_is_a_bound_and_within_the_tolerance(name, rtol, basis):
 @pytest.mark.parametrize("forms", [(None,) * 3, ("db2", "db2 rows", "haar")])
 def test_colours_have_their_own(forms):
     """Channels that were compressed in several forms are written in one basis."""
-    scenes, matrices = [lambertian(N, rho, seed=7) for rho in (0.2, 0.8, 2.0)], []
+    scenes = [lambertian(N, rho, seed=7) for rho in (0.2, 0.8, 2.0)]
+    matrices = []
     for one, basis in zip(map(transport, scenes), forms, strict=True):
         matrices += (ltcl.compress(one, 0.01, norm="worst", basis=basis) if basis else one).matrices
     T = ltcl.Transport(matrices, GRID, first_bounce=np.stack([scene.F for scene in scenes]))
@@ -116,7 +118,8 @@ def test_mixing_of_colours_is_undone():
 
 @pytest.mark.parametrize("form", ["csr", "dense", "tiles of 8"])
 def test_a_compressed_transport_is_inverted_as_it_is(device, form):
-    scene, W = SCENES["rho 0.8"], Wavelet(device, GRID, "db2")
+    scene = SCENES["rho 0.8"]
+    W = Wavelet(device, GRID, "db2")
     core = FORMATS[form](device, scipy.sparse.csr_array(W.to_dense() @ scene.R @ W.to_dense().T))
     S = IdentityPlus(Compressed(core, W, W), solution_error=1e-3)
     T = ltcl.Transport(ScaledColumns(S, scene.F), GRID, first_bounce=scene.F)
@@ -181,11 +184,10 @@ def test_the_errors_of_a_pixel_whose_A_is_dropped(S, first, least, most):
     assert abs(1.0 - 1.0 / S) <= A.error * (1 + 1e-6)
 
 
-SINGULAR, EYE = ltcl.Transport(np.eye(N) + np.eye(N)[::-1], GRID), scipy.sparse.eye_array(2)
-TALL, GOOD = (
-    ltcl.Transport(np.ones((4, 2)), (1, 2), camera_grid=(2, 2)),
-    transport(SCENES["rho 0.8"]),
-)
+SINGULAR = ltcl.Transport(np.eye(N) + np.eye(N)[::-1], GRID)
+EYE = scipy.sparse.eye_array(2)
+TALL = ltcl.Transport(np.ones((4, 2)), (1, 2), camera_grid=(2, 2))
+GOOD = transport(SCENES["rho 0.8"])
 
 
 @pytest.mark.parametrize(
@@ -276,11 +278,9 @@ def test_eigenvalues_of_no_scene_are_eliminated_where_there_is_room(monkeypatch)
 
 def test_an_inverse_refuses_what_it_cannot_do(smooth):
     T, inverse = smooth
-    p, kept, plain = (
-        np.full(T.grid, 0.3),
-        {"inverse": inverse},
-        ltcl.Transport(T.matrices[0], T.grid),
-    )
+    p = np.full(T.grid, 0.3)
+    kept = {"inverse": inverse}
+    plain = ltcl.Transport(T.matrices[0], T.grid)
     other = ltcl.Transport(T.matrices[0] + 0.02, T.grid, first_bounce=T.first_bounce)
     cases: tuple[Any, ...] = (
         (r"rtol is 0\.001", ltcl.separate, T, p, {**kept, "rtol": 1e-3}),

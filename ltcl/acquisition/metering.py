@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Exposures of a calibration and of the scan after it, found by photographs of white and black.
+"""Metering: exposures of a calibration and of its scan, by photographs of white and black.
 
 White is exposed so that the brightest pixels reach 0.7 of the linear range. Each pattern of a scan
 is photographed at that exposure, for the pixels that it lights, and at one up to 64 times as long,
