@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 7: time over resolution ==============================
+"""
+Figure 7: time over resolution
+==============================
 
 How long it takes to find the direct light of a picture, from 128 to 131 072 pixels, with an error
 of at most 1 %. A matrix inverse by the series is the slowest way; two sides in wavelets, on which

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is out of reach ====================
+"""
+What is out of reach
+====================
 
 A projector cannot take light away. Next to something bright, a place cannot be darker than the
 light that bounces into it. ltcl finds the best pattern there is, proves how good it is, and shows

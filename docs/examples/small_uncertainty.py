@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How sure is a bounce? =====================
+"""
+How sure is a bounce?
+=====================
 
 A measured T is noisy, and so are the bounces that are found with it. ``std`` says by how much,
 pixel by pixel. Here the truth is known: where ltcl says one standard deviation, about two thirds of

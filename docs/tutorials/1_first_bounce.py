@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Your first bounce of light ==========================
+"""
+Your first bounce of light
+==========================
 
 Ten minutes, no hardware. You throw a picture into the corner of a room, see why it looks wrong, and
 let ltcl find the pattern that makes it look right. Then you take the light apart, bounce by bounce.
@@ -118,11 +120,11 @@ figure = pictures(
 # ===================  ======================  =================================================
 # in this page         in the paper            what it is
 # ===================  ======================  =================================================
-# ``transport``        T                       picture = T pattern; a column for each projector
-# pixel ``result.pattern``   p                       the pattern, so that T p is the picture that
-# you want ``parts.direct``     l\ :sub:`d`             the direct light ``parts.bounces``    A l\
-# :sub:`d`, ...      bounce 1, bounce 2 and so on ===================  ======================
-# =================================================
+# ``transport``        T                       picture = T pattern; a column for each projector pixel
+# ``result.pattern``   p                       the pattern, so that T p is the picture that you want
+# ``parts.direct``     l\ :sub:`d`             the direct light
+# ``parts.bounces``    A l\ :sub:`d`, ...      bounce 1, bounce 2 and so on
+# ===================  ======================  =================================================
 #
 # Where to go on: :doc:`with a matrix that you have <2_my_matrix>`, :doc:`with a corner of your own
 # <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser

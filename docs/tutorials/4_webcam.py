@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A webcam and a second display =============================
+"""
+A webcam and a second display
+=============================
 
 A projector on the second output, a webcam on a cable: ltcl shows the patterns and takes the
 photographs itself. It measures how long a picture takes from one to the other, and checks each

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A film onto a wall ==================
+"""
+A film onto a wall
+==================
 
 A film on two coloured walls that meet in a corner: every frame is compensated, all with the same
 brightness, so that nothing flickers. A run that was stopped goes on where it was.
