@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """R of a right-angled corner of one albedo, dense, with a sixteenth of the work of one inverse.
 
-The corner has two mirrors, from left to right and from top to bottom. Light that is even or odd
-under each of them stays so at every bounce: four kinds that never mix. A quarter of the corner, N /
-4 pixels, tells all of such light, and A there is the sum of its four mirror images with the signs
-of the kind.
+The corner has two mirror symmetries, left to right and top to bottom. Light that is even or odd
+under each of them stays so at every bounce: these are four symmetry classes that never mix. A
+quarter of the corner, N / 4 pixels, determines all light of a class, and A there is the sum of its
+four mirror images with the signs of the class.
 
 Form factors depend on three offsets only, n^3 numbers for the N^2 = 4 n^4 entries of A: products
-with A of 131072 pixels, 69 GB, take a table of 134 MB.
+with A of 131072 pixels, 69 GB, need a table of 134 MB.
 """
 
 from __future__ import annotations
@@ -25,64 +25,96 @@ class Bounce:
     """A = albedo F of `ltcl.scenes.dihedral(n, albedo)`, (N, N) with N = 2 n^2, never stored.
 
     `table` (n, n, n): form factors of patches d apart along the seam, in column p of the left wall,
-    which sees, and column q of the right one, both counted from the left.
+    which receives the light, and column q of the right one, both counted from the left.
     """
 
     def __init__(self, n: int, albedo: float) -> None:
-        self.n, self.albedo, self.grid, self.shape = n, albedo, (n, 2 * n), (2 * n * n, 2 * n * n)
-        left, right = np.array(
-            [((0, 0, -1), (-1, 0, 0)), ((0, 0, -1), (0, 1, 0))], np.float64
-        )  # down, right
-        d, p, q = np.ogrid[:n, :n, :n]
-        offsets = np.broadcast_arrays(p + 0.5 - n, q + 0.5, d)
-        places = (np.stack([each[k] for each in offsets], axis=-1).reshape(-1, 3) for k in range(n))
-        self.table = np.stack(
-            [exchange.exchange(left, right, place).reshape(n, n) for place in places]
-        )
-        around = np.abs(np.arange(2 * n) - n)  # n, n - 1, ..., 0, ..., n - 1, of which n is none
-        even = np.concatenate([self.table, np.zeros_like(self.table[:1])])[np.roll(around, n)]
-        self._spectrum = np.ascontiguousarray(
-            np.fft.rfft(even, axis=0).real
-        )  # cosine transforms over d
+        self.n = n
+        self.albedo = albedo
+        self.grid = (n, 2 * n)
+        self.shape = (2 * n * n, 2 * n * n)
+        self.table = _form_factors(n)
+        # Distances n, n - 1, ..., 0, ..., n - 1 along the seam: an even sequence, 0 at distance n.
+        distances = np.abs(np.arange(2 * n) - n)
+        padded = np.concatenate([self.table, np.zeros_like(self.table[:1])])
+        even = padded[np.roll(distances, n)]
+        # The Fourier transform of an even sequence is real: cosine transforms over d.
+        self._spectrum = np.ascontiguousarray(np.fft.rfft(even, axis=0).real)
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1 of A, (stop - start, N) float32."""
-        n, (row, column) = self.n, np.divmod(np.arange(start, stop), 2 * self.n)
-        apart, left, right = np.abs(row[:, None] - np.arange(n)), column < n, column >= n
+        n = self.n
+        row, column = np.divmod(np.arange(start, stop), 2 * n)
+        distances = np.abs(row[:, None] - np.arange(n))
+        is_left = column < n
+        is_right = ~is_left
         out = np.zeros((stop - start, n, 2 * n), np.float32)
-        out[left, :, n:] = self.table[apart[left], column[left, None]]
-        out[right, :, :n] = self.table.transpose(0, 2, 1)[apart[right], column[right, None] - n]
+        left_columns = column[is_left, None]
+        out[is_left, :, n:] = self.table[distances[is_left], left_columns]
+        right_columns = column[is_right, None] - n
+        mirrored = self.table.transpose(0, 2, 1)
+        out[is_right, :, :n] = mirrored[distances[is_right], right_columns]
         return np.float32(self.albedo) * out.reshape(-1, self.shape[1])
 
     def matmat(self, x: np.ndarray) -> np.ndarray:
-        """A x, (N, k): a convolution along the seam, by a Fourier transform, and a matrix across it."""
+        """A x, (N, k): a convolution along the seam by Fourier transforms, a matrix across."""
         n = self.n
-        waves = np.fft.rfft(np.asarray(x, np.float64).reshape(n, 2 * n, -1), 2 * n, axis=0)
-        parts = waves.view(np.float64)  # real and imaginary side by side: the spectra are real
-        of_left, of_right = self._spectrum, self._spectrum.transpose(0, 2, 1)
-        seen = np.concatenate([of_left @ parts[:, n:], of_right @ parts[:, :n]], axis=1)
-        light = np.fft.irfft(seen.view(np.complex128), 2 * n, axis=0)[:n]
-        return self.albedo * light.reshape(np.shape(x))
+        light = np.asarray(x, np.float64).reshape(n, 2 * n, -1)
+        waves = np.fft.rfft(light, 2 * n, axis=0)
+        # The spectra are real: real and imaginary parts are columns beside each other.
+        columns = waves.view(np.float64)
+        on_left = self._spectrum @ columns[:, n:]
+        on_right = self._spectrum.transpose(0, 2, 1) @ columns[:, :n]
+        received = np.concatenate([on_left, on_right], axis=1).view(np.complex128)
+        bounced = np.fft.irfft(received, 2 * n, axis=0)[:n]
+        return self.albedo * bounced.reshape(np.shape(x))
+
+
+def _form_factors(n: int) -> np.ndarray:
+    """Table of `Bounce`, (n, n, n)."""
+    # Axes of the walls: down, right.
+    left_wall = np.array(((0, 0, -1), (-1, 0, 0)), np.float64)
+    right_wall = np.array(((0, 0, -1), (0, 1, 0)), np.float64)
+    d, p, q = np.ogrid[:n, :n, :n]
+    offsets = np.broadcast_arrays(p + 0.5 - n, q + 0.5, d)
+    layers = []
+    for distance in range(n):
+        places = np.stack([offset[distance] for offset in offsets], axis=-1).reshape(-1, 3)
+        layers.append(exchange.exchange(left_wall, right_wall, places).reshape(n, n))
+    return np.stack(layers)
 
 
 def interreflection(n: int, albedo: float, progress: Callable[[str], object]) -> np.ndarray:
     """R = (I - A)^-1 - I of `ltcl.scenes.dihedral(n, albedo)` for even n, (N, N) float32."""
-    A, half, size = Bounce(n, albedo), n // 2, n * n // 2
+    A = Bounce(n, albedo)
+    half = n // 2
+    size = n * n // 2
+    # 1. Form factors of the upper left quarter, and of its three mirror images, as it sees them.
     upper = A.rows(0, A.shape[0] // 2).reshape(half, 2 * n, n, 2 * n)[:, :n]
-    down, right = slice(None, half - 1, -1), slice(None, n - 1, -1)
-    quarters = [(v, h) for v in (slice(half), down) for h in (slice(n), right)]
-    images = np.stack([upper[:, :, v, h].reshape(size, size) for v, h in quarters]) / albedo
+    quarters = _quarters(n)
+    views = [upper[:, :, v, h].reshape(size, size) for v, h in quarters]
+    images = np.stack(views) / albedo
+    # 2. One inverse for each symmetry class.
     signs = scipy.linalg.hadamard(4)
-    kinds = np.empty(images.shape)
-    for number, kind in enumerate(kinds):
-        progress(f"  bounces of light, kind {number + 1} of 4")
-        form_factors = np.tensordot(signs[number], images, 1)
-        kind[:] = transport_matrix(
-            form_factors, np.full(size, albedo), np.ones(size)
-        ) / albedo - np.eye(size)
+    interreflections = np.empty(images.shape)
+    for number, class_signs in enumerate(signs):
+        progress(f"  bounces of light, symmetry {number + 1} of 4")
+        form_factors = np.tensordot(class_signs, images, 1)
+        T = transport_matrix(form_factors, np.full(size, albedo), np.ones(size))
+        interreflections[number] = T / albedo - np.eye(size)
+    # 3. Blocks of R: a quarter and its image see each other by the sum over all classes.
     R = np.empty((n, 2 * n, n, 2 * n), np.float32)
-    for image, of_kinds in enumerate(signs):
-        block = np.tensordot(of_kinds / 4, kinds, 1).reshape(half, n, half, n)
-        for seen in range(4):
-            R[(*quarters[seen], *quarters[seen ^ image])] = block
+    for image, class_signs in enumerate(signs):
+        block = np.tensordot(class_signs / 4, interreflections, 1).reshape(half, n, half, n)
+        for receiver in range(4):
+            R[(*quarters[receiver], *quarters[receiver ^ image])] = block
     return R.reshape(A.shape)
+
+
+def _quarters(n: int) -> list[tuple[slice, slice]]:
+    """Rows and columns of the quarters of a corner, each in the order of the upper left one."""
+    upper = slice(n // 2)
+    lower = slice(None, n // 2 - 1, -1)
+    left = slice(n)
+    right = slice(None, n - 1, -1)
+    return [(upper, left), (upper, right), (lower, left), (lower, right)]

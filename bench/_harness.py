@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What every bench shares: options, timing, the roofline, and the report.
+"""Shared by all benches: command line, timing, memory bandwidth, and the report.
 
-Ratios count: competitors are timed in turn with us, as the speed of a machine drifts. Figures are
-medians.
+Ratios count: competitors are timed in turn with us, because the speed of a machine drifts. Figures
+are medians.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,11 @@ from ltcl import plots
 from ltcl.device import Device, vectors
 from ltcl.operators import Operator
 
-_rest = 0.3  # seconds
+# Seconds of rest before each timed action, so that spinning threads go to sleep; none at --smoke.
+_rest_seconds = 0.3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Options:
     """Command line of a bench."""
 
@@ -38,12 +40,13 @@ class Options:
     json: Path | None
     plot: Path | None
     device: Device
-    more: argparse.Namespace = field(default_factory=argparse.Namespace)  # a bench's own arguments
+    # All arguments of the command line, with those that only one bench has.
+    arguments: argparse.Namespace = field(default_factory=argparse.Namespace)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison. `ratio` is how many times better ours is; `target` is the least it should be."""
+    """One comparison: `ratio` says how many times better ours is, `target` is its minimum."""
 
     question: str
     competitor: str
@@ -57,55 +60,73 @@ class Row:
     def from_times(
         cls,
         question: str,
-        who: str,
+        competitor: str,
         theirs: float,
         ours: float,
         unit: str,
         target: float | None = None,
     ) -> Row:
-        """The less, the better."""
-        return cls(question, who, theirs, ours, unit, theirs / ours, target)
+        """Compare two quantities of which the smaller is the better."""
+        return cls(
+            question=question,
+            competitor=competitor,
+            theirs=theirs,
+            ours=ours,
+            unit=unit,
+            ratio=theirs / ours,
+            target=target,
+        )
 
     @property
     def verdict(self) -> str:
-        """Hit, miss by how much, or nothing where there is no target."""
+        """A hit, a miss and its extent, or nothing if there is no target."""
         if self.target is None:
             return ""
-        part = self.ratio / self.target
-        return "hit" if part >= 1.0 else f"MISS: {part:.1%} of {self.target:.3g}x"
+        share = self.ratio / self.target
+        if share >= 1.0:
+            return "hit"
+        return f"MISS: {share:.1%} of {self.target:.3g}x"
 
 
-def parse_options(description: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Options:
+def parse_options(
+    description: str | None, bench_arguments: Mapping[str, Mapping[str, Any]] | None = None
+) -> Options:
     """Parse the command line, with a bench's own arguments, and open the device."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run")
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes: check that it runs")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--plot", type=Path, help="draw what was found into this PNG")
-    parser.add_argument("--device", help="as ltcl.open_device takes it")
-    for name, settings in (own or {}).items():
-        parser.add_argument(f"--{name}", **settings)
+    parser.add_argument("--plot", type=Path, help="draw the results into this PNG")
+    parser.add_argument("--device", help="device, as ltcl.open_device takes it")
+    if bench_arguments is not None:
+        for name, settings in bench_arguments.items():
+            parser.add_argument(f"--{name}", **settings)
     arguments = parser.parse_args()
     if arguments.smoke:
-        global _rest
-        _rest = 0.0
-    device = ltcl.open_device(arguments.device)
-    return Options(arguments.smoke, arguments.json, arguments.plot, device, arguments)
+        global _rest_seconds
+        _rest_seconds = 0.0
+    return Options(
+        smoke=arguments.smoke,
+        json=arguments.json,
+        plot=arguments.plot,
+        device=ltcl.open_device(arguments.device),
+        arguments=arguments,
+    )
 
 
 def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:
     """Median seconds of each action, run in turn A B C A B C.
 
-    Before its turn comes a rest, as threads of BLAS and OpenMP spin after their work; then it runs
-    until the processor is awake, and once more, which counts: in a solve a product follows a
-    product.
+    A rest comes before each turn, as threads of BLAS and OpenMP spin after their work. Then the
+    action runs until the processor is awake, and once more, which counts: in a solve a product
+    follows a product.
     """
     times: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(repeats):
         for name, action in actions.items():
-            time.sleep(_rest)
-            warm = time.perf_counter() + _rest / 3
+            time.sleep(_rest_seconds)
+            end_of_warming = time.perf_counter() + _rest_seconds / 3
             action()
-            while time.perf_counter() < warm:
+            while time.perf_counter() < end_of_warming:
                 action()
             start = time.perf_counter()
             action()
@@ -114,21 +135,29 @@ def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> di
 
 
 def product(A: Operator, x: np.ndarray) -> Callable[[], None]:
-    """A @ x with vectors on the device, as inside a solve, and waited for."""
-    on_device = A.device.upload(x)
-    out = A.apply(on_device)
+    """Return an action: A @ x with vectors on the device, as inside a solve, and a wait."""
+    x_device = A.device.upload(x)
+    out = A.apply(x_device)
 
     def run() -> None:
-        A.apply(on_device, out)
+        A.apply(x_device, out)
         A.device.finish()
 
     return run
 
 
 def triad(device: Device, smoke: bool, parts: int = 1) -> tuple[Callable[[], None], int]:
-    """a b + c over arrays far larger than caches, or a part: what memory gives; bytes as STREAM counts."""
-    count = (1 << (16 if smoke else 25)) // parts
-    b, c, out = (vectors.fill(device.empty(count), 1.0) for _ in range(3))
+    """Return the action a b + c over arrays far larger than caches, and its bytes as STREAM counts.
+
+    With `parts` the arrays have that part of the length: the bandwidth for one of several ranks.
+    """
+    total = 1 << 25
+    if smoke:
+        total = 1 << 16
+    count = total // parts
+    b = vectors.fill(device.empty(count), 1.0)
+    c = vectors.fill(device.empty(count), 1.0)
+    out = vectors.fill(device.empty(count), 1.0)
 
     def run() -> None:
         vectors.axpby(2.0, b, 1.0, c, out)
@@ -138,76 +167,104 @@ def triad(device: Device, smoke: bool, parts: int = 1) -> tuple[Callable[[], Non
 
 
 def report(
-    given: Options,
+    options: Options,
     title: str,
     rows: list[Row],
     facts: dict[str, Any],
     draw: Callable[[], Any] | None = None,
 ) -> None:
-    """Publish comparisons, by default as bars."""
+    """Publish comparisons, drawn as bars if there is no `draw`."""
     table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
     for row in rows:
-        target = "" if row.target is None else f"{row.target:.3g}x"
-        figures = (f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x")
-        table.add_row(
-            row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict
-        )
-    content = {"rows": [{**asdict(row), "verdict": row.verdict} for row in rows]}
-    publish(given, title, facts, table, content, draw or (lambda: _bars(title, rows)))
+        table.add_row(*_cells(row, options.smoke))
+    records = [{**asdict(row), "verdict": row.verdict} for row in rows]
+    if draw is None:
+        draw = partial(_bars, title, rows)
+    publish(options, title, facts, table, {"rows": records}, draw)
+
+
+def _cells(row: Row, is_smoke: bool) -> list[str]:
+    """Cells of a comparison in the table; tiny sizes get no verdict."""
+    target = ""
+    if row.target is not None:
+        target = f"{row.target:.3g}x"
+    verdict = row.verdict
+    if is_smoke:
+        verdict = ""
+    return [
+        row.question,
+        row.competitor,
+        f"{row.theirs:.4g}",
+        f"{row.ours:.4g}",
+        row.unit,
+        f"{row.ratio:.2f}x",
+        target,
+        verdict,
+    ]
 
 
 def publish(
-    given: Options,
+    options: Options,
     title: str,
     facts: dict[str, Any],
     table: Table,
     content: Any,
     draw: Callable[[], Any],
 ) -> None:
-    """Print facts and table; write them with `content`, and draw, where the command line asked for it."""
+    """Print facts and table; write them with `content`, and draw, if the options ask for it."""
     console = Console(width=150)
-    console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
+    console.print(f"[bold]{title}[/]\n{options.device.name}, {options.device.driver}")
     for name, value in facts.items():
-        console.print(
-            f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}"
-        )
-    if given.smoke:
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        console.print(f"  {name}: {text}")
+    if options.smoke:
         console.print("[yellow]--smoke: sizes this small show that it runs, not how fast[/]")
     console.print(table)
-    if given.json is not None:
-        write_json(given.json, record(given, title, facts) | content)
-    if given.plot is not None:
-        given.plot.parent.mkdir(parents=True, exist_ok=True)
-        plots.save(draw(), given.plot)
+    if options.json is not None:
+        write_json(options.json, record(options, title, facts) | content)
+    if options.plot is not None:
+        options.plot.parent.mkdir(parents=True, exist_ok=True)
+        plots.save(draw(), options.plot)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a record, making its folder."""
+    """Write a record and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def record(given: Options, title: str, facts: dict[str, Any]) -> dict[str, Any]:
-    """What every JSON file of a bench opens with: the question, the device and the versions."""
-    versions = {"ltcl": ltcl.__version__, "python": platform.python_version()}
-    versions |= {"numpy": np.__version__, "scipy": scipy.__version__}
-    device = {"device": given.device.name, "driver": given.device.driver}
-    return {"title": title, "smoke": given.smoke, **device, "versions": versions, "facts": facts}
+def record(options: Options, title: str, facts: dict[str, Any]) -> dict[str, Any]:
+    """Head of every JSON file of a bench: the question, the device, the versions and the facts."""
+    versions = {
+        "ltcl": ltcl.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+    }
+    return {
+        "title": title,
+        "smoke": options.smoke,
+        "device": options.device.name,
+        "driver": options.device.driver,
+        "versions": versions,
+        "facts": facts,
+    }
 
 
 def _bars(title: str, rows: list[Row]) -> Any:
+    # Only a drawing needs matplotlib, and some benches measure the memory of this process.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 0.45 * len(rows) + 1.4), dpi=120, layout="constrained")
     axes = figure.subplots()
-    places = range(len(rows))[::-1]
-    axes.barh(places, [row.ratio for row in rows], color="#3b6ea5", label="measured")
-    for place, row in zip(places, rows, strict=True):
+    heights = range(len(rows))[::-1]
+    ratios = [row.ratio for row in rows]
+    axes.barh(heights, ratios, color="#3b6ea5", label="measured")
+    for height, row in zip(heights, rows, strict=True):
         if row.target is not None:
-            axes.plot([row.target] * 2, [place - 0.4, place + 0.4], color="#c0392b", lw=2)
-    axes.set_yticks(
-        places, [f"{row.question}\nagainst {row.competitor}" for row in rows], fontsize=7
-    )
+            axes.plot([row.target] * 2, [height - 0.4, height + 0.4], color="#c0392b", lw=2)
+    labels = [f"{row.question}\nagainst {row.competitor}" for row in rows]
+    axes.set_yticks(heights, labels, fontsize=7)
     axes.set_xscale("log")
     axes.set_xlabel("times better (red: target)")
     axes.set_title(title, fontsize=10)

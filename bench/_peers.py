@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sparse products of others, in float32 with 32-bit indices: what the extra `bench` brings, and CuPy.
+"""Sparse products of other libraries, in float32 with 32-bit indices.
 
-A peer that is not installed is named and left out; SciPy and NumPy are always there.
+The extra `bench` installs them, except CuPy. A peer that is not installed is named and left out;
+SciPy and NumPy are always present.
 """
 
 from __future__ import annotations
@@ -25,37 +26,55 @@ def missing() -> list[str]:
 
 
 def sparse_products(A: Any, x: np.ndarray) -> dict[str, Product]:
-    """A @ x by every peer that is there, for a csr_array A of float32 and x (N,) or (N, k)."""
-    makers = {"sparse_dot_mkl": _mkl, "cupy": _cupy}
+    """A @ x by every installed peer, for a csr_array A of float32 and x (N,) or (N, k)."""
+    products: dict[str, Product] = {"scipy": lambda: A @ x}
     absent = missing()
-    products = {name: make(A, x) for name, make in makers.items() if name not in absent}
-    return {"scipy": lambda: A @ x, **products}
+    if "sparse_dot_mkl" not in absent:
+        products["sparse_dot_mkl"] = _mkl(A, x)
+    if "cupy" not in absent:
+        products["cupy"] = _cupy(A, x)
+    return products
 
 
 def _mkl(A: Any, x: np.ndarray) -> Product:
     import scipy.sparse
 
-    os.environ.setdefault("KMP_BLOCKTIME", "0")  # its threads must not spin while others are timed
-    # It looks for the library beside Python itself, where an environment of `venv` has it not.
-    found = [file for file in metadata.files("mkl") or () if file.name.startswith("libmkl_rt")]
-    if found:
-        os.environ.setdefault("MKL_RT", str(found[0].locate()))
+    # Its threads must not spin while other products are timed.
+    os.environ.setdefault("KMP_BLOCKTIME", "0")
+    library = _mkl_library()
+    if library is not None:
+        os.environ.setdefault("MKL_RT", library)
     mkl: Any = importlib.import_module("sparse_dot_mkl")
 
-    matrix = scipy.sparse.csr_matrix(A)  # it takes no csr_array
+    # MKL's wrapper accepts a csr_matrix only.
+    matrix = scipy.sparse.csr_matrix(A)
     return lambda: mkl.dot_product_mkl(matrix, x)
 
 
+def _mkl_library() -> str | None:
+    """Path of the library: the wrapper looks beside Python, where a venv does not have it."""
+    files = metadata.files("mkl")
+    if files is None:
+        return None
+    for file in files:
+        if file.name.startswith("libmkl_rt"):
+            return str(file.locate())
+    return None
+
+
 def _cupy(A: Any, x: np.ndarray) -> Product:
-    cupy: Any = importlib.import_module("cupy")  # in no extra: it needs CUDA
+    # CuPy is in no extra, as it needs CUDA.
+    cupy: Any = importlib.import_module("cupy")
     sparse: Any = importlib.import_module("cupyx.scipy.sparse")
 
-    parts = (cupy.asarray(A.data), cupy.asarray(A.indices), cupy.asarray(A.indptr))
-    matrix, operand = sparse.csr_matrix(parts, shape=A.shape), cupy.asarray(x, order="F")
+    arrays = (cupy.asarray(A.data), cupy.asarray(A.indices), cupy.asarray(A.indptr))
+    matrix = sparse.csr_matrix(arrays, shape=A.shape)
+    operand = cupy.asarray(x, order="F")
 
     def run() -> np.ndarray:
-        product = matrix @ operand  # cuSPARSE, on the device as ours is
+        # cuSPARSE, on the device as ours is.
+        result = matrix @ operand
         cupy.cuda.Device().synchronize()
-        return product
+        return result
 
     return run

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The CSR product, beside what memory gives, SciPy, and MKL and cuSPARSE where they are installed.
+"""The CSR product, beside memory bandwidth, SciPy, and MKL and cuSPARSE if they are installed.
 
 N = 131072 pixels, 256 nonzeros a row, in runs of 16 neighbours (as light transport has them) and at
 random; 1, 3, 4 and 8 right-hand sides. Ours is timed with vectors on the device, as inside a solve.
@@ -19,16 +19,23 @@ from _harness import Options, Row, parse_options, product, report, seconds, tria
 from _peers import sparse_products
 from ltcl.operators import CSR
 
+# Numbers of right-hand sides.
 SIDES = (1, 3, 4, 8)
-SCIPY_TARGET = {1: 2.0, 8: 3.5}  # times faster
-CUSPARSE_TARGET = 0.95  # of its speed, on a GPU
 PEERS = {"scipy": "scipy.sparse", "sparse_dot_mkl": "MKL", "cupy": "cuSPARSE (CuPy)"}
-SIDE_TARGET = {4: 1 / 0.4, 8: 1 / 0.25}  # times less a side than one side alone
-TRIAD_TARGET = 0.9  # part of the triad's bytes a second, where a row is made of runs
+# Least ratio to SciPy by right-hand sides, and to cuSPARSE, on a GPU.
+SCIPY_TARGET = {1: 2.0, 8: 3.5}
+CUSPARSE_TARGET = 0.95
+# Ratio of the time of one side alone to the time a side.
+SIDE_TARGET = {4: 1 / 0.4, 8: 1 / 0.25}
+# Share of the triad's bytes a second, if a row is made of runs.
+TRIAD_TARGET = 0.9
 
 
 def matrix(n: int, per_row: int, run: int, seed: int = 0) -> Any:
-    """(n, n) with `per_row` nonzeros in runs of `run` neighbouring columns at distinct random places."""
+    """Make an (n, n) matrix with `per_row` nonzeros a row.
+
+    They are in runs of `run` neighbouring columns, which begin at distinct random places.
+    """
     rng = np.random.default_rng(seed)
     parts = per_row // run
     # One draw from each of these equal parts: sorted and distinct without rejection.
@@ -40,43 +47,87 @@ def matrix(n: int, per_row: int, run: int, seed: int = 0) -> Any:
     return scipy.sparse.csr_array((values, columns, pointers), shape=(n, n))
 
 
-def compare(given: Options, name: str, A: Any) -> list[Row]:
-    """Rows for one matrix; everything is timed in turn, so that all ratios are of one moment."""
-    run, nbytes = triad(given.device, given.smoke)
-    operator, rng = CSR(given.device, A), np.random.default_rng(1)
-    actions: dict[str, Callable[[], object]] = {"triad": run}
+def compare(options: Options, name: str, A: Any) -> list[Row]:
+    """Compare on one matrix; everything is timed in turn, so that all ratios are of one moment."""
+    run_triad, triad_bytes = triad(options.device, options.smoke)
+    actions = {"triad": run_triad} | product_actions(options, name, A)
+    milliseconds = {action: 1e3 * spent for action, spent in seconds(actions).items()}
+    rows = []
     for k in SIDES:
-        x = rng.random((A.shape[1], k) if k > 1 else A.shape[1], dtype=np.float32)
-        if not np.allclose(operator.dot(x), A @ x, rtol=1e-4, atol=1e-5):
-            raise SystemExit(f"the product of {name} with {k} right-hand sides is wrong")
-        actions[f"ours {k}"] = product(operator, x)
-        actions |= {f"{peer} {k}": theirs for peer, theirs in sparse_products(A, x).items()}
-    ms = {what: 1e3 * spent for what, spent in seconds(actions).items()}
-    rows, alone = [], ms["ours 1"]
-    for k in SIDES:
-        question, ours = f"{name}, k = {k}", ms[f"ours {k}"]
-        targets = {"scipy": SCIPY_TARGET.get(k), "cupy": CUSPARSE_TARGET}
-        for peer, who in PEERS.items():
-            if (theirs := ms.get(f"{peer} {k}")) is not None:
-                rows.append(Row.from_times(question, who, theirs, ours, "ms", targets.get(peer)))
+        rows += peer_rows(f"{name}, k = {k}", k, milliseconds)
         if k == 1:
-            roof, rate = nbytes / ms["triad"] / 1e6, 8 * A.nnz / ours / 1e6
-            target = TRIAD_TARGET if "runs" in name else None
-            rows.append(Row(question, "our triad", roof, rate, "GB/s", rate / roof, target))
+            bandwidth = triad_bytes / milliseconds["triad"] / 1e6
+            rate = 8 * A.nnz / milliseconds["ours 1"] / 1e6
+            rows.append(bandwidth_row(name, bandwidth, rate))
         elif k in SIDE_TARGET:
-            rows.append(
-                Row.from_times(question, "k = 1", alone, ours / k, "ms a side", SIDE_TARGET[k])
-            )
+            rows.append(side_row(name, k, milliseconds))
     return rows
 
 
+def product_actions(options: Options, name: str, A: Any) -> dict[str, Callable[[], object]]:
+    """Products by us and by all peers, for each number of right-hand sides."""
+    operator = CSR(options.device, A)
+    rng = np.random.default_rng(1)
+    actions: dict[str, Callable[[], object]] = {}
+    for k in SIDES:
+        shape = (A.shape[1], k)
+        if k == 1:
+            shape = (A.shape[1],)
+        x = rng.random(shape, dtype=np.float32)
+        if not np.allclose(operator.dot(x), A @ x, rtol=1e-4, atol=1e-5):
+            raise SystemExit(f"the product of {name} with {k} right-hand sides is wrong")
+        actions[f"ours {k}"] = product(operator, x)
+        for peer, run in sparse_products(A, x).items():
+            actions[f"{peer} {k}"] = run
+    return actions
+
+
+def peer_rows(question: str, k: int, milliseconds: dict[str, float]) -> list[Row]:
+    """Compare with all peers that are installed."""
+    targets = {"scipy": SCIPY_TARGET.get(k), "cupy": CUSPARSE_TARGET}
+    ours = milliseconds[f"ours {k}"]
+    rows = []
+    for peer, competitor in PEERS.items():
+        theirs = milliseconds.get(f"{peer} {k}")
+        if theirs is not None:
+            target = targets.get(peer)
+            rows.append(Row.from_times(question, competitor, theirs, ours, "ms", target))
+    return rows
+
+
+def bandwidth_row(name: str, bandwidth: float, rate: float) -> Row:
+    """Compare the product's bytes a second with those of the triad."""
+    return Row(
+        question=f"{name}, k = 1",
+        competitor="our triad",
+        theirs=bandwidth,
+        ours=rate,
+        unit="GB/s",
+        ratio=rate / bandwidth,
+        target=TRIAD_TARGET if "runs" in name else None,
+    )
+
+
+def side_row(name: str, k: int, milliseconds: dict[str, float]) -> Row:
+    """Compare the time a side with that of one side alone."""
+    alone = milliseconds["ours 1"]
+    share = milliseconds[f"ours {k}"] / k
+    question = f"{name}, k = {k}"
+    return Row.from_times(question, "k = 1", alone, share, "ms a side", SIDE_TARGET[k])
+
+
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    n, per_row = (2048, 32) if given.smoke else (131072, 256)
+    """Run the bench."""
+    options = parse_options(__doc__)
+    n = 131072
+    per_row = 256
+    if options.smoke:
+        n = 2048
+        per_row = 32
     rows = []
     for name, run in (("runs of 16", 16), ("random", 1)):
-        rows += compare(given, name, matrix(n, per_row, run))
-    report(given, "CSR product", rows, {"pixels": n, "nonzeros a row": per_row})
+        rows += compare(options, name, matrix(n, per_row, run))
+    report(options, "CSR product", rows, {"pixels": n, "nonzeros a row": per_row})
 
 
 if __name__ == "__main__":

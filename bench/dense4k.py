@@ -21,33 +21,47 @@ from ltcl.operators import Dense
 
 
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    scene = ltcl.scenes.box(6 if given.smoke else 32, sides=4, albedo=0.45)
-    T = scene.transport(device=given.device)
+    """Run the bench."""
+    options = parse_options(__doc__)
+    n = 32
+    if options.smoke:
+        n = 6
+    scene = ltcl.scenes.box(n, sides=4, albedo=0.45)
+    T = scene.transport(device=options.device)
     S = T.systems[0]
     dense = S.to_dense()
     l_d = T.first_bounce * np.random.default_rng(0).random(T.shape[1])
     l_out = dense @ l_d
-    l_out32, factors32 = l_out.astype(np.float32), scipy.linalg.lu_factor(dense.astype(np.float32))
+    l_out32 = l_out.astype(np.float32)
+    factors32 = scipy.linalg.lu_factor(dense.astype(np.float32))
     A = np.eye(len(dense)) - np.linalg.inv(dense)
-    inverse = ltcl.Inverse([Dense(given.device, A)], [1e-5], T.grid, T.first_bounce)
+    inverse = ltcl.Inverse([Dense(options.device, A)], [1e-5], T.grid, T.first_bounce)
     solution = ltcl.solve(S, l_out, "chebyshev", rtol=1e-2)
-    run, nbytes = triad(given.device, given.smoke)
+    run_triad, triad_bytes = triad(options.device, options.smoke)
     actions = {
-        "triad": run,
+        "triad": run_triad,
         "ours": lambda: ltcl.solve(S, l_out, "chebyshev", rtol=1e-2),
         "float64": lambda: np.linalg.solve(dense, l_out),
         "kept32": lambda: scipy.linalg.lu_solve(factors32, l_out32),
         "inverse": lambda: inverse.solve(l_out),
     }
     times = seconds(actions, repeats=5)
-    question, kept = f"direct part at N = {T.shape[0]}", "LU kept, float32 (ours: an inverse kept)"
-    rows = [
-        Row.from_times(
-            question, "numpy.linalg.solve, float64", times["float64"], times["ours"], "s", 51.0
-        ),
-        Row.from_times(question, kept, times["kept32"], times["inverse"], "s", 1.0),
-    ]
+    solved = Row.from_times(
+        f"direct part at N = {T.shape[0]}",
+        "numpy.linalg.solve, float64",
+        times["float64"],
+        times["ours"],
+        "s",
+        target=51.0,
+    )
+    prepared = Row.from_times(
+        f"direct part at N = {T.shape[0]}",
+        "LU kept, float32 (ours: an inverse kept)",
+        times["kept32"],
+        times["inverse"],
+        "s",
+        target=1.0,
+    )
     facts = {
         "pixels": T.shape[0],
         "rho(R)": ltcl.analyze(T).channels[0].spectral_radius,
@@ -55,9 +69,10 @@ def main() -> None:
         "relative error of the direct part": relative_error(solution.x, l_d),
         "and with the inverse": relative_error(inverse.solve(l_out).x, l_d),
         "GB/s of our products": solution.products * S.nbytes / times["ours"] / 1e9,
-        "GB/s of our triad": nbytes / times["triad"] / 1e9,
+        "GB/s of our triad": triad_bytes / times["triad"] / 1e9,
     }
-    report(given, "4096 x 4096: direct part against dense inversion", rows, facts)
+    title = "4096 x 4096: direct part against dense inversion"
+    report(options, title, [solved, prepared], facts)
 
 
 if __name__ == "__main__":

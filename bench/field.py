@@ -66,7 +66,7 @@ def make(data: Path, given: Options) -> dict[str, Any]:
         else:
             small = {"size": 12, "paths": 256, "samples": 256}
             dataset.trace(
-                data / name, name, **(small if given.smoke else {"size": given.more.size})
+                data / name, name, **(small if given.smoke else {"size": given.arguments.size})
             )
     if not (scenes := dataset.found(data)):
         raise SystemExit(f"{data} has no scenes, and none can be traced: {why}")
@@ -76,13 +76,13 @@ def make(data: Path, given: Options) -> dict[str, Any]:
 def main() -> None:
     """Score every method on every scene; exit status 1 where one fails that is not of `DIVERGES`."""
     given, failures = parse_options(__doc__ or "", ARGUMENTS), []
-    chosen = commands(given.more.method)
-    if not given.smoke and given.more.data is None:
+    chosen = commands(given.arguments.method)
+    if not given.smoke and given.arguments.data is None:
         raise SystemExit(
             "--data DIR is missing: the folder of the scenes, or where they are to be traced"
         )
     with TemporaryDirectory() as scratch:
-        data = given.more.data or Path(scratch)
+        data = given.arguments.data or Path(scratch)
         facts, results = make(data, given), dict[str, dict[str, dict[str, Any]]]()
         table = Table("scene", "method", *scoring.COLUMNS, *scoring.OTHERS)
         for name, scene in dataset.found(data).items():

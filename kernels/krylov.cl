@@ -25,13 +25,14 @@
 #endif
 // Rows of a copy: rho and the phase. Rows of the state: alpha; |r*|^2; and the square that <r*, v>
 // is compared with: |S^T r*|^2 with |p|^2, or |r*|^2 with |v|^2.
-#if !defined(BICGSTAB_RHO) || !defined(BICGSTAB_PHASE) || !defined(BICGSTAB_ALPHA) || \
-    !defined(BICGSTAB_SHADOW) || !defined(BICGSTAB_AGAINST)
+#if !defined(BICGSTAB_RHO) || !defined(BICGSTAB_PHASE) || !defined(BICGSTAB_ALPHA) \
+    || !defined(BICGSTAB_SHADOW) || !defined(BICGSTAB_AGAINST)
 #error "krylov.cl needs -DBICGSTAB_RHO, _PHASE, _ALPHA, _SHADOW, _AGAINST: rows of the state"
 #endif
 // Phases of a column, real numbers: it moves; restarted with r* = p = r and made no step since;
 // waits for a restart by the host; has no step even after a restart.
-#if !defined(PHASE_MOVES) || !defined(PHASE_FRESH) || !defined(PHASE_WAITS) || !defined(PHASE_BROKEN)
+#if !defined(PHASE_MOVES) || !defined(PHASE_FRESH) || !defined(PHASE_WAITS) \
+    || !defined(PHASE_BROKEN)
 #error "krylov.cl needs -DPHASE_MOVES, -DPHASE_FRESH, -DPHASE_WAITS, -DPHASE_BROKEN"
 #endif
 

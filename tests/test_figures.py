@@ -32,7 +32,9 @@ def figures(load: Callable[[str], Any]) -> Any:
 
 @pytest.fixture
 def given(load: Callable[[str], Any], device: Device, tmp_path: Path) -> Any:
-    return load("_harness").Options(True, tmp_path / "new" / "found.json", None, device)
+    return load("_harness").Options(
+        smoke=True, json=tmp_path / "new" / "found.json", plot=None, device=device
+    )
 
 
 def conclude(figures: Any, given: Any, *claims: Any) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ import ctypes
 import math
 import struct
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from ltcl.device.driver_errors import explain, translated
 from ltcl.errors import InputTypeError
@@ -34,12 +34,9 @@ PACKERS: dict[str, Callable[[Any], Any]] = {
 Size = int | tuple[int, ...]
 
 
-class Parameter(NamedTuple):
-    """Argument of a kernel, as the compiler reports it."""
-
-    position: int
-    # The bytes of a Python number; None for buffers and local memory.
-    pack: Callable[[Any], Any] | None
+# An argument of a kernel, as the compiler reports it: its position, and how a Python number becomes
+# bytes, None for buffers and local memory. A plain tuple, which Python unpacks fastest.
+Parameter = tuple[int, Callable[[Any], Any] | None]
 
 
 class Kernel:
@@ -137,7 +134,7 @@ def _parameters(info: Any, handle: Any) -> dict[str, Parameter]:
             type_name = handle.get_arg_info(index, info.TYPE_NAME)
             pack = PACKERS[type_name.replace("unsigned ", "u")]
         name = handle.get_arg_info(index, info.NAME)
-        parameters[name] = Parameter(index, pack)
+        parameters[name] = index, pack
     return parameters
 
 
@@ -149,6 +146,8 @@ class Launch:
 
     def __init__(self, kernel: Kernel, items: Size, group: Size, arguments: dict[str, Any]) -> None:
         self._kernel = kernel
+        self._name = kernel.name
+        self._device = kernel.device
         self._parameters = kernel.parameters
         self._group = kernel.group(group if isinstance(group, tuple) else (group,))
         self.resize(items)
@@ -161,23 +160,22 @@ class Launch:
 
     def __call__(self) -> None:
         """Queue the launch; returns at once."""
-        if 0 not in self._size:
-            self._kernel.device.launch(self._kernel.name, self._handle, self._size, self._group)
+        if self._has_items:
+            self._device.launch(self._name, self._handle, self._size, self._group)
 
     def set(self, /, **values: Any) -> None:
         """Change arguments, by name, for the launches that follow: ``launch.set(keep=0.5)``."""
         parameters = self._parameters
-        handle = self._handle
         name = ""
         try:
             for name, value in values.items():
                 position, pack = parameters[name]
                 if pack is None:
-                    handle.set_arg(position, getattr(value, "buffer", value))
+                    self._handle.set_arg(position, getattr(value, "buffer", value))
                     self._buffers[name] = value
                 else:
                     # `set_arg` would do as well, but tries all else before bytes: 6 us, not 0.1.
-                    handle._set_arg_buf(position, pack(value))
+                    self._handle._set_arg_buf(position, pack(value))
         except Exception as error:
             raise self._kernel.argument_error(name, values[name], error) from error
 
@@ -185,6 +183,7 @@ class Launch:
         """Change the number of work-items, rounded up to whole groups, for launches to come."""
         size = items if isinstance(items, tuple) else (items,)
         self._size = tuple(-(-n // g) * g for n, g in zip(size, self._group, strict=True))
+        self._has_items = 0 not in self._size
 
     def __del__(self) -> None:
         if hasattr(self, "_handle"):

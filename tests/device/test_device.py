@@ -133,7 +133,8 @@ def test_a_forked_process_is_refused_and_does_not_hang(device):
 
 def test_opening_a_device_leaves_the_environment_alone_and_reads_no_pickles(device):
     code = (
-        "import os, ltcl; before = dict(os.environ); ltcl.open_device(); assert dict(os.environ) == before;"
+        "import os, ltcl; before = dict(os.environ); ltcl.open_device();"
+        "assert dict(os.environ) == before;"
         "import pyopencl; assert pyopencl._PYOPENCL_NO_CACHE"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
