@@ -27,5 +27,6 @@ print(record["device"])
 for name, method in fig7.METHODS.items():
     last = [point for point in points if point.method == name][-1]
     print(
-        f"{method.label:20} {last.pixels:7} pixels {1e3 * last.seconds:10.4g} ms, error {last.way.error:.2%}"
+        f"{method.label:20} {last.pixels:7} pixels {1e3 * last.seconds:10.4g} ms, "
+        f"error {last.way.error:.2%}"
     )

@@ -23,7 +23,7 @@ def mixed(*strengths, rest=1.0):
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

@@ -25,7 +25,7 @@ parts = ltcl.separate(T, seen, bounces=3)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

@@ -20,7 +20,7 @@ exact = T @ pattern
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

@@ -30,7 +30,7 @@ shown += np.clip(-missing, 0, None)[..., None] * 6 * (0.1, 0.4, 1.0)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

@@ -27,7 +27,7 @@ exact = ltcl.separate(ltcl.Transport(true, corner.grid), white, bounces=2)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

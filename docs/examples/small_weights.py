@@ -27,7 +27,7 @@ weighted = ltcl.compensate(T, wanted, weights=region)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

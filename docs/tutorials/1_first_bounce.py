@@ -28,7 +28,7 @@ wanted = 0.25 + 0.75 * corner.sample(photo)  # its pixels on the three walls, as
 
 
 def view(light):
-    """What somebody sees who stands in front of the corner."""
+    """The corner as somebody sees it who stands in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 
@@ -120,7 +120,7 @@ figure = pictures(
 # ===================  ======================  =================================================
 # in this page         in the paper            what it is
 # ===================  ======================  =================================================
-# ``transport``        T                       picture = T pattern; a column for each projector pixel
+# ``transport``        T                       picture = T pattern; one column per projector pixel
 # ``result.pattern``   p                       the pattern, so that T p is the picture that you want
 # ``parts.direct``     l\ :sub:`d`             the direct light
 # ``parts.bounces``    A l\ :sub:`d`, ...      bounce 1, bounce 2 and so on

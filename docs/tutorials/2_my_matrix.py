@@ -135,7 +135,7 @@ better = ltcl.denoise(T)
 
 
 def error(M):
-    """Of the light that bounced: the diagonal, which is the direct light, counts as right."""
+    """Error of the light that bounced; the diagonal, the direct light, counts as right."""
     off = (M.to_numpy() - true * lit) * (1 - np.eye(len(true)))
     return np.linalg.norm(off) / np.linalg.norm(true * (1 - np.eye(len(true))))
 

@@ -132,7 +132,8 @@ def scan(folder, photographer=None):
             if photographer is None:
                 raise
             print(
-                f"{missing.missing:3} photographs, the first: {str(missing).partition(': ')[2][:47]} ..."
+                f"{missing.missing:3} photographs, the first: "
+                f"{str(missing).partition(': ')[2][:47]} ..."
             )
             photographer(folder, rig)
 
@@ -212,7 +213,7 @@ def exchange(files):
 
 
 def moved(files):
-    """From photograph 80 on the camera looks elsewhere."""
+    """The camera looks elsewhere from photograph 80 on."""
     for path in files[79:]:
         Image.fromarray(np.roll(np.asarray(Image.open(path)), 2, axis=1)).save(path)
 

@@ -63,7 +63,7 @@ print(f"{done.worst.error:.1%} ({done.worst.name})")
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=240, supersample=2)
 
 

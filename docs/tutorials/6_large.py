@@ -47,7 +47,7 @@ small = ltcl.compensate(C, wanted, gain="auto")
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

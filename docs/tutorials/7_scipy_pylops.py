@@ -74,7 +74,7 @@ found = pylops.optimization.leastsquares.regularized_inversion(
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(np.reshape(light, corner.grid), size=320, supersample=2)
 
 
