@@ -95,7 +95,7 @@ def follow(call: Callable[[], Any]) -> Way:
 
 
 def frames_below_solver(frame: FrameType) -> int:
-    """Python frames from the launch of a product up to the solver that asked for it, 0 without one."""
+    """Python frames from the launch of a product up to the solver that asked, 0 without one."""
     for depth, (caller, _) in enumerate(traceback.walk_stack(frame)):
         if "/ltcl/solvers/" in caller.f_code.co_filename:
             return depth

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Stores: what is written comes back by rows, plain zarr reads it, and damage to any file is noticed."""
+"""Stores: rows come back as written, plain zarr reads them, damage to any file is noticed."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_missing_blocks_are_named_and_written_ones_replaced(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("sigmas", [0.0, 0.5])
 def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
-    """Variances of `fill` are 1, 2, ... in the order of the entries; only the first few are far above."""
+    """Variances of `fill` are 1, 2, ... in order of the entries; only the first are far above."""
     store = make(tmp_path / "T.zarr", **SQUARE, channels=3)
     fill(store, with_variance=True, final=False).finalize(sigmas=sigmas)
     expected = []

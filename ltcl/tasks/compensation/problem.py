@@ -18,10 +18,11 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.device import Device
+from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
 from ltcl.operators import Operator, ScaledColumns, as_operator
 from ltcl.solvers import SolveSettings
-from ltcl.solvers.bounded import Bounded, minimise, round_inwards
+from ltcl.solvers.bounded import Bounded, minimise
 from ltcl.transport.transport import Transport
 
 # Pictures (M, k) or light (N, k), one array per system.

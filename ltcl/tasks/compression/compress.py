@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`compress`: a transport on compressed operators, with bounds on the loss of pictures, or of any light.
+"""`compress`: transports as compressed operators, with bounds on the loss of pictures or light.
 
 R of every channel is written between bases in which it is sparse, and small numbers are dropped:
 R~ = R + E.
@@ -163,7 +163,7 @@ def compress(
 
 
 def check_rtol(rtol: Any, least: float) -> float:
-    """Return `rtol`; refuse it before any work where a product in float32 already rounds by as much."""
+    """Return `rtol`; refuse, before any work, one that float32 products exceed by rounding."""
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     if rtol <= least:
         rounding = checks.upwards(least)

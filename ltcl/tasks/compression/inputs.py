@@ -93,7 +93,7 @@ def check_inputs(
     noise: Noise | None,
     **reading: Any,
 ) -> CompressionInputs:
-    """Check the input of `compress`: a Transport, operators, or rows; see `source` for `reading`."""
+    """Check the input of `compress`: a Transport, operators or rows; `reading` as in `source`."""
     if isinstance(T, Transport):
         for name, value in {"grid": grid, "first_bounce": first_bounce, "device": device}.items():
             if value is not None:
@@ -190,7 +190,7 @@ def inputs_of_transport(
 
 
 def _noise_factors(problem: CompressionProblem, noise: Noise, channel: int) -> np.ndarray:
-    """Factors (2, N) of the variance of R = T F^-1 - I; photons count by the mean entry of a column."""
+    """Variance factors (2, N) of R = T F^-1 - I; photons count by the mean entry of a column."""
     F = problem.F
     ones = problem.operator.device.upload(np.ones(len(F), np.float32))
     column_sums = problem.operator.apply_transpose(ones).get().astype(np.float64)
