@@ -54,7 +54,7 @@ def make(data: Path, given: Options) -> dict[str, Any]:
     """Make what `data` lacks; facts of all its scenes."""
     facts: dict[str, Any] = {}
     names = ("coloured",) if given.smoke else dataset.NAMES
-    missing = [name for name in names if name not in dataset.found(data)]
+    missing = [name for name in names if name not in dataset.find_scenes(data)]
     why = tracing.unavailable() if missing else ""
     if why:
         facts[f"NOT TRACED: {', '.join(missing)}"] = why
@@ -68,7 +68,7 @@ def make(data: Path, given: Options) -> dict[str, Any]:
             dataset.trace(
                 data / name, name, **(small if given.smoke else {"size": given.arguments.size})
             )
-    if not (scenes := dataset.found(data)):
+    if not (scenes := dataset.find_scenes(data)):
         raise SystemExit(f"{data} has no scenes, and none can be traced: {why}")
     return facts | {name: scene.facts for name, scene in scenes.items()}
 
@@ -85,7 +85,7 @@ def main() -> None:
         data = given.arguments.data or Path(scratch)
         facts, results = make(data, given), dict[str, dict[str, dict[str, Any]]]()
         table = Table("scene", "method", *scoring.COLUMNS, *scoring.OTHERS)
-        for name, scene in dataset.found(data).items():
+        for name, scene in dataset.find_scenes(data).items():
             results[name] = {"traced": scoring.traced(scene)}
             for method, command in chosen.items():
                 print(f"{name}: {method}", flush=True)
