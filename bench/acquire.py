@@ -9,9 +9,9 @@ counted as an error):
 
     T p             of patterns that no scan has seen
     compensated     a picture that is shown with the pattern that T says
-    bounces 1 to 3  of a picture, against their `std`, which is known without the truth: root mean
-    squares far light       the sum of what a pixel gets from beyond its tile of n / 8 pixels and
-    the tiles around it
+    bounces 1 to 3  of a picture, against their `std`, which is known without the truth
+    far light       root mean square of the sum that a pixel gets from beyond its tile of n / 8
+                    pixels and the tiles around it
 
 An adaptive scan has to need a fifth of the photographs of one pixel at a time at most. Smaller
 corners give photographs and time against the number of pixels, beside what the plan said before the

@@ -2,12 +2,12 @@
 """Exact form factors between flat patches at any angle and distance, without occlusion.
 
     a_i F_ij = int_i int_j  cos(t_i) cos(t_j) / (pi r^2)  da_j da_i
-             = 1 / (2 pi)  sum over the edges p of i, q of j:  (p . q)  int int ln r  ds dt,   0 <
-             s, t < 1
+             = 1 / (2 pi)  sum_p sum_q (p . q)  int_0^1 int_0^1  ln r  ds dt
 
-(the second line by Stokes' theorem; p and q run around the fronts). Pairs farther apart than they
-are large take Gauss-Legendre points on both patches: the kernel is smooth there and every term
-positive. Nearer pairs, and those where the plane of one patch cuts the other, take the integral
+(the second line by Stokes' theorem: edges p run around the front of patch i, q around that of j).
+Pairs farther apart than they are large take Gauss-Legendre points on both patches: the kernel is
+smooth there and every term positive. Nearer pairs, and those where the plane of one patch cuts the
+other, take the integral
 over both outlines, of what lies in front: along q it has a closed form, and along p it is smooth
 but for logarithms where p passes the ends of q and where both lines come closest, so p is cut there
 and Gauss points crowd towards the ends of each piece. Far patches would lose digits so, a factor
