@@ -29,8 +29,8 @@ import numpy as np
 
 ROUNDING = 1e-5  # relative deviation of arrays that counts as rounding
 VARIABLE_FIELDS = re.compile(
-    r"(seconds|time|date|speed|version|python|system|numpy|scipy|pyopencl|ltcl|rate|latency|bandwidth"
-    r"|created|host|pid|memory|free|per_second|frames_per_second|flops|driver|path|cache)",
+    r"(seconds|time|date|speed|version|python|system|numpy|scipy|pyopencl|ltcl|rate|latency"
+    r"|bandwidth|created|host|pid|memory|free|per_second|frames_per_second|flops|driver|path|cache)",
     re.IGNORECASE,
 )
 TRANSPORT_OPTIONS = ["--first-bounce", "--on-dark", "--dark", "--noise"]

@@ -59,7 +59,8 @@ class BlockStore:
     ----------
     layout : StoreLayout
     provenance, attributes : dict
-        Plain JSON: where the transport comes from; what `update` keeps.
+        Plain JSON: where the transport comes from; what `update` keeps. Those of the last time
+        that this object read or wrote the store; `update` adds to what others have written since.
     final : bool
 
     Examples

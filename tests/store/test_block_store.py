@@ -173,6 +173,17 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
         store.extra("words", np.array(["a"]))
 
 
+def test_update_keeps_what_others_have_changed_since_it_was_opened(tmp_path: Path) -> None:
+    first = make(tmp_path / "T.zarr")
+    first.update(both=0)
+    second = BlockStore.open(first.path)
+    first.update(one=1, both=1)
+    second.update(two=2)
+    expected = {"one": 1, "two": 2, "both": 1}
+    assert second.attributes == expected
+    assert BlockStore.open(first.path).attributes == expected
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -121,6 +121,8 @@ def threshold_within(frobenius: float, *arrays: np.ndarray, most: float = math.i
 class Coefficients:
     """The numbers of R between two bases of at least `threshold`: R~ = W_out^T core W_in.
 
+    With weights of columns, this R~ is the weighted R; `Bases` takes the weights off again.
+
     `first` is the Frobenius norm of what was dropped between the passes, `second` of what was
     dropped at the end.
     """

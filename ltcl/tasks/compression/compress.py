@@ -69,7 +69,8 @@ def compress(
         see `norm`. "noise" keeps what stands out of `T.noise`, a Transport's, by 3 standard
         deviations; by 1.4 where pictures have most of their light, by 4 where they have none.
     budget : int, optional
-        Bytes that the cores of all channels may take together on the device.
+        Bytes that the cores of all channels may take together on the device. It limits nothing on
+        the way: compression runs to its end, and then raises an error if it needs more.
     norm : "pictures" or "worst"
         Light that the error bound covers, pictures or any; `rtol` limits this error, and the
         result's `error` states it. The error of pictures is the largest loss of 256 fresh random

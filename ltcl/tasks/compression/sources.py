@@ -249,7 +249,7 @@ def _can_workers_fetch(client: Any, matrix: Any) -> bool:
     return False
 
 
-def interreflection(T: SourceRows, F: np.ndarray) -> SourceRows:
+def interreflection_rows(T: SourceRows, F: np.ndarray) -> SourceRows:
     """R = T F^-1 - I by rows, computed in float64 and rounded once.
 
     The column of a masked pixel, F = 0, is 0.
