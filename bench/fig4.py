@@ -13,6 +13,7 @@ converge to l_d.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -42,7 +43,7 @@ FALLING_TERMS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Terms and sums of the series on the picture of a scene, (TERMS + 1, 3, N) for n = 0, 1, ..."""
+    """Terms and sums of the series on a picture, (TERMS + 1, 3, N) for n = 0, 1, ..."""
 
     scene: Scene
     l_d: np.ndarray
@@ -66,7 +67,7 @@ def measure(n: int, device: ltcl.Device) -> Series:
 
 
 def bleeding(scene: Scene, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How much redder the floor is beside the red wall, and how much greener beside the green one.
+    """Excess of red on the floor beside the red wall, and of green beside the green one.
 
     Mean over the nearest patches of (..., 3, N), less that of the other colours, relative to its
     size.
@@ -79,13 +80,13 @@ def bleeding(scene: Scene, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def colour_excess(colours: np.ndarray, channel: int, opposite: int) -> np.ndarray:
-    """One channel of (..., 3) above the mean of the opposite one and blue, relative to all."""
+    """Relative excess of a channel of (..., 3) over the mean of the opposite one and blue."""
     others = (colours[..., opposite] + colours[..., 2]) / 2
     return (colours[..., channel] - others) / np.abs(colours).mean(axis=-1)
 
 
 def colour_cast(scene: Scene, values: np.ndarray) -> float:
-    """Largest difference between colours of a patch on the neutral walls, relative to their mean."""
+    """Largest relative difference between the colours of a patch on the neutral walls."""
     n = scene.grid[0]
     neutral = values.reshape(3, n, 6, n)[:, :, list(NEUTRAL)]
     spread = np.ptp(neutral, axis=0) / neutral.mean(axis=0)
@@ -93,7 +94,7 @@ def colour_cast(scene: Scene, values: np.ndarray) -> float:
 
 
 def contents(n: int, bounces: int) -> np.ndarray:
-    """How often A^j l_d is in n terms on l_out: 0 for 1 <= j <= n.
+    """Multiples of A^j l_d in n terms on l_out: 0 for 1 <= j <= n.
 
     These are the coefficients of eq. 12 times I + A + A^2 + ...
     """
@@ -245,7 +246,7 @@ def draw_errors(figure: Figure, series: Series) -> None:
     axes.set_xlim(0, TERMS)
 
 
-def draw_channel_error(axes: Axes, series: Series, channel: int, name: str, **look: str) -> None:
+def draw_channel_error(axes: Axes, series: Series, channel: int, name: str, **look: Any) -> None:
     truth = series.l_d[channel]
     deviations = np.linalg.norm(series.sums[:, channel] - truth, axis=1)
     axes.plot(deviations / np.linalg.norm(truth), label=name, lw=2, **look)

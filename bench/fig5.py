@@ -51,7 +51,7 @@ def error_bounds(albedo: float) -> np.ndarray:
 
 
 def swings(n: int, device: ltcl.Device) -> dict[str, np.ndarray]:
-    """Sums of 0 .. ORDERS terms over the truth, red light, at three patches of the floor of figure 4."""
+    """Sums of 0 .. ORDERS terms over the truth, in red light, at three patches of a floor."""
     scene, l_d = boxes.coloured_box(n)
     T = scene.transport(first_bounce=scene.first_bounce, device=device)
     l_out = boxes.all_bounces(scene, l_d)
@@ -66,7 +66,7 @@ def swings(n: int, device: ltcl.Device) -> dict[str, np.ndarray]:
 
 
 def norms(n: int, albedo: float, device: ltcl.Device) -> np.ndarray:
-    """||S^-1 - S_k^-1||, the largest singular value, of a closed box for k = 1 .. ORDERS (eq. 16)."""
+    """Largest singular value of S^-1 - S_k^-1 of a closed box for k = 1 .. ORDERS (eq. 16)."""
     scene = box(n, albedo=albedo)
     exact = np.eye(6 * n * n) - albedo * scene.form_factors
     (S,) = scene.transport(first_bounce=scene.first_bounce, device=device).systems
@@ -215,9 +215,14 @@ def divergence_claim(text: str, race: Race) -> Claim:
 
 
 def chebyshev_claim(races: list[Race]) -> Claim:
-    products = max(race.chebyshev.products for race in races)
-    error = max(race.error for race in races)
-    has_converged = all(race.chebyshev.converged for race in races)
+    products = 0
+    error = 0.0
+    has_converged = True
+    for box_race in races:
+        products = max(products, box_race.chebyshev.products)
+        error = max(error, box_race.error)
+        if not box_race.chebyshev.converged:
+            has_converged = False
     measured = f"to 1e-5 in at most {products} products, {error:.1g} off the truth"
     text = "ours: Chebyshev converges in all of them"
     return Claim(text, measured, "below 1e-4", has_converged and error < 1e-4)
@@ -284,8 +289,9 @@ def draw_jacobi(axes: Axes, name: str, box_race: Race, shade: str) -> None:
     # The last residual of one wall is 0.
     residuals = np.maximum(box_race.jacobi.residuals[: DRAWN_STEPS + 1], low / 10)
     is_outside = (residuals <= low) | (residuals >= high)
-    # The first residual is 1 and inside.
-    last = int(np.argmax(is_outside)) if is_outside.any() else len(residuals) - 1
+    last = len(residuals) - 1
+    if is_outside.any():
+        last = int(np.argmax(is_outside))
     axes.plot(residuals[: last + 1], color=shade, lw=2)
     end = residuals[last]
     alignment = "bottom"
@@ -294,7 +300,9 @@ def draw_jacobi(axes: Axes, name: str, box_race: Race, shade: str) -> None:
     elif last == DRAWN_STEPS:
         alignment = "center"
     height = float(np.clip(1.3 * end, 1.3 * low, high))
-    label = f" {name} diverges" if box_race.diverged else f" {name}"
+    label = f" {name}"
+    if box_race.diverged:
+        label += " diverges"
     axes.text(last, height, label, color=shade, fontsize=10, fontweight="bold", va=alignment)
 
 

@@ -38,6 +38,7 @@ LAMP = (0.85, 0.75, 0.8)
 GLOSSY_ALBEDO = 1.6 * np.array(ALBEDO[:5])
 GLOSS = 0.5
 EXPONENT = 150
+DIRECTIONS = 64
 PROJECTOR = (2.3, 0.75, 0.7)
 # Iterations that are made, and those whose pictures are drawn.
 ITERATIONS = 30
@@ -45,6 +46,18 @@ DRAWN_SHADOWS = (1, 2, 10)
 DRAWN_GLOSS = (1, 2, 20)
 # Bounces end where they are so small beside their sum: float32 products tell no more.
 BOUNCE_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """Patches along a wall; the spectrum of the box of one camera needs a dense matrix."""
+
+    shadows: int = 14
+    gloss: int = 12
+    camera: int = 6
+
+
+SMOKE_SIZES = Sizes(shadows=4, gloss=4, camera=4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,16 +142,9 @@ def with_gloss(n: int, smoke: bool) -> Recovery:
 def glossy_box(n: int, smoke: bool) -> Any:
     """Five glossy walls, camera and projector before the sixth."""
     room = boxes.from_the_front(box(1, 5, ALBEDO[:5]))
-    return glossy(
-        room,
-        n,
-        GLOSSY_ALBEDO,
-        GLOSS,
-        EXPONENT / 2 if smoke else EXPONENT,
-        projector=PROJECTOR,
-        directions=16 if smoke else 64,
-        rays=32,
-    )
+    exponent, directions = (EXPONENT / 2, 16) if smoke else (EXPONENT, DIRECTIONS)
+    place: Any = {"projector": PROJECTOR, "directions": directions, "rays": 32}
+    return glossy(room, n, GLOSSY_ALBEDO, GLOSS, exponent, **place)
 
 
 class LightField(scipy.sparse.linalg.LinearOperator):
@@ -242,18 +248,18 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
     return figure
 
 
-def camera_radius(options: Options) -> float:
-    """rho(R) of the glossy box as one camera and one projector see it."""
-    # Smaller than the box that is drawn: its spectrum is that of a dense matrix.
-    scene = glossy_box(4 if options.smoke else 6, options.smoke)
+def camera_radius(n: int, options: Options) -> float:
+    """Spectral radius of R of the glossy box as one camera and one projector see it."""
+    scene = glossy_box(n, options.smoke)
     T = scene.transport(scene.first_bounce, options.device, on_dark="mask")
     return max(channel.spectral_radius for channel in ltcl.analyze(T).channels)
 
 
 def main() -> None:
     options = parse_options(__doc__)
-    shade = with_shadows(4 if options.smoke else 14, options.device)
-    gloss = with_gloss(4 if options.smoke else 12, options.smoke)
+    sizes = SMOKE_SIZES if options.smoke else Sizes()
+    shade = with_shadows(sizes.shadows, options.device)
+    gloss = with_gloss(sizes.gloss, options.smoke)
     unknowns = []
     errors = []
     albedos = []
@@ -266,7 +272,7 @@ def main() -> None:
         "relative error after n iterations": errors,
         "largest albedo": albedos,
     }
-    listed = claims(shade, gloss, camera_radius(options))
+    listed = claims(shade, gloss, camera_radius(sizes.camera, options))
     title = "Figure 6: shadows and gloss"
     figures.conclude(options, title, listed, facts, lambda: draw(shade, gloss))
 

@@ -71,7 +71,7 @@ FINE_RTOL = 5e-4
 MAX_ROW_WAVELETS = 128
 BLOCK_BYTES = 1 << 28
 
-# A slope is fitted where times are at least so many times the launch floor, to at least so many points.
+# A slope is fitted to times of at least so many launch floors, and to at least so many points.
 FLOOR_RATIO = 5.0
 MIN_SLOPE_POINTS = 3
 # Smaller pictures have too few wavelets for a claim about their number.
@@ -82,7 +82,7 @@ LABEL_OFFSETS = {"rows": 5, "both": -5}
 
 @dataclass(frozen=True)
 class Method:
-    """How it is drawn, and the range of its slope, which is free for a peer."""
+    """Label and look of a method, and the range of its slope, which is free for a peer."""
 
     label: str
     colour: str
@@ -101,7 +101,7 @@ METHODS = {
 
 @dataclass(frozen=True)
 class Problem:
-    """A corner, a picture of it, (N,) float32, and the direct light that makes it, (N,) float64."""
+    """A corner, a picture of it, (N,) float32, and the direct light behind it, (N,) float64."""
 
     rows: Bounce
     l_out: np.ndarray
@@ -115,7 +115,7 @@ class Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """A method that is ready to run, and figures of its first run; `kept` are numbers of R a row."""
+    """A method ready to run, and figures of its first run; `kept` are numbers of R a row."""
 
     run: Callable[[], np.ndarray]
     error: float
@@ -223,7 +223,7 @@ def wavelet_way(corner: Problem, W: Wavelet, C: Any, both: bool) -> Way:
 
 @dataclass(frozen=True)
 class Point:
-    """One method at one N."""
+    """Time of a method at one N."""
 
     method: str
     pixels: int
@@ -298,10 +298,12 @@ def select_method(points: list[Point], name: str) -> list[Point]:
 
 def curve(points: list[Point], name: str) -> tuple[np.ndarray, np.ndarray]:
     """N and seconds of one method, by rising N."""
-    own_points = select_method(points, name)
-    pixels = np.array([point.pixels for point in own_points])
-    times = np.array([point.seconds for point in own_points])
-    return pixels, times
+    pixels = []
+    times = []
+    for point in select_method(points, name):
+        pixels.append(point.pixels)
+        times.append(point.seconds)
+    return np.array(pixels), np.array(times)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,7 +333,8 @@ def law(pixels: np.ndarray, times: np.ndarray) -> Law:
     first = min(int(small[-1]) + 1, len(pixels) - MIN_SLOPE_POINTS)
     pixels = pixels[first:]
     above = times[first:] - floor
-    slope, factor = 0.0, 0.0
+    slope = 0.0
+    factor = 0.0
     if above.min() > 0.0:
         slope, log_factor = np.polyfit(np.log(pixels), np.log(above), 1)
         factor = np.exp(log_factor)
@@ -346,10 +349,10 @@ def law(pixels: np.ndarray, times: np.ndarray) -> Law:
 
 def slowdown(points: list[Point], slow: str, fast: str) -> tuple[int, float]:
     """The largest N that both methods reach, and how many times longer one takes there."""
-    slow_times = {point.pixels: point.seconds for point in select_method(points, slow)}
-    fast_times = {point.pixels: point.seconds for point in select_method(points, fast)}
+    slow_times = dict(zip(*curve(points, slow), strict=True))
+    fast_times = dict(zip(*curve(points, fast), strict=True))
     last = max(slow_times.keys() & fast_times.keys())
-    return last, slow_times[last] / fast_times[last]
+    return int(last), float(slow_times[last] / fast_times[last])
 
 
 def method_facts(method: Method, points: list[Point]) -> dict[str, list[float]]:
@@ -492,7 +495,9 @@ def main() -> None:
     points = []
     for n in SMOKE_SIZES if options.smoke else SIZES:
         points += measure(options, n)
-    laws = {} if options.smoke else all_laws(points)
+    laws: dict[str, Law] = {}
+    if not options.smoke:
+        laws = all_laws(points)
     facts: dict[str, Any] = {"albedo": ALBEDO}
     for name, method in METHODS.items():
         facts |= method_facts(method, select_method(points, name))

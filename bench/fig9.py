@@ -11,7 +11,9 @@ measured by `bench/dense4k.py`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -56,7 +58,7 @@ class Parts:
 
     @property
     def turns(self) -> np.ndarray:
-        """Share of each bounce's light on the two walls that is on the wall in turn, (BOUNCES + 1,)."""
+        """Share of the light of each bounce that is on the wall in turn, (BOUNCES + 1,)."""
         n = self.scene.grid[0]
         light = np.abs(self.light.reshape(BOUNCES + 1, n, -1, n, 3))
         on_walls = light.sum(axis=(1, 3, 4))[:, :2]
@@ -85,16 +87,12 @@ def diffuse(n: int, device: ltcl.Device) -> Parts:
 
 def with_board(n: int, smoke: bool, device: ltcl.Device) -> Parts:
     """The dihedral with the board, as one camera and one projector see it, and its separation."""
-    scene = glossy(
-        [*dihedral(1).walls, BOARD],
-        n,
-        (WHITE, WHITE, GREY),
-        (0, 0, 0.3),
-        120 if smoke else 500,
-        projector=PROJECTOR,
-        camera=CAMERA,
-        directions=16 if smoke else 64,
-    )
+    exponent, directions = (120, 16) if smoke else (500, 64)
+    walls = [*dihedral(1).walls, BOARD]
+    albedo = (WHITE, WHITE, GREY)
+    gloss = (0, 0, 0.3)
+    place: Any = {"projector": PROJECTOR, "camera": CAMERA, "directions": directions}
+    scene = glossy(walls, n, albedo, gloss, exponent, **place)
     pattern = np.zeros((*scene.grid, 3))
     pattern[:, :n] = GREEN
     pattern[:, 2 * n :] = 0.22
@@ -176,7 +174,7 @@ def join_numbers(values: np.ndarray, form: str) -> str:
 
 
 def draw_parts(figure: Figure, parts: Parts, top: float, text: str) -> None:
-    """Picture, direct and global light; below them the bounces, each as bright as it can be shown."""
+    """Picture, direct and global light; below them the bounces, each as bright as possible."""
     scene = parts.scene
     lefts, width = figures.columns(BOUNCES, gap=24)
     # A highlight may be cut off.
@@ -220,11 +218,12 @@ def draw(plain: Parts, board: Parts) -> Figure:
 
 
 def main() -> None:
-    options = parse_options(__doc__ or "")
-    plain = diffuse(6 if options.smoke else 24, options.device)
-    board = with_board(5 if options.smoke else 14, options.smoke, options.device)
+    options = parse_options(__doc__)
+    plain_size, board_size = (6, 5) if options.smoke else (24, 14)
+    plain = diffuse(plain_size, options.device)
+    board = with_board(board_size, options.smoke, options.device)
     facts = {
-        "patches": [int(np.prod(parts.scene.grid)) for parts in (plain, board)],
+        "patches": [math.prod(plain.scene.grid), math.prod(board.scene.grid)],
         "reciprocity defect of the glossy scene": board.separation.reciprocity_defect,
     }
     listed = claims(plain, board)

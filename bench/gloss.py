@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Quality of the single-view approximation: bounces of glossy scenes by one camera and one projector.
+"""Quality of the single-view approximation: bounces of glossy scenes by one camera.
 
 T = P S F Q (eq. 28) is taken for S' F', with F' = P F Q diagonal and S' = T F'^-1, and bounce k of
 a picture for (I - S'^-1)^k F' l_in, where the light field has P A^k F Q l_in (eq. 29). Those are
@@ -45,7 +45,7 @@ SHADES: dict[float, str] = {5: COLOURS["direct"], 20: COLOURS["chebyshev"], 60: 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One scene and its results; lists are for the direct light and the bounces after it.
+    """Results of a scene; lists are for the direct light and the bounces after it.
 
     Attributes
     ----------
@@ -164,11 +164,13 @@ def round_all(values: np.ndarray) -> list[float]:
 
 def measure_cases(options: Options) -> list[Case]:
     if options.smoke:
-        n, directions = 4, 16
+        n = 4
+        directions = 16
         exponents = [5, 20]
         shares = (0.0, 0.1, 0.2, 0.4)
     else:
-        n, directions = 10, 64
+        n = 10
+        directions = 64
         exponents = list(SHADES)
         shares = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
     cases = []
@@ -192,11 +194,7 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
     moderate = [case for case in cases if 0 < case.gloss <= MODERATE_GLOSS]
     return [
         *exactness_claims(cases, matte),
-        limit_claim(
-            f"bounce 1 is about right at gloss {MODERATE_GLOSS:g}",
-            max(case.off[1] for case in moderate),
-            0.3,
-        ),
+        first_bounce_claim(moderate),
         decay_claim(moderate),
         iterations_claim(moderate),
         *warning_claims(cases, matte),
@@ -215,6 +213,11 @@ def exactness_claims(cases: Sequence[Case], matte: Sequence[Case]) -> list[Claim
         limit_claim("compensation is exact of any gloss", compensation_error, 1e-4),
         limit_claim("none of it is clipped", clipped, 0.0),
     ]
+
+
+def first_bounce_claim(moderate: Sequence[Case]) -> Claim:
+    error = max(case.off[1] for case in moderate)
+    return limit_claim(f"bounce 1 is about right at gloss {MODERATE_GLOSS:g}", error, 0.3)
 
 
 def limit_claim(text: str, value: float, most: float) -> Claim:
@@ -265,7 +268,8 @@ def warning_claims(cases: Sequence[Case], matte: Sequence[Case]) -> list[Claim]:
 
 def negative_claim(moderate: Sequence[Case]) -> Claim:
     ratios = [case.negative[1] / case.off[1] for case in moderate]
-    least, most = min(ratios), max(ratios)
+    least = min(ratios)
+    most = max(ratios)
     return Claim(
         "negative light in bounce 1 tells how far it is off",
         f"it is {least:.2f} to {most:.2f} times the error, at gloss up to {MODERATE_GLOSS:g}",
@@ -280,7 +284,8 @@ def draw(cases: Sequence[Case]) -> Figure:
         "Glossy scenes: what one camera and one projector can tell",
         "A dihedral of albedo 0.5, left wall lit. "
         "Solid: both walls glossy; dashed: only the unlit one.",
-        "Errors are those of separated bounces against $P A^k F Q$ of the full light field (eq. 29).",
+        "Errors are those of separated bounces against $P A^k F Q$ "
+        "of the full light field (eq. 29).",
     )
     left, right = 80, 560
     above, below = 150, 490

@@ -176,20 +176,24 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
     has_target = not (method == "bounded" and "wavelets" in kind)
     is_hit = launches <= target.launches and waits <= target.waits and allocations == 0
     verdict = "hit" if is_hit else "MISS"
+    targets = f"{target.launches}, {target.waits}"
+    if not has_target:
+        verdict = ""
+        targets = "none: in pixels"
     return {
         "operator": kind,
         "method": method,
         "k": k,
         "launches a step": launches,
         "waits a step": waits,
-        "targets": f"{target.launches}, {target.waits}" if has_target else "none: in pixels",
+        "targets": targets,
         "waits, with checks": round(traffic.waits / iterations, 2),
         "allocations": allocations,
         "bytes over the bus a step": round(traffic.nbytes / iterations),
         "first solve: launches": len(first.events) - first.waits,
         "waits": first.waits,
         "KB over the bus": round(first.nbytes / 1e3, 1),
-        "verdict": verdict if has_target else "",
+        "verdict": verdict,
     }
 
 

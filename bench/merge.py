@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs to radiance, beside OpenCV: megapixels a second, noise of the picture, error of the response.
+"""Photographs to radiance, beside OpenCV: megapixels a second, noise, error of the response.
 
 A smooth scene in three colours at 6 exposures, by a camera with an sRGB curve, 10000 electrons, a
 read noise of 0.2 % and a black offset of 0.4 %. A megapixel is one of a photograph, of three
@@ -140,8 +140,9 @@ def judge_response(estimate: Callable[[], np.ndarray]) -> tuple[float, float]:
 
 def main() -> None:
     options = parse_options(__doc__)
-    rows = merging_rows(options, 64 if options.smoke else 1200)
-    rows += response_rows(64 if options.smoke else 400)
+    merged_size, response_size = (64, 64) if options.smoke else (1200, 400)
+    rows = merging_rows(options, merged_size)
+    rows += response_rows(response_size)
     facts = {"exposures": len(EXPOSURES), "opencv": cv2.__version__}
     report(options, "Merging exposures", rows, facts)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which method when: products with S that each one takes to 1 %, from dim rooms to bright ones.
+"""Products with S that each method takes to 1 %, from dim rooms to bright ones.
 
 Closed boxes of one albedo m, where rho(R) = m / (1 - m); an open corner of albedo 0.9; and a glossy
 corner, whose S of one camera is not self-adjoint. A third of the pixels has random direct light.
@@ -41,12 +41,11 @@ def problem(name: str, scene: Any, options: Options) -> Problem:
 
 def rooms(smoke: bool) -> dict[str, Any]:
     """Scenes by their names in the table."""
-    n = 4 if smoke else 16
+    n, directions = (4, 16) if smoke else (16, 64)
     scenes: dict[str, Any] = {}
     for rho in RADII:
         scenes[f"rho {rho:g}"] = box(n, sides=6, albedo=rho / (1.0 + rho))
     scenes["corner"] = box(n, sides=3, albedo=CORNER_ALBEDO)
-    directions = 16 if smoke else 64
     scenes["glossy"] = glossy(dihedral(1), n, 0.5, GLOSS, directions=directions, **GLOSSY_ROOM)
     return scenes
 

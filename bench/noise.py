@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Accuracy of the noise model of T: standard deviations of entries, estimated over true, on known scenes.
+"""Accuracy of the noise of T: standard deviations, estimated over true, on known scenes.
 
 `Transport.noise` from T alone and from a second measurement, with noise of 1e-5 to 1e-2 of the
 median first bounce: a floor alone; with photon noise as large at the first bounce; and with 300
@@ -26,7 +26,7 @@ from _harness import parse_options
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
 
-# Noise floors, in median first bounces, and variances of photon noise at the first bounce, in floors.
+# Noise floors in median first bounces; variances of photon noise at the first bounce, in floors.
 LEVELS = (1e-5, 1e-4, 1e-3, 1e-2)
 PHOTONS = (0.0, 1.0, 300.0)
 # An estimate is good within this factor; a case, with so many good entries.
@@ -77,8 +77,10 @@ def main() -> None:
         is_good += [case.within >= MIN_SHARE for case in cases]
     text = f"cases of which 95 % of the entries are within a factor {MAX_FACTOR}"
     claim = Claim(text, f"{sum(is_good)} of {len(is_good)}", "all", all(is_good))
-    # Scenes of --smoke are too small for the claim.
-    listed = [] if options.smoke else [claim]
+    listed = [claim]
+    if options.smoke:
+        # Its scenes are too small for the claim.
+        listed = []
     figures.conclude(options, "Noise of T, estimated over true", listed, facts, Figure)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A transport of 8 GB on a disk, host and device held to 2 GB: products, solves; and rows on two devices.
+"""A transport of 8 GB on a disk, host and device held to 2 GB; and rows on two devices.
 
 T = (I + R) F on a grid of 212 x 212 pixels has light between pixels that falls with their distance
 in the order of rows, so that products are also to be had by FFT in float64: these judge the
@@ -55,7 +55,7 @@ NEAR_DIAGONALS = 8
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """T_ij = (1 on the diagonal + kernel[|i - j|]) F_j in a file, and its products without the file."""
+    """T_ij = ((i == j) + kernel[|i - j|]) F_j in a file, and its products without the file."""
 
     side: int
     file: Path
@@ -178,11 +178,11 @@ def solve_tasks(options: Options, scene: Scene, T: np.ndarray) -> dict[str, str]
     near = near_transport(scene, whole, options.device)
 
     def compensate(T: ltcl.Transport, **settings: Any) -> tuple[int, float]:
-        answer = ltcl.compensate(T, pictures, **settings)
+        answer: Any = ltcl.compensate(T, pictures, **settings)
         return answer.solution.products, residual(scene, answer.pattern, pictures)
 
     def separate() -> tuple[int, float]:
-        answer = ltcl.separate(whole, pictures[0], 2)
+        answer: Any = ltcl.separate(whole, pictures[0], 2)
         products = sum(solution.products for solution in answer.solutions)
         # Light on the projector with this direct part makes the picture.
         pattern = answer.direct / whole.first_bounce.reshape(grid)

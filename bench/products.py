@@ -68,7 +68,7 @@ class Form:
     y: np.ndarray
 
     def operators(self, options: Options, numbers: Any) -> tuple[Operator, Operator]:
-        """(core, operator on pictures) of some numbers: sparse rows, or tiles of 16 bits in a basis."""
+        """The core and the operator on pictures: sparse rows, or tiles of 16 bits in a basis."""
         if self.into is None:
             rows = CSR(options.device, numbers)
             return rows, rows
@@ -81,9 +81,9 @@ class Form:
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """One format at one error.
+    """Figures of a format at one error.
 
-    `kept` are numbers a row, `pixels` the milliseconds of a product, `core` those of its core alone.
+    `kept` are numbers a row, `pixels` the milliseconds of a product, `core` those of its core.
     """
 
     form: str
@@ -211,14 +211,22 @@ def draw(
 
 def draw_form(memory: Axes, time: Axes, form: str, points: list[Point]) -> None:
     """Curves of one format: error over memory, and over time."""
-    errors = [point.error for point in points]
-    megabytes = [point.nbytes / 1e6 for point in points]
-    pixel_ms = [point.pixels for point in points]
+    errors = []
+    megabytes = []
+    pixel_ms = []
+    core_ms = []
+    for point in points:
+        errors.append(point.error)
+        megabytes.append(point.nbytes / 1e6)
+        pixel_ms.append(point.pixels)
+        core_ms.append(point.core)
     style = {"color": COLOURS[form], "marker": "o", "ms": 4, "lw": 2}
     memory.loglog(megabytes, errors, **style)
-    time.loglog(pixel_ms, errors, ls="--" if form == "both" else "-", **style)
     if form == "both":
-        time.loglog([point.core for point in points], errors, **style)
+        time.loglog(pixel_ms, errors, ls="--", **style)
+        time.loglog(core_ms, errors, **style)
+    else:
+        time.loglog(pixel_ms, errors, ls="-", **style)
     name = FORMATS[form].replace("rows ", "rows\n").replace("sides ", "sides\n")
     label = {"color": COLOURS[form], "ha": "center", "fontsize": 9}
     memory.text(megabytes[0], 1.15 * errors[0], name, **label)
@@ -233,7 +241,7 @@ def draw_peers(time: Axes, ms: dict[str, float]) -> None:
 
 
 def draw_gain(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> None:
-    """How much less ours takes at 1 % than others, and where the dense product stands."""
+    """Mark the gain of ours over others at 1 %, and the dense product."""
     theirs, ours = pair
     bottom = min(ERRORS) / 1.3
     axes.vlines(dense, bottom, max(ERRORS), color=PEER_COLOUR, lw=1, ls=":")

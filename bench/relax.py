@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A Gauss-Seidel sweep, beside one product with the same matrix and beside PyAMG's; and block Gauss-Seidel.
+"""A sweep of Gauss-Seidel and of its block form, beside one product and beside PyAMG's.
 
 S = I + R with N = 131072 pixels and 256 nonzeros a row, in runs of 16 neighbours and at random, and
 a dense R of 4096 pixels. Ours is timed with vectors on the device, as inside a solve; PyAMG relaxes
@@ -29,53 +29,70 @@ PYAMG_TARGETS = {"runs of 16": 2.4, "random": 1.4}
 PYAMG_DENSE_TARGET = 6.0
 
 
-def full_matrix(R: Any) -> scipy.sparse.csr_array:
+def full_matrix(R: Any) -> Any:
     """S = I + R in CSR, float32."""
     identity = scipy.sparse.eye_array(R.shape[0])
     S = scipy.sparse.csr_array(identity + scipy.sparse.csr_array(R))
     return S.astype(np.float32)
 
 
-def compare(options: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> list[Row]:
-    is_sparse = scipy.sparse.issparse(R)
-    operator = CSR(options.device, R) if is_sparse else Dense(options.device, R)
-    S = IdentityPlus(operator)
-    n = S.shape[0]
-    b = np.random.default_rng(1).random(n, dtype=np.float32)
-    device_b = options.device.upload(b)
-    relax = relaxation(S, "gauss_seidel")
-    block_relax = relaxation(S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
+class SweepTimer:
+    """Sweeps with one matrix on the device, and PyAMG's on the host."""
 
-    def start(how: Any) -> Sweeps:
-        x = options.device.upload(np.zeros(n, np.float32))
-        return Sweeps(how, x, device_b, device_b.like())
+    def __init__(self, options: Options, R: Any) -> None:
+        self.device = options.device
+        self.R = R
+        make = CSR if scipy.sparse.issparse(R) else Dense
+        self.S = IdentityPlus(make(options.device, R))
+        n = self.S.shape[0]
+        self.b = np.random.default_rng(1).random(n, dtype=np.float32)
+        relax = relaxation(self.S, "gauss_seidel")
+        block_relax = relaxation(self.S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
+        self.strip = relax.block
+        self.sweeps = self.start(relax)
+        self.block_sweeps = self.start(block_relax)
 
-    sweeps = start(relax)
-    block_sweeps = start(block_relax)
+    def start(self, method: Any) -> Sweeps:
+        """Sweeps of a method from x = 0."""
+        x = self.device.upload(np.zeros(len(self.b), np.float32))
+        b = self.device.upload(self.b)
+        return Sweeps(method, x, b, b.like())
 
-    def sweep(sweeps: Sweeps) -> None:
+    def sweep(self, sweeps: Sweeps) -> None:
+        """Run one sweep and wait for it."""
         sweeps.sweep()
-        options.device.finish()
+        self.device.finish()
 
-    actions: dict[str, Callable[[], object]] = {
-        "product": product(S.R, b),
-        "sweep": lambda: sweep(sweeps),
-        "block": lambda: sweep(block_sweeps),
-    }
-    if pyamg_sweep is not None:
-        full = full_matrix(R)
-        x = np.zeros(n, np.float32)
-        pyamg_sweep(full, x, b)
-        sweep(sweeps)
-        if not np.allclose(sweeps.x.get(), x, rtol=1e-4, atol=1e-5):
-            raise SystemExit(f"the sweep of {name} is not that of PyAMG")
-        actions["pyamg"] = lambda: pyamg_sweep(full, x, b)
-    ms = {key: 1e3 * spent for key, spent in seconds(actions, repeats=15).items()}
+    def milliseconds(self, pyamg_sweep: Callable | None) -> dict[str, float]:
+        """Median times of a product and of sweeps, in turn."""
+        actions: dict[str, Callable[[], object]] = {
+            "product": product(self.S.R, self.b),
+            "sweep": lambda: self.sweep(self.sweeps),
+            "block": lambda: self.sweep(self.block_sweeps),
+        }
+        if pyamg_sweep is not None:
+            actions["pyamg"] = self.checked_pyamg(pyamg_sweep)
+        return {key: 1e3 * spent for key, spent in seconds(actions, repeats=15).items()}
+
+    def checked_pyamg(self, pyamg_sweep: Callable) -> Callable[[], object]:
+        """PyAMG's sweep, after the first ones of both were compared."""
+        full = full_matrix(self.R)
+        x = np.zeros(len(self.b), np.float32)
+        pyamg_sweep(full, x, self.b)
+        self.sweep(self.sweeps)
+        if not np.allclose(self.sweeps.x.get(), x, rtol=1e-4, atol=1e-5):
+            raise SystemExit(f"the sweep of {len(x)} pixels is not that of PyAMG")
+        return lambda: pyamg_sweep(full, x, self.b)
+
+
+def compare(options: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> list[Row]:
+    timer = SweepTimer(options, R)
+    ms = timer.milliseconds(pyamg_sweep)
 
     def row(question: str, competitor: str, key: str, ours: str, target: float) -> Row:
         return Row.from_times(question, competitor, ms[key], ms[ours], "ms", target)
 
-    strips = f"{name}, strips of {relax.block}"
+    strips = f"{name}, strips of {timer.strip}"
     block_method = f"{name}, block method"
     rows = [
         row(strips, "one product", "product", "sweep", PRODUCT_TARGET),
@@ -88,7 +105,7 @@ def compare(options: Options, name: str, R: Any, pyamg_sweep: Callable | None) -
 
 
 def find_pyamg_sweep() -> Callable | None:
-    """PyAMG's Gauss-Seidel sweep, or None if PyAMG is not installed (the extra `bench` brings it)."""
+    """PyAMG's Gauss-Seidel sweep, or None if it is not installed (the extra `bench` brings it)."""
     if importlib.util.find_spec("pyamg") is None:
         return None
     return importlib.import_module("pyamg.relaxation.relaxation").gauss_seidel

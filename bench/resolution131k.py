@@ -127,7 +127,7 @@ def build(options: Options, rows: Bounce) -> Built:
 
 
 def fewest_for_patterns(W: Wavelet, rows: Bounce, cores: list[Any]) -> list[Any]:
-    """As few numbers of each core as leave the direct light of another picture off by 0.6 %."""
+    """Drop numbers of each core until the direct light of another picture is off by 0.6 %."""
     h, w = rows.grid
     picture = scaled_landscape(h, w).mean(axis=2)
     grey = np.roll(picture, (h // 3, w // 5), (0, 1)).reshape(-1)
@@ -147,7 +147,7 @@ def fewest_for_patterns(W: Wavelet, rows: Bounce, cores: list[Any]) -> list[Any]
 
 
 def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]:
-    """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
+    """A landscape, its pattern, direct light and bounces, (h, w, 3), and errors of all but it."""
     desired = scaled_landscape(*rows.grid)
     with built.spent("compensate, first call"):
         pattern = built.compensate(desired).pattern
@@ -244,7 +244,9 @@ def main() -> None:
     ms = measure_ms(built, images[0])
     facts = build_facts(options, built, rows.shape[0], ms)
     names = ["pattern", "direct"] + [f"bounce {k}" for k in range(1, BOUNCES + 1)]
-    listed = [] if options.smoke else claims(names, errors, ms)
+    listed = []
+    if not options.smoke:
+        listed = claims(names, errors, ms)
     title = "131072 pixels in colour"
     figures.conclude(options, title, listed, facts, lambda: draw(names, images))
 

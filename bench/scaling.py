@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How much faster two MPI ranks solve than one, and a model's prediction for 64 GPUs.
+"""Gain of two MPI ranks over one, and a model's prediction for 64 GPUs.
 
 A product over p ranks takes t(p) = a + b E / p + c N with E stored entries and N pixels: calls; the
 entries of a rank; and the vector, whole on each, which is read from the device, exchanged, written
@@ -43,6 +43,7 @@ ROUNDS = 11
 PRODUCTS = 4
 # Rows of a matrix that one random generator makes.
 BLOCK_ROWS = 256
+Actions = dict[str, Callable[[], object] | None]
 # The model's machine; bytes a second, and seconds.
 GPUS = 64
 MEMORY_SPEED = 0.8 * 3.35e12
@@ -86,7 +87,7 @@ def size_rows(n: int, k: int, times: dict[str, float]) -> list[Row]:
 
 
 def model(sizes: tuple[tuple[int, int], ...], results: list[dict[str, float]]) -> dict[str, Any]:
-    """a, b and c, at least 0, by least squares of relative deviations, and what follows for GPUs."""
+    """Fit a, b and c, at least 0, to relative deviations, and predict products on GPUs."""
     terms = []
     times = []
     for (n, k), result in zip(sizes, results, strict=True):
@@ -153,45 +154,59 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
     b = np.random.default_rng(1).random(n, np.float32)
     own_rows = matrix(comm.rank * half, (comm.rank + 1) * half, n, entries)
     operators = rank_operators(comm, alone, n, entries, own_rows)
-
-    def solve(A: Any) -> np.ndarray:
-        return ltcl.solve(IdentityPlus(A), b, "chebyshev", rtol=1e-4, spectrum=(0.5, 1.5)).x
-
-    def run_products(A: Any, x: Any) -> None:
-        for _ in range(PRODUCTS):
-            A.apply(x).device.finish()
-
-    own_half = np.zeros(half, np.float32)
-    whole = np.zeros(n, np.float32)
-
-    def exchange_halves() -> None:
-        for _ in range(PRODUCTS):
-            comm.Allgatherv(own_half, whole)
-
-    actions: dict[str, Callable[[], object] | None] = {"exchange": exchange_halves}
-    for name in ("no MPI", "1 rank", "2 ranks", "4 ranks"):
-        A = operators.get(name)
-        # All ranks go through the same names in the same order.
-        actions[f"product {name}"] = None
-        actions[f"solve {name}"] = None
-        if A is not None:
-            actions[f"product {name}"] = partial(run_products, A, A.device.upload(b))
-            if name != "4 ranks":
-                actions[f"solve {name}"] = partial(solve, A)
-    device = operators["2 ranks"].device
-    triad_of_half, _ = triad(device, n * entries < 1 << 20, 2)
+    triad_of_half, _ = triad(operators["2 ranks"].device, n * entries < 1 << 20, 2)
+    actions: Actions = {"exchange": exchange_halves(comm, n)}
+    actions |= operator_actions(operators, b)
     actions |= memory_actions(comm, "reading the same", partial(read_numbers, own_rows))
     actions |= memory_actions(comm, "triad", triad_of_half)
     times = median_seconds(comm, actions)
     for name in times:
         if name.startswith(("product", "exchange")):
             times[name] /= PRODUCTS
-    distributed = solve(operators["2 ranks"])
+    distributed = solve(operators["2 ranks"], b)
     difference = 0.0
     if "no MPI" in operators:
-        deviation = np.linalg.norm(distributed - solve(operators["no MPI"]))
+        deviation = np.linalg.norm(distributed - solve(operators["no MPI"], b))
         difference = float(deviation / np.linalg.norm(distributed))
     return times | {"difference": difference}
+
+
+def solve(A: Any, b: np.ndarray) -> np.ndarray:
+    return ltcl.solve(IdentityPlus(A), b, "chebyshev", rtol=1e-4, spectrum=(0.5, 1.5)).x
+
+
+def run_products(A: Any, x: Any) -> None:
+    for _ in range(PRODUCTS):
+        A.apply(x).device.finish()
+
+
+def operator_actions(operators: dict[str, Any], b: np.ndarray) -> Actions:
+    """Products and solves; a rank has None for those in which it takes no part.
+
+    All ranks go through the same names in the same order.
+    """
+    actions: Actions = {}
+    for name in ("no MPI", "1 rank", "2 ranks", "4 ranks"):
+        A = operators.get(name)
+        actions[f"product {name}"] = None
+        actions[f"solve {name}"] = None
+        if A is not None:
+            actions[f"product {name}"] = partial(run_products, A, A.device.upload(b))
+            if name != "4 ranks":
+                actions[f"solve {name}"] = partial(solve, A, b)
+    return actions
+
+
+def exchange_halves(comm: Any, n: int) -> Callable[[], None]:
+    """Exchanges of the halves of a vector, as products make them."""
+    own_half = np.zeros(n // 2, np.float32)
+    whole = np.zeros(n, np.float32)
+
+    def exchange() -> None:
+        for _ in range(PRODUCTS):
+            comm.Allgatherv(own_half, whole)
+
+    return exchange
 
 
 def read_numbers(own_rows: Any) -> None:
@@ -203,9 +218,7 @@ def read_numbers(own_rows: Any) -> None:
         own_rows.view(np.int32).max()
 
 
-def memory_actions(
-    comm: Any, name: str, read_half: Callable[[], object]
-) -> dict[str, Callable[[], object] | None]:
+def memory_actions(comm: Any, name: str, read_half: Callable[[], object]) -> Actions:
     """Reading of both halves by the first rank, and of a half by each."""
 
     def one_rank() -> None:
@@ -220,7 +233,7 @@ def memory_actions(
 
 
 def matrix(start: int, stop: int, n: int, entries: int) -> Any:
-    """Rows that sum to 1/4, the same on all ranks, with an entry in each of `entries` equal pieces."""
+    """Rows that sum to 1/4, the same on all ranks, an entry in each of `entries` equal pieces."""
     piece = n // entries
     blocks = []
     for first in range(start, stop, BLOCK_ROWS):
@@ -239,7 +252,7 @@ def matrix(start: int, stop: int, n: int, entries: int) -> Any:
     return scipy.sparse.vstack(blocks, "csr")
 
 
-def median_seconds(comm: Any, actions: dict[str, Callable[[], object] | None]) -> dict[str, float]:
+def median_seconds(comm: Any, actions: Actions) -> dict[str, float]:
     """Median seconds of each in turn; a rank sleeps while others have something to do alone."""
     times: dict[str, list[float]] = {name: [] for name in actions}
     # The first round warms up.

@@ -45,7 +45,7 @@ class Problem:
 
     @property
     def is_sparse(self) -> bool:
-        """Whether R is a sparse matrix."""
+        """True if R is a sparse matrix."""
         return scipy.sparse.issparse(self.R)
 
     def full_matrix(self) -> Any:
@@ -112,7 +112,7 @@ def neumann(problem: Problem) -> tuple[np.ndarray, int]:
 
 
 def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
-    """One right-hand side after the other; the products are those inside its iteration."""
+    """Solve one right-hand side after the other; the products are those inside its iteration."""
     residuals: list[float] = []
     columns = []
     for side in problem.b.reshape(len(problem.b), -1).T:
@@ -146,14 +146,16 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
 
     has_one_column = problem.b.ndim == 1
     rows = []
+    neumann_target = None
+    gmres_target = None
     if has_one_column:
+        neumann_target = NEUMANN_TARGET
+        gmres_target = GMRES_TARGET
         rows.append(Row.from_times(name, "3 later solves", 3 * ms["ours"], first_ms, "ms", 1.0))
     fewer = Row.from_times(
         name, "Neumann's products", neumann_products, ours.products, "products", PRODUCTS_TARGET
     )
     library = "scipy.sparse" if problem.is_sparse else "numpy"
-    neumann_target = NEUMANN_TARGET if has_one_column else None
-    gmres_target = GMRES_TARGET if has_one_column else None
     loop = f"{library} Neumann loop"
     return [
         *rows,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Deviations, denoising and `rtol="noise"` of path-traced transports, judged by independent measurements.
+"""Deviations, denoising and `rtol="noise"` of path-traced transports, by other measurements.
 
 Mitsuba traces (`scenes.tracing`) a corner, a box, and a box with blocks ten times each. Twice, one
 is judged by the mean of eight others, whose own errors are subtracted from all ratios; with the
@@ -173,13 +173,17 @@ def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
 
 
 def way_claims(name: str, judgements: list[Judgement]) -> list[Claim]:
-    deviations = np.array([judgement.deviations for judgement in judgements])
-    denoised = np.array([judgement.denoised for judgement in judgements])
-    compressed = np.array([judgement.compressed for judgement in judgements])
+    deviations = []
+    denoised = []
+    compressed = []
+    for judgement in judgements:
+        deviations.append(judgement.deviations)
+        denoised.append(judgement.denoised)
+        compressed.append(judgement.compressed)
     return [
-        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", deviations),
-        DENOISED_LIMITS.claim(f"{name}: denoised", denoised),
-        COMPRESSED_LIMITS.claim(f"{name}: compressed", compressed),
+        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", np.array(deviations)),
+        DENOISED_LIMITS.claim(f"{name}: denoised", np.array(denoised)),
+        COMPRESSED_LIMITS.claim(f"{name}: compressed", np.array(compressed)),
     ]
 
 
@@ -206,7 +210,8 @@ def main() -> None:
     is_halved: list[bool] = []
     for scene in ("simulated",) if options.smoke else SCENES:
         if options.smoke:
-            measured, off = simulated_measurements(), {}
+            measured = simulated_measurements()
+            off = {}
         else:
             measured, off = traced_measurements(scene)
         facts[f"{scene}: bounces of one view, off"] = off
@@ -219,8 +224,9 @@ def main() -> None:
             claims += way_claims(name, judgements)
     halved = f"{sum(is_halved)} of {len(is_halved)}"
     claims.append(Claim("denoised: at most half is left", halved, "all", all(is_halved)))
-    listed = [] if options.smoke else claims
-    figures.conclude(options, "Path-traced transports", listed, facts, Figure)
+    if options.smoke:
+        claims = []
+    figures.conclude(options, "Path-traced transports", claims, facts, Figure)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Video: frames a second from decoded sRGB codes to the 8-bit codes of the projector, 256 x 512 in colour.
+"""Video: frames a second from decoded sRGB codes to the codes of the projector, in colour.
 
-T is as `ltcl.compress` makes it of a smooth scene: db2 wavelets on both sides, with a core of some
-thousand coarse coefficients, ten numbers a row. Frames drift slowly and are compensated one by one,
-and by eights as `ltcl.batch.compensate_frames` does, which is timed with its pictures on disk.
+T has 256 x 512 pixels and is as `ltcl.compress` makes it of a smooth scene: db2 wavelets on both
+sides, with a core of some thousand coarse coefficients, ten numbers a row. Frames drift slowly and
+are compensated one by one, and by eights as `ltcl.batch.compensate_frames` does, which is timed
+with its pictures on disk.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def symmetric_core(grid: tuple[int, int], coarse: tuple[int, int]) -> Any:
 
 
 def film(T: ltcl.Transport, frames: int) -> np.ndarray:
-    """Decoded frames, (frames, h, w, 3) uint8: a landscape that drifts, within reach of the projector."""
+    """A landscape that drifts, in codes, (frames, h, w, 3) uint8, within the projector's reach."""
     h, w = T.grid
     picture = np.asarray(landscape(h, w), np.float32).reshape(h, w, -1)[..., :3]
     light = np.broadcast_to(0.1 + 0.2 * picture, (h, w, 3))
@@ -123,8 +124,10 @@ def rate_row(name: str, spent: float) -> Row:
     rate = BATCH / spent
     target = INVERSE_TARGET if name.startswith("inverse") else SOLVE_TARGET
     ratio = rate / target
-    # Files take as long as the machine's disk.
-    least = None if "png" in name else 1.0
+    least: float | None = 1.0
+    if "png" in name:
+        # Files take as long as the machine's disk.
+        least = None
     return Row(name, f"{target:g} frames/s", target, rate, "frames/s", ratio, least)
 
 

@@ -62,10 +62,7 @@ FLAGS = (
 # Seconds that the browser may take to start, and a page to show an element.
 TIMEOUT = 60.0
 
-# Pixels along a wall of both transports.
-LARGE = 256
-SMALL = 48
-# Largest milliseconds of the probe, least frames a second, and largest seconds of the first picture.
+# Largest milliseconds of the probe, least frames a second, largest seconds of the first picture.
 PROBE_MS = 60.0
 SMALL_PROBE_MS = 20.0
 PAINTING_RATE = 25.0
@@ -74,12 +71,7 @@ FILM_RATE = 24.0
 SMALL_RATE = 1e3 / SMALL_PROBE_MS
 FIRST_PICTURE_SECONDS = 3.0
 
-# What is measured: movements of the probe, seconds of painting, frames of a film, starts.
-MOVES = 100
-TOUCH_SECONDS = 5.0
-FILM_FRAMES = 150
 FILM_FPS = 30.0
-STARTS = 3
 
 # Milliseconds from each of `count` movements over the projector's picture to a column of T.
 PROBE = """async (count) => {
@@ -150,6 +142,21 @@ OPEN_TAB = "(view) => document.getElementById(`tab-${view}`).click()"
 HAS_ELEMENT = "(selector) => Boolean(document.querySelector(selector))"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Workload:
+    """Patches along a wall of both transports, and amounts of what is measured with them."""
+
+    large: int = 256
+    small: int = 48
+    moves: int = 100
+    touch_seconds: float = 5.0
+    film_frames: int = 150
+    starts: int = 3
+
+
+SMOKE_WORKLOAD = Workload(large=8, small=4, moves=5, touch_seconds=0.5, film_frames=10, starts=1)
+
+
 def wait_until(condition: Callable[[], bool], message: str, pause: float) -> None:
     """Check a condition until it holds, or raise TimeoutError."""
     end = time.monotonic() + TIMEOUT
@@ -169,7 +176,7 @@ def find_browser() -> str:
 
 
 class Chromium(contextlib.AbstractContextManager):
-    """One page of a browser without a window."""
+    """A page of a browser without a window."""
 
     def __init__(self) -> None:
         self._resources = contextlib.ExitStack()
@@ -216,7 +223,7 @@ class Chromium(contextlib.AbstractContextManager):
                 return answer["result"]
 
     def open(self, url: str) -> None:
-        """Go to a page, and wait until it has drawn something and asks nothing any more."""
+        """Go to a page, and wait until it has drawn something and needs nothing more."""
         self._request("Page.navigate", url=url)
         if "#" not in url:
             self.wait("#probe-camera-canvas[data-frame]")
@@ -260,7 +267,9 @@ def first_picture(page: Chromium, T: ltcl.Transport, folder: Path) -> float:
     ltcl.save(file, T)
     start = time.perf_counter()
     command = [sys.executable, "-m", "ltcl", "view", str(file), "--no-browser"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:  # noqa: S603 - ours
+    with subprocess.Popen(  # noqa: S603 - ours
+        command, stderr=subprocess.PIPE, text=True
+    ) as process:
         page.open(printed_url(process))
         spent = time.perf_counter() - start
         process.terminate()
@@ -290,15 +299,14 @@ class Touch:
     column_cpu_ms: float
 
 
-def touch(page: Chromium, T: ltcl.Transport, options: Options) -> Touch:
+def touch(page: Chromium, T: ltcl.Transport, workload: Workload) -> Touch:
     """Move pointer and sliders in the viewer."""
-    duration = 0.5 if options.smoke else TOUCH_SECONDS
-    moves = 5 if options.smoke else MOVES
+    moves = workload.moves
 
     def measure_rate(view: str, drawn: str, script: str) -> float:
         page.evaluate(OPEN_TAB, view)
         page.wait(drawn, "body[data-state=ready]")
-        return page.evaluate(script, duration)
+        return page.evaluate(script, workload.touch_seconds)
 
     with ltcl.view(T, {"landscape": landscape(*T.grid)}, open_browser=False) as viewer:
         page.open(viewer.url)
@@ -316,10 +324,10 @@ def touch(page: Chromium, T: ltcl.Transport, options: Options) -> Touch:
         )
 
 
-def play_film(page: Chromium, T: ltcl.Transport, folder: Path, options: Options) -> Pace:
+def play_film(page: Chromium, T: ltcl.Transport, folder: Path, frame_count: int) -> Pace:
     """The pace of a film with a kept inverse."""
     film = folder / "film.mkv"
-    codes = video.film(T, 10 if options.smoke else FILM_FRAMES)
+    codes = video.film(T, frame_count)
     frames = (video.TO_LINEAR[frame] for frame in codes)
     write_video(film, frames, FILM_FPS)
     rules: Any = {"rtol": video.RTOL, "inverse": ltcl.invert(T, video.RTOL)}
@@ -348,15 +356,15 @@ def format_grid(T: ltcl.Transport) -> str:
 
 def main() -> None:
     options = parse_options(__doc__)
-    large = transport(options, 8 if options.smoke else LARGE)
-    small = transport(options, 4 if options.smoke else SMALL)
-    starts = 1 if options.smoke else STARTS
+    workload = SMOKE_WORKLOAD if options.smoke else Workload()
+    large = transport(options, workload.large)
+    small = transport(options, workload.small)
     with tempfile.TemporaryDirectory() as name, Chromium() as page:
         folder = Path(name)
-        large_touch = touch(page, large, options)
-        small_touch = touch(page, small, options)
-        first = np.median([first_picture(page, large, folder) for _ in range(starts)])
-        film = play_film(page, large, folder, options)
+        large_touch = touch(page, large, workload)
+        small_touch = touch(page, small, workload)
+        first = np.median([first_picture(page, large, folder) for _ in range(workload.starts)])
+        film = play_film(page, large, folder, workload.film_frames)
     size = format_grid(large)
     small_size = format_grid(small)
     film_text = f"a film of {FILM_FPS:g} frames/s, {size}"
@@ -381,8 +389,9 @@ def main() -> None:
         "latency of the film, s": film.latency,
         "load of the machine": os.getloadavg()[0],
     }
-    listed = [] if options.smoke else claims
-    figures.conclude(options, "The viewer in Chromium", listed, facts, Figure)
+    if options.smoke:
+        claims = []
+    figures.conclude(options, "The viewer in Chromium", claims, facts, Figure)
 
 
 if __name__ == "__main__":

@@ -75,9 +75,7 @@ def numba_walker(
     return lambda: walk(pointers, threshold, own_target, alias, sums, b, out)
 
 
-def coloured_matrices(
-    options: Options, R: scipy.sparse.csr_array, random: np.random.Generator
-) -> list[CSR]:
+def coloured_matrices(options: Options, R: Any, random: np.random.Generator) -> list[CSR]:
     """R of three colours with one sparsity pattern."""
     n = R.shape[0]
     matrices: list[CSR] = []
@@ -91,8 +89,8 @@ def coloured_matrices(
     return matrices
 
 
-def compare_colours(options: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
-    """Steps of walks that three channels share, counted for each, beside those of a walk a channel."""
+def compare_colours(options: Options, R: Any, samples: int) -> Row:
+    """Steps of walks that three channels share, counted for each, beside a walk a channel."""
     random = np.random.default_rng(3)
     n = R.shape[0]
     pixels = np.arange(n)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The files of a scene: two measurements of T by bounces, and photographs of patterns that T never saw.
+"""The files of a scene: two measurements of T by bounces, and photographs of other patterns.
 
-README.md describes the format. A traced scene comes from Mitsuba; a simulated one, for machines
-without LLVM, from ltcl's form factors: T_k = A^k F, each measurement with noise of its own.
+Photographs are of patterns that T never saw. README.md describes the format. A traced scene comes
+from Mitsuba; a simulated one, for machines without LLVM, from ltcl's form factors: T_k = A^k F,
+each measurement with noise of its own.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def text_pattern(grid: tuple[int, int]) -> np.ndarray:
 
 
 def relight(T: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Pictures of patterns p, (K, h, w) or (K, h, w, 3), by T, (N, N) or (3, N, N), or by its diagonal."""
+    """Pictures of patterns p, (K, h, w[, 3]), by T, ([3,] N, N), or by its diagonal."""
     pixels = p.shape[1] * p.shape[2]
     # (channels, K, N)
     light = np.moveaxis(p.reshape(len(p), pixels, -1), -1, 0)
@@ -101,7 +102,7 @@ class Scene:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """How it was made."""
+        """Origin of the scene, and the settings it was made with."""
         return json.loads((self.folder / "scene.json").read_text(encoding="utf-8"))
 
     @cached_property

@@ -150,7 +150,7 @@ def child_cpu_seconds() -> float:
 
 def describe_exit(error: subprocess.CalledProcessError) -> str:
     """The exit status of a command, and the last line that it wrote."""
-    output = error.stderr or error.stdout
+    output = error.stderr if error.stderr else error.stdout
     lines = output.decode(errors="replace").strip().splitlines()
     last = lines[-1] if lines else "nothing"
     return f"exit status {error.returncode}, it said: {last:.200}"
@@ -163,7 +163,7 @@ def kept_nbytes(out: Path, transport: Path) -> int:
 
 
 def traced(scene: Scene) -> dict[str, Any]:
-    """Scores of the true patterns and of the first measurement's own bounces: those of noise alone."""
+    """Scores of the true patterns and of the first measurement's bounces: those of noise alone."""
     p = scene.photographs["patterns"]
     return judge(scene, {"patterns": p, "bounces": scene.bounces("first", p)})
 

@@ -35,7 +35,7 @@ VARIANT = "llvm_ad_rgb"
 
 @dataclass(frozen=True)
 class Cuboid:
-    """Its middle, half of its sides, and degrees around y."""
+    """A box: its middle, half of its sides, and degrees around y."""
 
     middle: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -159,10 +159,12 @@ def unavailable() -> str:
     attempt = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if attempt.returncode == 0:
         return ""
-    lines = attempt.stderr.strip().splitlines() or [""]
-    # The reason is in the last line of a traceback, in the first one of LLVM.
-    reason = lines[-1] if attempt.returncode == 1 else lines[0]
-    return f"Mitsuba's llvm_ad_rgb ended with {attempt.returncode}: {reason}"
+    reason = ""
+    lines = attempt.stderr.strip().splitlines()
+    if lines:
+        # The reason is in the last line of a traceback, in the first one of LLVM.
+        reason = lines[-1] if attempt.returncode == 1 else lines[0]
+    return f"Mitsuba's {VARIANT} ended with {attempt.returncode}: {reason}"
 
 
 def load_mitsuba() -> Any:
@@ -181,7 +183,7 @@ def version() -> str:
 
 
 def trace(name: str, grid: tuple[int, int], paths: int, seed: int) -> np.ndarray:
-    """T by bounces (`BOUNCES`, N, N) float32 of a scene of `TRACED`, in colour (`BOUNCES`, 3, N, N).
+    """T by bounces of a scene of `TRACED`, (`BOUNCES`, N, N) or (`BOUNCES`, 3, N, N) float32.
 
     Their sum is T. A camera pixel sends at least so many `paths`. Seeds give independent
     measurements.
@@ -303,7 +305,7 @@ class PathTracer:
 
 
 def photographs(name: str, patterns: np.ndarray, samples: int, seed: int) -> np.ndarray:
-    """Pictures of the scene under each of the patterns, (K, h, w) or (K, h, w, 3) in [0, 1], of its shape.
+    """Pictures of the scene under patterns (K, h, w) or (K, h, w, 3) in [0, 1], of the same shape.
 
     Rendered by Mitsuba's path integrator and projector emitter. In a scene without colour three
     patterns are rendered at once, as red, green and blue.
