@@ -29,8 +29,8 @@ import numpy as np
 
 ROUNDING = 1e-5  # relative deviation of arrays that counts as rounding
 VARIABLE_FIELDS = re.compile(
-    r"(seconds|time|date|speed|version|python|system|numpy|scipy|pyopencl|ltcl|rate|latency|bandwidth"
-    r"|created|host|pid|memory|free|per_second|frames_per_second|flops|driver|path|cache)",
+    r"(seconds|time|date|speed|version|python|system|numpy|scipy|pyopencl|ltcl|rate|latency"
+    r"|bandwidth|created|host|pid|memory|free|per_second|frames_per_second|flops|driver|path|cache)",
     re.IGNORECASE,
 )
 TRANSPORT_OPTIONS = ["--first-bounce", "--on-dark", "--dark", "--noise"]
@@ -180,7 +180,10 @@ def task_commands() -> list[str]:
         "separate corner.npz picture.exr --first-bounce estimate --out s5 --json",
         "separate colour.npz colour-picture.exr --out s6 --json",
         "separate corner.npz picture.exr grey.png --out s7 --json",
-        "separate corner.npz picture.exr --method monte_carlo --samples 64 --seed 5 --out s8 --json",
+        (
+            "separate corner.npz picture.exr --method monte_carlo --samples 64 --seed 5 "
+            "--out s8 --json"
+        ),
         "separate corner.npz picture.exr --method hybrid --samples 16 --out s9 --json",
         "separate corner.npz picture.exr --inverse inverse.npz --out s10 --json",
         "separate small2.npz picture.exr --out s11 --json",
@@ -391,7 +394,7 @@ def without_variable_fields(value: Any) -> Any:
 
 
 def digest(path: Path) -> Any:
-    """What a file holds: numbers of arrays as sums, JSON as its fields, else a hash."""
+    """Contents of a file: arrays as sums of numbers, JSON as its fields, all else as a hash."""
     if path.suffix == ".json":
         return plain_text(path.read_text("utf-8", errors="replace"))
     if path.suffix in (".npz", ".npy"):
@@ -458,7 +461,7 @@ def differences(before: Any, after: Any, place: str) -> Iterator[str]:
 
 
 def named_by_line(runs: dict[str, Any]) -> dict[str, Any]:
-    """Runs by their command lines, which may stand in another order; the second of a line gets a 2."""
+    """Name runs by their command lines, whose order may differ; the second of a line gets a 2."""
     named: dict[str, Any] = {}
     for key, value in runs.items():
         line = key.partition(": ")[2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Install a wheel and a source archive as a user would, for each Python that ltcl is for, and use them.
+"""Install a wheel and a source archive as a user would, and use them, for each Python of ltcl.
 
 Each archive goes into an empty virtual environment of its own, away from the checkout. All other
 packages come as wheels: nothing is compiled. Then `ltcl doctor` and a small `ltcl demo` must end
@@ -47,7 +47,7 @@ def interpreter(version: str) -> str | None:
 
 
 def use(python: str, archive: Path, folder: Path) -> str | None:
-    """Install `archive` for `python` below `folder` and use it; the output of the first step that failed."""
+    """Install `archive` for `python` below `folder` and use it; the output of a failed step."""
     environment = {name: value for name, value in os.environ.items() if name not in HIDDEN}
     environment |= {"POCL_CACHE_DIR": str(folder / "pocl"), "LTCL_CACHE": str(folder / "cache")}
     own = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")

@@ -54,7 +54,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Refuse a run without any test of the `device` fixture, which fails where there is no device."""
+    """Refuse a run without a test of the `device` fixture, which fails if there is no device."""
     fixtures: set[Any] = set().union(*(getattr(item, "fixturenames", ()) for item in session.items))
     if "device" not in fixtures:
         raise pytest.UsageError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 7: what it takes to find the direct light l_d of a picture l_out, over the resolution N.
+"""Figure 7: time to find the direct light l_d of a picture l_out, over the resolution N.
 
 A white corner of two walls, N = 128 to 131072, of albedo 0.8: rho(R) is about 0.4 there, and the
 plain series converges. Four ways, the first also by the BLAS of NumPy, each to an error of at most
@@ -10,10 +10,10 @@ plain series converges. Four ways, the first also by the BLAS of NumPy, each to 
     rows        the same with the rows of R in db2 wavelets, the paper's           N W
     both        the same with both sides of R in db2, on coefficients throughout   N W
 
-The last two keep the largest numbers that 0.7 % need, in 16 bits each. Timed is all from the
-picture on the host to l_d on the host, once R is in the form that the method wants. Dense R is (I -
-A)^-1 - I by factorization (`_corner.py`). Both compressed forms come from C of R = W^T C W, which
-eq. 21 makes on coefficients from rows of A that stream by, as in `resolution131k.py`; rows in
+The last two keep the largest numbers that 0.7 % need, in 16 bits each. The time is that from the
+picture on the host to l_d on the host, once R is in the form that the method needs. Dense R is
+(I - A)^-1 - I by factorization (`_corner.py`). Both compressed forms come from C of R = W^T C W,
+which eq. 21 makes on coefficients from rows of A that stream by, as in `resolution131k.py`; rows in
 wavelets are R W^T = W^T C. Each method goes as far as memory, and some minutes, allow. The truth
 needs no inverse: l_d = l_out - A l_out, A by exact rows.
 """
@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import _figures as figures
@@ -44,26 +45,44 @@ from ltcl.tasks.compression import invert_coefficients
 from ltcl.tasks.compression.coefficients import coefficients
 from ltcl.tasks.compression.sources import source
 
-SIZES, SMOKE = (
-    (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256),
-    (2, 4, 8),
-)  # patches along a wall, N = 2 n^2
-SERIES, DENSE, SQUARES = 4232, 32768, 4  # the largest N; arrays of N x N float32 on the way
-PATIENCE, REPEATS = 3.0, 15  # s: what takes longer runs once
-ABOVE, LEAST = 5.0, 3  # times the launch floor: where a slope begins; of so many points at least
-MANY = 2000  # pixels from which on W is judged: few have few wavelets
-APART = {"rows": 5, "both": -5}  # points, between times that are written beside each other
-ALBEDO, ERROR = 0.8, 1e-2
-DROPPED = 0.7e-2  # of the error, what compression may take; the iteration has the rest
+# Patches along a wall: N = 2 n^2.
+SIZES = (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256)
+SMOKE_SIZES = (2, 4, 8)
+ALBEDO = 0.8
+ERROR = 1e-2
+# Share of the error that compression may take; the iteration has the rest.
+COMPRESSION_ERROR = 0.7e-2
 TOLERANCES = 0.5 ** np.arange(1, 12, 0.5)
-THRESHOLD, FINE = 1e-4, 5e-4  # of numbers of A; of R before it is thresholded
-MOST = 128  # wavelets a row from which the largest are chosen
-MEMORY = 1 << 28  # bytes of a block
+
+# The largest N of the two dense methods.
+MAX_SERIES_PIXELS = 4232
+MAX_DENSE_PIXELS = 32768
+# Arrays of N x N float32 that the host holds at once on the way to dense R.
+DENSE_ARRAYS = 4
+
+# A method whose first run takes more seconds than this is timed by that run alone.
+MAX_REPEATED_SECONDS = 3.0
+REPEATS = 15
+
+# Numbers of A below this are dropped, and of R, before it is thresholded for a picture.
+THRESHOLD = 1e-4
+FINE_RTOL = 5e-4
+# Wavelets a row from which the largest are chosen.
+MAX_ROW_WAVELETS = 128
+BLOCK_BYTES = 1 << 28
+
+# A slope is fitted where times are at least so many times the launch floor, to at least so many points.
+FLOOR_RATIO = 5.0
+MIN_SLOPE_POINTS = 3
+# Smaller pictures have too few wavelets for a claim about their number.
+MIN_WAVELET_PIXELS = 2000
+# Points up or down, where two times would be written upon each other.
+LABEL_OFFSETS = {"rows": 5, "both": -5}
 
 
 @dataclass(frozen=True)
 class Method:
-    """How it is drawn, and between what its slope must be; a peer's is not asked for."""
+    """How it is drawn, and the range of its slope, which is free for a peer."""
 
     label: str
     colour: str
@@ -88,8 +107,13 @@ class Problem:
     l_out: np.ndarray
     l_d: np.ndarray
 
+    @property
+    def pixels(self) -> int:
+        """N."""
+        return len(self.l_out)
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Way:
     """A method that is ready to run, and figures of its first run; `kept` are numbers of R a row."""
 
@@ -103,73 +127,98 @@ class Way:
 
 def problem(n: int) -> Problem:
     rows = Bounce(n, ALBEDO)
-    l_out = 0.05 + 0.4 * landscape(*rows.grid).mean(axis=2).reshape(-1)
+    grey = landscape(*rows.grid).mean(axis=2).reshape(-1)
+    l_out = 0.05 + 0.4 * grey
     return Problem(rows, l_out, l_out - rows.matmat(l_out))
 
 
-def by_steps(S: IdentityPlus, at: Problem, kept: float) -> Way:
+def iteration_way(S: IdentityPlus, corner: Problem, kept: float) -> Way:
     """The iteration, with the loosest tolerance whose error is small enough."""
 
     def solve(rtol: float) -> ltcl.Solution:
-        return ltcl.solve(S, at.l_out, "jacobi", rtol=rtol)
+        return ltcl.solve(S, corner.l_out, "jacobi", rtol=rtol)
 
-    enough = (t for t in TOLERANCES if relative_error(solve(t).x, at.l_d) <= ERROR)
-    rtol = float(next(enough, TOLERANCES[-1]))
-    s = solve(rtol)
+    rtol = loosest_tolerance(lambda rtol: relative_error(solve(rtol).x, corner.l_d))
+    solution = solve(rtol)
     return Way(
-        lambda: solve(rtol).x, relative_error(s.x, at.l_d), s.seconds, s.products, S.nbytes, kept
+        run=lambda: solve(rtol).x,
+        error=relative_error(solution.x, corner.l_d),
+        first=solution.seconds,
+        products=solution.products,
+        nbytes=S.nbytes,
+        kept=kept,
     )
 
 
-def by_numpy(S: IdentityPlus, steps: int) -> np.ndarray:
+def loosest_tolerance(error: Callable[[float], float]) -> float:
+    """The first of TOLERANCES whose error is small enough, or the last."""
+    for rtol in map(float, TOLERANCES):
+        if error(rtol) <= ERROR:
+            return rtol
+    return float(TOLERANCES[-1])
+
+
+def numpy_series(S: IdentityPlus, steps: int) -> np.ndarray:
     """The series by the products of NumPy's BLAS."""
-    less = -S.R.to_dense().astype(np.float32)
-    term, total = less, np.eye(len(less), dtype=np.float32) + less
+    negative_R = -S.R.to_dense().astype(np.float32)
+    term = negative_R
+    total = np.eye(len(term), dtype=np.float32) + term
     for _ in range(steps - 1):
-        term = term @ less
+        term = term @ negative_R
         total += term
     return total
 
 
-def by_matrices(inverse: Callable[[int], np.ndarray], at: Problem, like: Way) -> Way:
+def matrix_way(inverse: Callable[[int], np.ndarray], corner: Problem, iteration: Way) -> Way:
     """The series, of as many terms as the iteration has steps: their sums are the same."""
+    steps = iteration.products - 1
 
     def run() -> np.ndarray:
-        return inverse(like.products - 1) @ at.l_out.astype(np.float32)
+        return inverse(steps) @ corner.l_out.astype(np.float32)
 
     start = time.perf_counter()
     l_d = run()
-    spent = time.perf_counter() - start
-    return Way(run, relative_error(l_d, at.l_d), spent, like.products - 1, like.nbytes, like.kept)
-
-
-def of_rows(given: Options, at: Problem, C: Any) -> Any:
-    """R W^T = W^T C, one column of C after the other."""
-    W = Wavelet(given.device, at.rows.grid, "db2")
-    columns = source("C", scipy.sparse.csr_array(C.T), MEMORY)
-    drop, most = FINE * float(np.linalg.norm(C.data)), MOST * C.shape[0]
-    synthesis = lambda a: W.apply_transpose(given.device.upload(a)).get()  # noqa: E731
-    return scipy.sparse.csr_array(
-        coefficients(columns, None, synthesis, drop=drop, most=most).core.T
+    first = time.perf_counter() - start
+    return Way(
+        run=run,
+        error=relative_error(l_d, corner.l_d),
+        first=first,
+        products=steps,
+        nbytes=iteration.nbytes,
+        kept=iteration.kept,
     )
 
 
-def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
-    """The fewest numbers that will do, in 16 bits, and the iteration with these."""
-    W = Wavelet(given.device, at.rows.grid, "db2")
+def row_coefficients(W: Wavelet, C: Any) -> Any:
+    """R W^T = W^T C, one column of C after the other."""
+    columns = source("C", scipy.sparse.csr_array(C.T), BLOCK_BYTES)
 
-    def system(core: Any, V: Any = W) -> IdentityPlus:
+    def synthesis(coarse: np.ndarray) -> np.ndarray:
+        return W.apply_transpose(W.device.upload(coarse)).get()
+
+    drop = FINE_RTOL * float(np.linalg.norm(C.data))
+    most = MAX_ROW_WAVELETS * C.shape[0]
+    rows = coefficients(columns, None, synthesis, drop=drop, most=most)
+    return scipy.sparse.csr_array(rows.core.T)
+
+
+def wavelet_way(corner: Problem, W: Wavelet, C: Any, both: bool) -> Way:
+    """The fewest numbers that will do, in 16 bits, and the iteration with these."""
+
+    def system(core: Any, V: Any) -> IdentityPlus:
         return IdentityPlus(Compressed(core, V if both else None, V))
 
     def error(core: Any) -> float:
-        S = system(CSR(given.device, core))
-        return relative_error(ltcl.solve(S, at.l_out, "jacobi", rtol=DROPPED / 10).x, at.l_d)
+        S = system(CSR(W.device, core), W)
+        solution = ltcl.solve(S, corner.l_out, "jacobi", rtol=COMPRESSION_ERROR / 10)
+        return relative_error(solution.x, corner.l_d)
 
-    kept = keep_fewest(C, error, DROPPED)
-    core, V = restrict_to_support(kept, W) if both else (kept, W)
-    return by_steps(
-        system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out)
-    )
+    core = keep_fewest(C, error, COMPRESSION_ERROR)
+    V: Any = W
+    if both:
+        core, V = restrict_to_support(core, W)
+    S = system(Tiles(W.device, core, 1, "float16"), V)
+    return iteration_way(S, corner, core.nnz / corner.pixels)
 
 
 @dataclass(frozen=True)
@@ -182,56 +231,80 @@ class Point:
     way: Way
 
 
-def ways(given: Options, at: Problem) -> dict[str, Way]:
+def ways(options: Options, corner: Problem) -> dict[str, Way]:
     """Every method that goes so far, ready to run."""
-    found, n = {}, len(at.l_out)
-    most = (
-        checks.host_memory() / (4 * SQUARES)
-    ) ** 0.5  # pixels of dense R for which memory is left
-    if n <= min(DENSE, most):
-        R = interreflection(at.rows.n, ALBEDO, lambda said: note(f"N = {n}: {said.strip()}"))
-        S = IdentityPlus(Dense(given.device, R))
-        iteration = found["iteration"] = by_steps(S, at, n)
-        if n <= min(SERIES, most):
-            found["series"] = by_matrices(
-                lambda steps: matrix_series(S, steps=steps).x, at, iteration
-            )
-            found["peer"] = by_matrices(lambda steps: by_numpy(S, steps), at, iteration)
-    transform = analysis(Wavelet(given.device, at.rows.grid, "db2"))
-    A = coefficients(
-        source("A", at.rows, MEMORY), transform, transform, THRESHOLD, first=THRESHOLD / 4
-    )
-    both = -invert_coefficients(
-        -A.core, rtol=FINE
-    ).D  # C of R = W^T C W in db2, far finer than needed
-    found["both"] = by_wavelets(given, at, both, True)
-    found["rows"] = by_wavelets(given, at, of_rows(given, at, both), False)
-    return found
+    return dense_ways(options, corner) | compressed_ways(options, corner)
 
 
-def measure(given: Options, n: int) -> list[Point]:
+def dense_ways(options: Options, corner: Problem) -> dict[str, Way]:
+    """The iteration and the series with all numbers of R, if memory is left for these."""
+    n = corner.pixels
+    # Pixels of dense R for which the host has memory.
+    most = (checks.host_memory() / (4 * DENSE_ARRAYS)) ** 0.5
+    if n > min(MAX_DENSE_PIXELS, most):
+        return {}
+    R = interreflection(corner.rows.n, ALBEDO, lambda text: note(f"N = {n}: {text.strip()}"))
+    S = IdentityPlus(Dense(options.device, R))
+    iteration = iteration_way(S, corner, n)
+    dense = {"iteration": iteration}
+    if n <= min(MAX_SERIES_PIXELS, most):
+        dense["series"] = matrix_way(
+            lambda steps: matrix_series(S, steps=steps).x, corner, iteration
+        )
+        dense["peer"] = matrix_way(lambda steps: numpy_series(S, steps), corner, iteration)
+    return dense
+
+
+def compressed_ways(options: Options, corner: Problem) -> dict[str, Way]:
+    """The iteration with R in wavelets, on both sides and in its rows."""
+    W = Wavelet(options.device, corner.rows.grid, "db2")
+    transform = analysis(W)
+    blocks = source("A", corner.rows, BLOCK_BYTES)
+    A = coefficients(blocks, transform, transform, THRESHOLD, first=THRESHOLD / 4)
+    # C of R = W^T C W, far finer than needed.
+    C = -invert_coefficients(-A.core, rtol=FINE_RTOL).D
+    return {
+        "both": wavelet_way(corner, W, C, both=True),
+        "rows": wavelet_way(corner, W, row_coefficients(W, C), both=False),
+    }
+
+
+def measure(options: Options, n: int) -> list[Point]:
     """All methods at one N, timed in turn."""
     start = time.perf_counter()
-    at = problem(n)
-    found, pixels = ways(given, at), len(at.l_out)
-    quick: dict[str, Callable[[], object]] = {
-        k: way.run for k, way in found.items() if way.first <= PATIENCE
-    }
-    spent = {name: way.first for name, way in found.items()} | seconds(quick, REPEATS)
-    for name, way in found.items():
-        ms = f"{1e3 * spent[name]:.4g} ms"
-        note(f"N = {pixels}, {name}: {ms}, error {way.error:.2%}, {way.kept:.4g} a row")
+    corner = problem(n)
+    methods = ways(options, corner)
+    pixels = corner.pixels
+    times = {}
+    actions: dict[str, Callable[[], object]] = {}
+    for name, way in methods.items():
+        times[name] = way.first
+        if way.first <= MAX_REPEATED_SECONDS:
+            actions[name] = way.run
+    times |= seconds(actions, REPEATS)
+    points = []
+    for name, way in methods.items():
+        ms = 1e3 * times[name]
+        note(f"N = {pixels}, {name}: {ms:.4g} ms, error {way.error:.2%}, {way.kept:.4g} a row")
+        points.append(Point(name, pixels, times[name], way))
     note(f"N = {pixels}: {time.perf_counter() - start:.3g} s in all")
-    return [Point(name, pixels, spent[name], way) for name, way in found.items()]
+    return points
+
+
+def select_method(points: list[Point], name: str) -> list[Point]:
+    """The points of one method, by rising N."""
+    return [point for point in points if point.method == name]
 
 
 def curve(points: list[Point], name: str) -> tuple[np.ndarray, np.ndarray]:
     """N and seconds of one method, by rising N."""
-    mine = [p for p in points if p.method == name]
-    return np.array([p.pixels for p in mine]), np.array([p.seconds for p in mine])
+    own_points = select_method(points, name)
+    pixels = np.array([point.pixels for point in own_points])
+    times = np.array([point.seconds for point in own_points])
+    return pixels, times
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Law:
     """seconds = floor + factor N^slope, of those N from `start` on."""
 
@@ -246,135 +319,195 @@ class Law:
         return self.floor + self.factor * pixels**self.slope
 
 
-def law(pixels: np.ndarray, spent: np.ndarray) -> Law:
+def law(pixels: np.ndarray, times: np.ndarray) -> Law:
     """The slope of log time over log N above the launch floor.
 
     The floor is the least time at any N: small solves are launches and checks, whose time varies.
     Points count from where all take at least five times as long, and the last three in any case;
     the slope is 0 where the floor is one of these.
     """
-    floor = float(spent.min())
-    first = min(int(np.flatnonzero(spent < ABOVE * floor)[-1]) + 1, len(pixels) - LEAST)
-    pixels, above = pixels[first:], spent[first:] - floor
-    if above.min() <= 0.0:
-        return Law(floor, 0.0, 0.0, int(pixels[0]), len(pixels))
-    slope, factor = np.polyfit(np.log(pixels), np.log(above), 1)
-    return Law(floor, float(np.exp(factor)), float(slope), int(pixels[0]), len(pixels))
+    floor = float(times.min())
+    (small,) = np.nonzero(times < FLOOR_RATIO * floor)
+    first = min(int(small[-1]) + 1, len(pixels) - MIN_SLOPE_POINTS)
+    pixels = pixels[first:]
+    above = times[first:] - floor
+    slope, factor = 0.0, 0.0
+    if above.min() > 0.0:
+        slope, log_factor = np.polyfit(np.log(pixels), np.log(above), 1)
+        factor = np.exp(log_factor)
+    return Law(
+        floor=floor,
+        factor=float(factor),
+        slope=float(slope),
+        start=int(pixels[0]),
+        count=len(pixels),
+    )
 
 
 def slowdown(points: list[Point], slow: str, fast: str) -> tuple[int, float]:
     """The largest N that both methods reach, and how many times longer one takes there."""
-    found = {p.pixels: p.seconds for p in points if p.method == fast}
-    last = max(
-        (p for p in points if p.method == slow and p.pixels in found), key=lambda p: p.pixels
-    )
-    return last.pixels, last.seconds / found[last.pixels]
+    slow_times = {point.pixels: point.seconds for point in select_method(points, slow)}
+    fast_times = {point.pixels: point.seconds for point in select_method(points, fast)}
+    last = max(slow_times.keys() & fast_times.keys())
+    return last, slow_times[last] / fast_times[last]
+
+
+def method_facts(method: Method, points: list[Point]) -> dict[str, list[float]]:
+    """Columns of the record, which `recorded` reads."""
+    columns: dict[str, list[float]] = {
+        "N": [],
+        "ms": [],
+        "error": [],
+        "products": [],
+        "numbers a row": [],
+        "MB": [],
+    }
+    for point in points:
+        way = point.way
+        columns["N"].append(point.pixels)
+        columns["ms"].append(float(f"{1e3 * point.seconds:.4g}"))
+        columns["error"].append(float(f"{way.error:.3g}"))
+        columns["products"].append(way.products)
+        columns["numbers a row"].append(float(f"{way.kept:.4g}"))
+        columns["MB"].append(float(f"{way.nbytes / 1e6:.4g}"))
+    return {f"{method.label}, {name}": values for name, values in columns.items()}
 
 
 def recorded(facts: dict[str, Any]) -> list[Point]:
     """The points of a record."""
     points = []
     for name, method in METHODS.items():
-        of = (
-            facts[f"{method.label}, {what}"]
-            for what in ("N", "ms", "error", "products", "MB", "numbers a row")
-        )
-        for n, ms, error, products, size, kept in zip(*of, strict=True):
-            way = Way(lambda: np.zeros(0), error, ms / 1e3, products, round(1e6 * size), kept)
-            points.append(Point(name, n, ms / 1e3, way))
+        for k, n in enumerate(facts[f"{method.label}, N"]):
+            seconds = facts[f"{method.label}, ms"][k] / 1e3
+            way = Way(
+                run=lambda: np.zeros(0),
+                error=facts[f"{method.label}, error"][k],
+                first=seconds,
+                products=facts[f"{method.label}, products"][k],
+                nbytes=round(1e6 * facts[f"{method.label}, MB"][k]),
+                kept=facts[f"{method.label}, numbers a row"][k],
+            )
+            points.append(Point(name, n, seconds, way))
     return points
 
 
 def all_laws(points: list[Point]) -> dict[str, Law]:
-    """Those of every method but the peer."""
-    return {name: law(*curve(points, name)) for name in METHODS if name != "peer"}
+    """The laws of every method but the peer."""
+    laws = {}
+    for name in METHODS:
+        if name != "peer":
+            laws[name] = law(*curve(points, name))
+    return laws
 
 
 def claims(points: list[Point], laws: dict[str, Law]) -> list[Claim]:
-    errors = [p.way.error for p in points]
-    least, most = min(errors), max(errors)
-    limit = f"at most {ERROR:.0%}"
-    listed = [
-        Claim("all methods run to 1 % error", f"{least:.2%} to {most:.2%}", limit, most <= ERROR)
-    ]
+    listed = [error_claim(points)]
     if not laws:
         return listed
-    for name, found in laws.items():
-        text, (low, high) = f"{METHODS[name].label}: slope", METHODS[name].slopes
-        measured = f"{found.slope:.2f}, of {found.count} sizes from N = {found.start} on"
-        listed.append(Claim(text, measured, f"{low} to {high}", low <= found.slope <= high))
-    (_, of_peer), (at, ratio) = (slowdown(points, slow, "iteration") for slow in ("peer", "series"))
-    orders = "three orders of magnitude from series to iteration"
-    times = f"{ratio:.0f} times at N = {at}; {of_peer:.0f} where NumPy makes it"
-    kept = {p.pixels: p.way.kept for p in points if p.method == "rows" and p.pixels >= MANY}
-    fewest, most = min(kept.values()), max(kept.values())
-    counts = f"{fewest:.3g} to {most:.3g} from N = {min(kept)} to {max(kept)}"
-    insensitive = "wavelets a row are insensitive to N"
-    return [
-        *listed,
-        Claim(orders, times, "at least 500", ratio >= 500.0),
-        Claim(insensitive, counts, "at most twice as many", most <= 2.0 * fewest),
-    ]
+    for name, fitted in laws.items():
+        listed.append(slope_claim(METHODS[name], fitted))
+    listed.append(slowdown_claim(points))
+    listed.append(wavelet_claim(points))
+    return listed
+
+
+def error_claim(points: list[Point]) -> Claim:
+    errors = [point.way.error for point in points]
+    measured = f"{min(errors):.2%} to {max(errors):.2%}"
+    limit = f"at most {ERROR:.0%}"
+    return Claim("all methods run to 1 % error", measured, limit, max(errors) <= ERROR)
+
+
+def slope_claim(method: Method, fitted: Law) -> Claim:
+    low, high = method.slopes
+    measured = f"{fitted.slope:.2f}, of {fitted.count} sizes from N = {fitted.start} on"
+    is_due = low <= fitted.slope <= high
+    return Claim(f"{method.label}: slope", measured, f"{low} to {high}", is_due)
+
+
+def slowdown_claim(points: list[Point]) -> Claim:
+    n, ratio = slowdown(points, "series", "iteration")
+    _, peer_ratio = slowdown(points, "peer", "iteration")
+    text = "three orders of magnitude from series to iteration"
+    measured = f"{ratio:.0f} times at N = {n}; {peer_ratio:.0f} where NumPy makes it"
+    return Claim(text, measured, "at least 500", ratio >= 500.0)
+
+
+def wavelet_claim(points: list[Point]) -> Claim:
+    kept = {}
+    for point in select_method(points, "rows"):
+        if point.pixels >= MIN_WAVELET_PIXELS:
+            kept[point.pixels] = point.way.kept
+    least = min(kept.values())
+    most = max(kept.values())
+    measured = f"{least:.3g} to {most:.3g} from N = {min(kept)} to {max(kept)}"
+    text = "wavelets a row are insensitive to N"
+    return Claim(text, measured, "at most twice as many", most <= 2.0 * least)
 
 
 def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
     figure = figures.page(
         600,
         "Figure 7: what the direct light takes, to 1 %",
-        "A corner of N pixels, each of which lights half of the others. A method starts with R in its own",
-        "form, and ends with the same error against the truth. Dotted: launch floor and a power of N.",
+        "A corner of N pixels, each of which lights half of the others. "
+        "A method starts with R in its own",
+        "form, and ends with the same error against the truth. "
+        "Dotted: launch floor and a power of N.",
     )
-    axes = figures.graph(
-        figure, (85, 150, 880, 375), "Time", "resolution of light transport, N", "seconds"
-    )
+    box = (85, 150, 880, 375)
+    axes = figures.graph(figure, box, "Time", "resolution of light transport, N", "seconds")
     axes.set_xscale("log")
     for name, method in METHODS.items():
-        pixels, spent = curve(points, name)
+        pixels, times = curve(points, name)
         label = method.label
         if name in laws:
             label += f": slope {laws[name].slope:.2f}"
-            at = np.geomspace(laws[name].start, pixels[-1])
-            axes.plot(at, laws[name](at), ":", color=method.colour, lw=1.5)
-        axes.plot(pixels, spent, "o" + method.line, color=method.colour, lw=2, ms=5, label=label)
-        duration = f"{1e3 * spent[-1]:.3g} ms" if spent[-1] < 1.0 else f"{spent[-1]:.3g} s"
-        place: Any = {
-            "xytext": (8, APART.get(name, 0)),
-            "textcoords": "offset points",
-            "va": "center",
-        }
-        axes.annotate(duration, (pixels[-1], spent[-1]), color=method.colour, fontsize=10, **place)
+            fitted = np.geomspace(laws[name].start, pixels[-1])
+            axes.plot(fitted, laws[name](fitted), ":", color=method.colour, lw=1.5)
+        axes.plot(pixels, times, "o" + method.line, color=method.colour, lw=2, ms=5, label=label)
+        label_end(axes, method, (pixels[-1], times[-1]), LABEL_OFFSETS.get(name, 0))
     axes.minorticks_off()
     axes.margins(x=0.1)
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10.5, loc="upper left")
     return figure
 
 
+def label_end(axes: Axes, method: Method, end: tuple[float, float], offset: int) -> None:
+    """Write the time at the largest N beside its point."""
+    duration = end[1]
+    text = f"{1e3 * duration:.3g} ms" if duration < 1.0 else f"{duration:.3g} s"
+    axes.annotate(
+        text,
+        end,
+        color=method.colour,
+        fontsize=10,
+        xytext=(8, offset),
+        textcoords="offset points",
+        va="center",
+    )
+
+
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    points = [p for n in (SMOKE if given.smoke else SIZES) for p in measure(given, n)]
-    laws = {} if given.smoke else all_laws(points)
+    options = parse_options(__doc__)
+    points = []
+    for n in SMOKE_SIZES if options.smoke else SIZES:
+        points += measure(options, n)
+    laws = {} if options.smoke else all_laws(points)
     facts: dict[str, Any] = {"albedo": ALBEDO}
     for name, method in METHODS.items():
-        mine = [p for p in points if p.method == name]
-        facts |= {
-            f"{method.label}, N": [p.pixels for p in mine],
-            f"{method.label}, ms": [float(f"{1e3 * p.seconds:.4g}") for p in mine],
-            f"{method.label}, error": [float(f"{p.way.error:.3g}") for p in mine],
-            f"{method.label}, products": [p.way.products for p in mine],
-            f"{method.label}, numbers a row": [float(f"{p.way.kept:.4g}") for p in mine],
-            f"{method.label}, MB": [float(f"{p.way.nbytes / 1e6:.4g}") for p in mine],
-        }
-    slower = {
-        "iteration": ("series", "peer"),
-        "rows": ("iteration",),
-        "both": ("iteration", "rows"),
-    }
-    for slow, fast in ((slow, fast) for fast, some in slower.items() for slow in some):
-        at, ratio = slowdown(points, slow, fast)
-        facts[f"{METHODS[slow].label} over {METHODS[fast].label} at N = {at}"] = ratio
-    figures.conclude(
-        given, "Figure 7: resolution", claims(points, laws), facts, lambda: draw(points, laws)
+        facts |= method_facts(method, select_method(points, name))
+    pairs = (
+        ("series", "iteration"),
+        ("peer", "iteration"),
+        ("iteration", "rows"),
+        ("iteration", "both"),
+        ("rows", "both"),
     )
+    for slow, fast in pairs:
+        n, ratio = slowdown(points, slow, fast)
+        facts[f"{METHODS[slow].label} over {METHODS[fast].label} at N = {n}"] = ratio
+    title = "Figure 7: resolution"
+    figures.conclude(options, title, claims(points, laws), facts, lambda: draw(points, laws))
 
 
 if __name__ == "__main__":

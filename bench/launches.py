@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a step of each method asks of a device: kernels, waits, allocations and bytes over the bus.
+"""Device traffic of a step of each method: kernels, waits, allocations and bytes over the bus.
 
 These counts are the same on every device. For every method and kind of operator a solve runs to a
 number of iterations that it cannot end before; steps are counted from product to product, medians.
-First solves are counted from an operator that nothing is known of: row sums, survey and tables
+First solves are counted from an operator whose properties are unknown: row sums, survey and tables
 included.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 from unittest import mock
 
@@ -27,47 +28,91 @@ from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.bounded import minimise
 
 WAIT = "wait"
-STEPS = 16  # of a solve that is counted
-# Launches and waits of a step between two checks, at most, and its products.
+# Iterations of a solve that is counted.
+STEPS = 16
+
+
+@dataclass(frozen=True)
+class Target:
+    """Largest launches and waits of a step between two checks, and its products."""
+
+    launches: int
+    waits: int
+    products: int
+
+
 TARGETS = {
-    **dict.fromkeys(("jacobi", "neumann", "richardson", "chebyshev"), (1, 0, 1)),
-    "cg": (3, 0, 1),
-    "gmres": (5, 1, 1),
-    "bicgstab": (5, 1, 2),
-    "bounded": (6, 1, 2),
+    "jacobi": Target(1, 0, 1),
+    "neumann": Target(1, 0, 1),
+    "richardson": Target(1, 0, 1),
+    "chebyshev": Target(1, 0, 1),
+    "cg": Target(3, 0, 1),
+    "gmres": Target(5, 1, 1),
+    "bicgstab": Target(5, 1, 2),
+    "bounded": Target(6, 1, 2),
 }
 
 
-@contextlib.contextmanager
-def traffic() -> Iterator[list[tuple[str, int]]]:
-    """What goes to a device inside the block: names of kernels, or WAIT, in order; and bytes over the bus."""
-    events: list[tuple[str, int]] = []
-    launch, copy, finish = Device.launch, Device.copy, Device.finish
+class Traffic:
+    """Calls to a device in their order: names of kernels, or WAIT, with bytes over the bus."""
 
-    def launched(self: Device, name: str, *rest: Any) -> None:
-        events.append((name, 0))
+    def __init__(self) -> None:
+        self.events: list[tuple[str, int]] = []
+
+    @property
+    def names(self) -> list[str]:
+        """Names of kernels, or WAIT."""
+        return [name for name, _ in self.events]
+
+    @property
+    def waits(self) -> int:
+        """Number of waits."""
+        return self.names.count(WAIT)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes over the bus."""
+        return sum(size for _, size in self.events)
+
+
+@contextlib.contextmanager
+def record_traffic() -> Iterator[Traffic]:
+    """Record the calls to all devices inside the block."""
+    traffic = Traffic()
+    launch = Device.launch
+    copy = Device.copy
+    finish = Device.finish
+
+    def recorded_launch(self: Device, name: str, *rest: Any) -> None:
+        traffic.events.append((name, 0))
         launch(self, name, *rest)
 
-    def copied(self: Device, to: Any, of: Any, **sizes: Any) -> None:
-        events.extend((WAIT, host.nbytes) for host in (to, of) if isinstance(host, np.ndarray))
-        copy(self, to, of, **sizes)
+    def recorded_copy(self: Device, to: Any, source: Any, **sizes: Any) -> None:
+        for array in (to, source):
+            if isinstance(array, np.ndarray):
+                traffic.events.append((WAIT, array.nbytes))
+        copy(self, to, source, **sizes)
 
-    def finished(self: Device) -> None:
-        events.append((WAIT, 0))
+    def recorded_finish(self: Device) -> None:
+        traffic.events.append((WAIT, 0))
         finish(self)
 
-    with mock.patch.multiple(Device, launch=launched, copy=copied, finish=finished):
-        yield events
+    with mock.patch.multiple(
+        Device, launch=recorded_launch, copy=recorded_copy, finish=recorded_finish
+    ):
+        yield traffic
 
 
-def operators(given: Options) -> dict[str, Any]:
+def operators(options: Options) -> dict[str, Callable[[], Any]]:
     """R of one kind each, made anew at every call: the mean of two neighbours.
 
     Its eigenvalues are all over [-0.9, 0.9], so that no method comes near rounding in those steps.
     """
-    side, device = 16 if given.smoke else 64, given.device
+    device = options.device
+    side = 16 if options.smoke else 64
     ring = np.roll(np.eye(side**2, dtype=np.float32), 1, axis=0)
-    G, W = 0.45 * (ring + ring.T), Wavelet(device, (side, side), "db2")
+    G = 0.45 * (ring + ring.T)
+    W = Wavelet(device, (side, side), "db2")
     sparse = scipy.sparse.csr_array(G)
     return {
         "csr": lambda: CSR(device, sparse),
@@ -77,73 +122,91 @@ def operators(given: Options) -> dict[str, Any]:
     }
 
 
-def solver(method: str, b: np.ndarray, **rules: Any) -> Callable[[IdentityPlus], Any]:
-    """A solve of one system after another; `bounded` is least squares within bounds that bind."""
+def solve(S: IdentityPlus, b: np.ndarray, method: str, **rules: Any) -> Any:
+    """A solve by one method; `bounded` is least squares within bounds that bind."""
+    if method != "bounded":
+        return ltcl.solve(S, b, method, throw=False, **rules)
+    columns = b.reshape(len(b), -1)
+    lower = np.full(len(b), 0.2)
+    upper = np.full(len(b), 0.5)
+    return minimise(S, columns, lower, upper, np.zeros(columns.shape), **rules)
+
+
+def long_rules(method: str) -> dict[str, Any]:
+    """Settings with which a solve takes STEPS iterations, and nothing else."""
     if method == "bounded":
-        columns = b.reshape(len(b), -1)
-        lower, upper, start = np.full(len(b), 0.2), np.full(len(b), 0.5), np.zeros(columns.shape)
-        return lambda S: minimise(S, columns, lower, upper, start, **rules)
-    return lambda S: ltcl.solve(S, b, method, throw=False, **rules)
+        return {"rtol": 1e-9, "maxiter": STEPS}
+    rules: dict[str, Any] = {"rtol": 1e-12, "maxiter": STEPS}
+    if method == "chebyshev":
+        rules |= {"arnoldi": 0, "spectrum": (0.05, 2.0)}
+    return rules
+
+
+def step_medians(names: list[str], products: int) -> tuple[int, int]:
+    """Median launches and waits of steps that begin with a product, of so many products."""
+    starts = [i for i, name in enumerate(names) if "matvec" in name]
+    launches = []
+    waits = []
+    for start, stop in zip(starts, starts[products:], strict=False):
+        step_waits = names[start:stop].count(WAIT)
+        waits.append(step_waits)
+        launches.append(stop - start - step_waits)
+    return round(np.median(launches)), round(np.median(waits))
 
 
 def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int) -> dict[str, Any]:
-    target, waits_most, products = TARGETS[method]
+    """Counts of one method on one kind of operator with k right-hand sides."""
+    target = TARGETS[method]
     S = IdentityPlus(make())
-    b = np.random.default_rng(1).random(
-        (S.shape[0],) if k == 1 else (S.shape[0], k), dtype=np.float32
-    )
-    with traffic() as first:
-        solver(method, b, rtol=1e-2)(S)
-    options = {"arnoldi": 0, "spectrum": (0.05, 2.0)} if method == "chebyshev" else {}
-    run = solver(method, b, rtol=1e-12 if method != "bounded" else 1e-9, maxiter=STEPS, **options)
-    run(S)  # builds, tunes, looks at S
+    n = S.shape[0]
+    shape = (n,) if k == 1 else (n, k)
+    b = np.random.default_rng(1).random(shape, dtype=np.float32)
+    with record_traffic() as first:
+        solve(S, b, method, rtol=1e-2)
+    rules = long_rules(method)
+    # Builds, tunes, surveys S.
+    solve(S, b, method, **rules)
     before = device.allocations
-    with traffic() as events:
-        iterations = run(S).iterations
+    with record_traffic() as traffic:
+        iterations = solve(S, b, method, **rules).iterations
     allocations = device.allocations - before
     # Residuals are read every few steps only, and so are not counted where nothing else waits.
-    names = [name for name, _ in events]
-    marks = [i for i, name in enumerate(names) if "matvec" in name]
-    spans = [names[i:j] for i, j in zip(marks, marks[products:], strict=False)]
-    waits = np.array([span.count(WAIT) for span in spans])
-    launches, waits = (
-        round(np.median([len(span) for span in spans] - waits)),
-        round(np.median(waits)),
-    )
-    pixels = (
-        method == "bounded" and "wavelets" in kind
-    )  # bounds are of pixels: transforms in every product
-    hit = launches <= target and waits <= waits_most and allocations == 0
-    first_waits = sum(name == WAIT for name, _ in first)
+    launches, waits = step_medians(traffic.names, target.products)
+    # Bounds are of pixels: transforms in every product, without a target.
+    has_target = not (method == "bounded" and "wavelets" in kind)
+    is_hit = launches <= target.launches and waits <= target.waits and allocations == 0
+    verdict = "hit" if is_hit else "MISS"
     return {
         "operator": kind,
         "method": method,
         "k": k,
         "launches a step": launches,
         "waits a step": waits,
-        "targets": "none: in pixels" if pixels else f"{target}, {waits_most}",
-        "waits, with checks": round(names.count(WAIT) / iterations, 2),
+        "targets": f"{target.launches}, {target.waits}" if has_target else "none: in pixels",
+        "waits, with checks": round(traffic.waits / iterations, 2),
         "allocations": allocations,
-        "bytes over the bus a step": round(sum(size for _, size in events) / iterations),
-        "first solve: launches": len(first) - first_waits,
-        "waits": first_waits,
-        "KB over the bus": round(sum(size for _, size in first) / 1e3, 1),
-        "verdict": "" if pixels else "hit" if hit else "MISS",
+        "bytes over the bus a step": round(traffic.nbytes / iterations),
+        "first solve: launches": len(first.events) - first.waits,
+        "waits": first.waits,
+        "KB over the bus": round(first.nbytes / 1e3, 1),
+        "verdict": verdict if has_target else "",
     }
 
 
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    kinds = itertools.product(operators(given).items(), TARGETS, (1, 3))
-    rows = [row(given.device, kind, make, method, k) for (kind, make), method, k in kinds]
-    misses = sum(one["verdict"] == "MISS" for one in rows)
+    options = parse_options(__doc__)
+    kinds = operators(options).items()
+    rows = []
+    for (kind, make), method, k in itertools.product(kinds, TARGETS, (1, 3)):
+        rows.append(row(options.device, kind, make, method, k))
+    misses = [cells["verdict"] for cells in rows].count("MISS")
     table = Table(*rows[0], caption=f"{misses} of {len(rows)} targets missed")
-    for one in rows:
-        table.add_row(*map(str, one.values()))
+    for cells in rows:
+        table.add_row(*map(str, cells.values()))
     Console(width=190).print(table)
-    if given.json is not None:
-        facts = record(given, "What a step asks of a device", {"missed": misses})
-        write_json(given.json, facts | {"rows": rows})
+    if options.json is not None:
+        content = record(options, "What a step asks of a device", {"missed": misses})
+        write_json(options.json, content | {"rows": rows})
 
 
 if __name__ == "__main__":

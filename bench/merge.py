@@ -11,7 +11,6 @@ best scale, where ours is valid; so is the error of the response, over linear va
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable
 from functools import partial
@@ -23,104 +22,128 @@ from _harness import Options, Row, parse_options, report, seconds
 from ltcl.acquisition.radiometry import NoiseModel, Response, calibrate, merge
 from ltcl.images import from_srgb, to_srgb
 
-SECONDS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-ELECTRONS, READ, BLACK = 10000.0, 0.002, 0.004
+EXPOSURES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+ELECTRONS = 10000.0
+READ_NOISE = 0.002
+BLACK = 0.004
 MERGERS = {"MergeDebevec": cv2.createMergeDebevec, "MergeRobertson": cv2.createMergeRobertson}
-_ROBERTSON = cv2.createCalibrateRobertson
-CALIBRATORS = {"CalibrateDebevec": cv2.createCalibrateDebevec, "CalibrateRobertson": _ROBERTSON}
+CALIBRATORS = {
+    "CalibrateDebevec": cv2.createCalibrateDebevec,
+    "CalibrateRobertson": cv2.createCalibrateRobertson,
+}
 
 
 def scene(n: int) -> np.ndarray:
     """Radiance (n, n, 3), from 0.002 to 0.95."""
     y, x = np.mgrid[:n, :n] / n
     waves = [0.5 + 0.5 * np.sin(5 * x + 2 * y + phase) for phase in (0, 1, 2)]
-    return 0.002 + 0.948 * np.stack(waves, axis=-1) * np.exp(-3 * y)[..., None]
+    falloff = np.exp(-3 * y)
+    return 0.002 + 0.948 * np.stack(waves, axis=-1) * falloff[..., None]
 
 
 def photographs(light: np.ndarray, levels: int) -> list[np.ndarray]:
-    rng, kind = np.random.default_rng(0), np.uint8 if levels == 256 else np.uint16
+    rng = np.random.default_rng(0)
+    integer = np.uint8 if levels == 256 else np.uint16
     shots = []
-    for t in SECONDS:
-        value = rng.poisson((light * t + BLACK) * ELECTRONS) / ELECTRONS + rng.normal(
-            0, READ, light.shape
-        )
-        shots.append(np.rint(to_srgb(np.clip(value, 0, 1)) * (levels - 1)).astype(kind))
+    for exposure in EXPOSURES:
+        electrons = rng.poisson((light * exposure + BLACK) * ELECTRONS)
+        values = electrons / ELECTRONS + rng.normal(0, READ_NOISE, light.shape)
+        codes = to_srgb(np.clip(values, 0, 1)) * (levels - 1)
+        shots.append(np.rint(codes).astype(integer))
     return shots
 
 
-def error(found: np.ndarray, true: np.ndarray) -> float:
+def scaled_error(measured: np.ndarray, true: np.ndarray) -> float:
     """Root mean square of the relative error, at the best scale."""
-    ratio = found.astype(np.float64) / true
+    ratio = measured.astype(np.float64) / true
     return float(np.std(ratio) / np.mean(ratio))
 
 
-def speeds(given: Options, n: int) -> list[Row]:
+def merging_rows(options: Options, n: int) -> list[Row]:
+    """Speed of merging, and noise of the merged picture."""
     light = scene(n)
-    shots = {levels: photographs(light, levels) for levels in (256, 4096)}
-    response, noise = (
-        Response(from_srgb(np.linspace(0, 1, 4097))),
-        NoiseModel(ELECTRONS, READ, BLACK),
-    )
-    times = np.array(SECONDS, np.float32)
-    table = np.maximum(from_srgb(np.linspace(0, 1, 256)) - BLACK, 1e-6).astype(np.float32)
-    curves = np.repeat(table[:, None, None], 3, axis=2)
+    shots_8 = photographs(light, 256)
+    shots_12 = photographs(light, 4096)
+    response = Response(from_srgb(np.linspace(0, 1, 4097)))
+    noise = NoiseModel(ELECTRONS, READ_NOISE, BLACK)
+    theirs = opencv_mergers(shots_8)
     actions: dict[str, Callable[[], object]] = {
-        "ours 8": lambda: merge(shots[256], SECONDS, response, noise),
-        "ours 12": lambda: merge(shots[4096], SECONDS, response, noise, levels=4096),
+        "ours 8": lambda: merge(shots_8, EXPOSURES, response, noise),
+        "ours 12": lambda: merge(shots_12, EXPOSURES, response, noise, levels=4096),
+        **theirs,
     }
-    for name, make in MERGERS.items():
-        actions[name] = partial(make().process, shots[256], times=times, response=curves)
-    spent = seconds(actions, 1 if given.smoke else 4)
-    rate = {name: len(SECONDS) * n * n / t / 1e6 for name, t in spent.items()}
+    times = seconds(actions, 1 if options.smoke else 4)
+    megapixels = len(EXPOSURES) * n * n / 1e6
+    rates = {name: megapixels / spent for name, spent in times.items()}
     rows = []
-    for name, bits in itertools.product(MERGERS, (8, 12)):
-        question, ours = (
-            f"merge {len(SECONDS)} x {n * n / 1e6:.3g} Mpixel, {bits} bits",
-            rate[f"ours {bits}"],
-        )
-        better = ours / rate[name]
-        rows.append(Row(question, f"OpenCV {name}, 8 bits", rate[name], ours, "Mpixel/s", better))
-    ours = merge(shots[256], SECONDS, response, noise)
     for name in MERGERS:
-        theirs = np.asarray(actions[name]())
-        off, own = (error(found[ours.valid], light[ours.valid]) for found in (theirs, ours.value))
-        rows.append(
-            Row.from_times("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", 1.0)
-        )
+        for bits in (8, 12):
+            ours = rates[f"ours {bits}"]
+            question = f"merge {len(EXPOSURES)} x {n * n / 1e6:.3g} Mpixel, {bits} bits"
+            competitor = f"OpenCV {name}, 8 bits"
+            better = ours / rates[name]
+            rows.append(Row(question, competitor, rates[name], ours, "Mpixel/s", better))
+    merged = merge(shots_8, EXPOSURES, response, noise)
+    valid_light = light[merged.valid]
+    our_noise = scaled_error(merged.value[merged.valid], valid_light)
+    for name, process in theirs.items():
+        picture = np.asarray(process())
+        their_noise = scaled_error(picture[merged.valid], valid_light)
+        question = "noise of the picture, 8 bits"
+        rows.append(Row.from_times(question, f"OpenCV {name}", their_noise, our_noise, "rms", 1.0))
     return rows
 
 
-def responses(n: int) -> list[Row]:
+def opencv_mergers(shots: list[np.ndarray]) -> dict[str, Callable[[], np.ndarray]]:
+    """OpenCV's mergers of photographs of 8 bits, with the camera's true response."""
+    times = np.array(EXPOSURES, np.float32)
+    linear = from_srgb(np.linspace(0, 1, 256)) - BLACK
+    table = np.maximum(linear, 1e-6).astype(np.float32)
+    curves = np.repeat(table[:, None, None], 3, axis=2)
+    mergers = {}
+    for name, make in MERGERS.items():
+        mergers[name] = partial(make().process, shots, times=times, response=curves)
+    return mergers
+
+
+def response_rows(n: int) -> list[Row]:
     """The response, by three estimators, and how long each takes."""
-    shots, times = photographs(scene(n), 256), np.array(SECONDS, np.float32)
-    used = np.linspace(0.02, 0.9, 400)
-    codes = to_srgb(used + BLACK)
+    shots = photographs(scene(n), 256)
+    times = np.array(EXPOSURES, np.float32)
 
-    def timed(action: Callable[[], np.ndarray]) -> tuple[float, float]:
-        start = time.perf_counter()
-        table = action()
-        spent = time.perf_counter() - start
-        zero = Response(table).linear(
-            to_srgb(np.array([BLACK]))
-        )  # theirs do not tell black: it is given
-        return error(Response(table).linear(codes) - zero, used), spent
+    def estimate(make: Callable) -> np.ndarray:
+        curve = make().process(shots, times=times)[:, 0, 0]
+        return np.maximum.accumulate(curve.astype(np.float64))
 
-    def theirs(make: Callable) -> np.ndarray:
-        return np.maximum.accumulate(make().process(shots, times=times)[:, 0, 0].astype(np.float64))
-
-    own, spent = timed(lambda: calibrate(shots, SECONDS).values[0])
-    question, rows = f"response of {n} x {n} pixels, 8 bits", []
+    our_error, our_seconds = judge_response(lambda: calibrate(shots, EXPOSURES).values[0])
+    question = f"response of {n} x {n} pixels, 8 bits"
+    rows = []
     for name, make in CALIBRATORS.items():
-        off, duration = timed(partial(theirs, make))
-        rows.append(Row.from_times(question, f"OpenCV {name}", off, own, "rms", 1.0))
-        rows.append(Row.from_times(question, f"OpenCV {name}", duration, spent, "s"))
+        error, duration = judge_response(partial(estimate, make))
+        rows.append(Row.from_times(question, f"OpenCV {name}", error, our_error, "rms", 1.0))
+        rows.append(Row.from_times(question, f"OpenCV {name}", duration, our_seconds, "s"))
     return rows
+
+
+def judge_response(estimate: Callable[[], np.ndarray]) -> tuple[float, float]:
+    """Error of an estimated response, and seconds."""
+    start = time.perf_counter()
+    table = estimate()
+    duration = time.perf_counter() - start
+    response = Response(table)
+    # OpenCV's estimators do not know black: the true one is subtracted.
+    zero = response.linear(to_srgb(np.array([BLACK])))
+    used = np.linspace(0.02, 0.9, 400)
+    linear = response.linear(to_srgb(used + BLACK)) - zero
+    return scaled_error(linear, used), duration
 
 
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    rows = speeds(given, 64 if given.smoke else 1200) + responses(64 if given.smoke else 400)
-    report(given, "Merging exposures", rows, {"exposures": len(SECONDS), "opencv": cv2.__version__})
+    options = parse_options(__doc__)
+    rows = merging_rows(options, 64 if options.smoke else 1200)
+    rows += response_rows(64 if options.smoke else 400)
+    facts = {"exposures": len(EXPOSURES), "opencv": cv2.__version__}
+    report(options, "Merging exposures", rows, facts)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,18 @@ from _harness import Options, Row, parse_options, product, report, seconds
 from ltcl.device import Device
 from ltcl.operators import Dense, MultiDevice, Streamed
 
-SIDE, CAP, TARGET, REPEATS = 212, 2 << 30, 0.8, 3
-PIECE, FRAMES = 1 << 22, 8
+# Pixels along a side of the grid.
+SIDE = 212
+MEMORY_CAP = 2 << 30
+# A product should read with at least this share of the disk's speed.
+SPEED_TARGET = 0.8
+REPEATS = 3
+READ_BYTES = 1 << 22
+READ_THREADS = (1, 2, 4)
+WRITTEN_ROWS = 512
+FRAMES = 8
+# Diagonals on each side that the sparse preconditioner keeps.
+NEAR_DIAGONALS = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,28 +61,35 @@ class Scene:
     file: Path
 
     @property
+    def pixels(self) -> int:
+        """N."""
+        return self.side**2
+
+    @property
     def kernel(self) -> np.ndarray:
         """R between pixels by their distance, (N,); rows of R sum to 0.8 at most."""
-        n = self.side**2
+        n = self.pixels
         return 0.8 * np.exp(-np.arange(n) / (0.1 * n)) / (0.2 * n)
 
     @property
     def F(self) -> np.ndarray:
         """The first bounce, (N,), in numbers of float32."""
-        return (1.0 + 0.5 * np.sin(np.arange(self.side**2))).astype(np.float32).astype(np.float64)
+        waves = 1.0 + 0.5 * np.sin(np.arange(self.pixels))
+        return waves.astype(np.float32).astype(np.float64)
 
     def write(self) -> None:
-        """Block by block, as no host may have room for all."""
-        n, F = self.side**2, self.F.astype(np.float32)
-        both = np.concatenate([self.kernel[:0:-1], self.kernel]).astype(np.float32)
-        windows = np.lib.stride_tricks.sliding_window_view(both, n)[
-            ::-1
-        ]  # row i begins with kernel[i]
+        """Write the file block by block, as no host may have room for all."""
+        n = self.pixels
+        F = self.F.astype(np.float32)
+        both_sides = np.concatenate([self.kernel[:0:-1], self.kernel]).astype(np.float32)
+        # Row i begins with kernel[i].
+        rows = np.lib.stride_tricks.sliding_window_view(both_sides, n)[::-1]
         T: Any = np.lib.format.open_memmap(self.file, "w+", np.float32, (n, n))
-        for start in range(0, n, 512):
-            block = np.array(windows[start : start + 512])
-            block[np.arange(len(block)), start + np.arange(len(block))] += np.float32(1.0)
-            T[start : start + 512] = block * F
+        for start in range(0, n, WRITTEN_ROWS):
+            block = np.array(rows[start : start + WRITTEN_ROWS])
+            within = np.arange(len(block))
+            block[within, start + within] += np.float32(1.0)
+            T[start : start + WRITTEN_ROWS] = block * F
         T.flush()
         self.forget()
 
@@ -82,134 +100,181 @@ class Scene:
         os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
         os.close(handle)
 
-    def seen(self, light: np.ndarray) -> np.ndarray:
+    def relight(self, light: np.ndarray) -> np.ndarray:
         """T light in float64, of frames (k, h, w)."""
-        x = light.reshape(len(light), -1).T.astype(np.float64) * self.F[:, None]
-        return (x + scipy.linalg.matmul_toeplitz(self.kernel, x)).T.reshape(light.shape)
+        columns = light.reshape(len(light), -1).T.astype(np.float64)
+        direct = columns * self.F[:, None]
+        indirect = scipy.linalg.matmul_toeplitz(self.kernel, direct)
+        return (direct + indirect).T.reshape(light.shape)
 
     def read(self, threads: int) -> None:
-        """All of the file, by so many threads, into buffers of theirs."""
+        """Read all of the file by so many threads into buffers of their own."""
         size = self.file.stat().st_size
-        spans = [(size * k // threads, size * (k + 1) // threads) for k in range(threads)]
+        edges = [size * k // threads for k in range(threads + 1)]
 
-        def read(span: tuple[int, int]) -> None:
-            buffer = memoryview(bytearray(PIECE))
+        def read_span(start: int, stop: int) -> None:
+            buffer = memoryview(bytearray(READ_BYTES))
             with self.file.open("rb", buffering=0) as file:
-                file.seek(span[0])
-                while file.tell() < span[1] and file.readinto(buffer):
+                file.seek(start)
+                while file.tell() < stop and file.readinto(buffer):
                     pass
 
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(read, spans))
+            list(pool.map(read_span, edges[:-1], edges[1:]))
 
     def speeds(self, actions: dict[str, Callable[[], object]]) -> dict[str, float]:
-        """GB a second that each action reads, in turn, medians, the file not cached."""
-        found: dict[str, list[float]] = {name: [] for name in actions}
+        """Median GB a second that each action reads, in turn, the file not cached."""
+        rates: dict[str, list[float]] = {name: [] for name in actions}
+        gigabytes = self.file.stat().st_size / 1e9
         for _ in range(REPEATS):
             for name, action in actions.items():
                 self.forget()
                 start = time.perf_counter()
                 action()
-                found[name].append(self.file.stat().st_size / (time.perf_counter() - start) / 1e9)
-                note(f"{name}: {found[name][-1]:.3g} GB/s")
-        return {name: statistics.median(values) for name, values in found.items()}
+                rate = gigabytes / (time.perf_counter() - start)
+                rates[name].append(rate)
+                note(f"{name}: {rate:.3g} GB/s")
+        return {name: statistics.median(values) for name, values in rates.items()}
 
 
-def speeds(given: Options, scene: Scene, A: Streamed) -> tuple[list[Row], dict[str, Any]]:
+def compare_speeds(scene: Scene, A: Streamed) -> tuple[list[Row], dict[str, Any]]:
     """Products by one and by several right-hand sides, against reading alone."""
     n = A.shape[1]
-    ways = {f"{k} threads": (lambda k=k: scene.read(k)) for k in (1, 2, 4)}
-    ours = {k: product(A, np.ones((n, k)) if k > 1 else np.ones(n)) for k in (1, FRAMES)}
-    found = scene.speeds({**ways, **{f"product of {k}": run for k, run in ours.items()}})
-    disk, rows = max(found[name] for name in ways), []
-    for k in ours:
-        speed = found[f"product of {k}"]
+    readings = {f"{k} threads": partial(scene.read, k) for k in READ_THREADS}
+    products = {1: product(A, np.ones(n)), FRAMES: product(A, np.ones((n, FRAMES)))}
+    actions: dict[str, Callable[[], object]] = dict(readings)
+    for k, run in products.items():
+        actions[f"product of {k}"] = run
+    speeds = scene.speeds(actions)
+    disk = max(speeds[name] for name in readings)
+    rows = []
+    for k in products:
+        speed = speeds[f"product of {k}"]
         question = f"product by {k} right-hand sides"
-        rows.append(Row(question, "reading alone", disk, speed, "GB/s", speed / disk, TARGET))
-    return rows, {"reading alone, GB/s": {name: round(found[name], 3) for name in ways}}
+        ratio = speed / disk
+        rows.append(Row(question, "reading alone", disk, speed, "GB/s", ratio, SPEED_TARGET))
+    alone = {name: round(speeds[name], 3) for name in readings}
+    return rows, {"reading alone, GB/s": alone}
 
 
-def answers(given: Options, scene: Scene, T: np.ndarray) -> dict[str, Any]:
+def near_transport(scene: Scene, whole: ltcl.Transport, device: Device) -> ltcl.Transport:
+    """The diagonals of T around the main one, as a sparse transport."""
+    offsets: Any = range(-NEAR_DIAGONALS, NEAR_DIAGONALS + 1)
+    diagonals = []
+    for k in offsets:
+        value = scene.kernel[abs(k)] + (k == 0)
+        diagonals.append(np.full(scene.pixels - abs(k), value))
+    S: Any = scipy.sparse.diags_array(diagonals, offsets=offsets)
+    T = S @ scipy.sparse.diags_array(scene.F)
+    return ltcl.Transport(scipy.sparse.csr_array(T), whole.grid, whole.first_bounce, device=device)
+
+
+def solve_tasks(options: Options, scene: Scene, T: np.ndarray) -> dict[str, str]:
     """Solves with T on the disk, whose answers are judged without it."""
-    grid, n = (scene.side, scene.side), scene.side**2
+    grid = (scene.side, scene.side)
     light = np.random.default_rng(0).uniform(0.3, 0.7, (FRAMES, *grid)).astype(np.float32)
-    picture = scene.seen(light).astype(np.float32)
-    offsets: Any = range(-8, 9)
-    diagonals = [np.full(n - abs(k), scene.kernel[abs(k)] + (k == 0)) for k in offsets]
-    near: Any = scipy.sparse.diags_array(diagonals, offsets=offsets) @ scipy.sparse.diags_array(
-        scene.F
-    )
-    whole = ltcl.Transport(T, grid, device=given.device)
-    rough = ltcl.Transport(
-        scipy.sparse.csr_array(near), grid, whole.first_bounce, device=given.device
-    )
-    tasks: dict[str, Callable[[], Any]] = {
-        f"compensate {FRAMES} frames to 1e-2": lambda: ltcl.compensate(whole, picture),
-        f"compensate {FRAMES} frames to 1e-4, by exact=": lambda: ltcl.compensate(
-            rough, picture, exact=whole, rtol=1e-4
+    pictures = scene.relight(light).astype(np.float32)
+    whole = ltcl.Transport(T, grid, device=options.device)
+    near = near_transport(scene, whole, options.device)
+
+    def compensate(T: ltcl.Transport, **settings: Any) -> tuple[int, float]:
+        answer = ltcl.compensate(T, pictures, **settings)
+        return answer.solution.products, residual(scene, answer.pattern, pictures)
+
+    def separate() -> tuple[int, float]:
+        answer = ltcl.separate(whole, pictures[0], 2)
+        products = sum(solution.products for solution in answer.solutions)
+        # Light on the projector with this direct part makes the picture.
+        pattern = answer.direct / whole.first_bounce.reshape(grid)
+        return products, residual(scene, pattern[None], pictures[:1])
+
+    tasks: dict[str, Callable[[], tuple[int, float]]] = {
+        f"compensate {FRAMES} frames to 1e-2": lambda: compensate(whole),
+        f"compensate {FRAMES} frames to 1e-4, by exact=": lambda: compensate(
+            near, exact=whole, rtol=1e-4
         ),
-        "separate, 2 bounces, to 1e-3": lambda: ltcl.separate(whole, picture[0], 2),
+        "separate, 2 bounces, to 1e-3": separate,
     }
     facts = {}
     for name, solve in tasks.items():
         start = time.perf_counter()
-        answer = solve()
+        products, error = solve()
         spent = time.perf_counter() - start
-        bounced = hasattr(answer, "direct")  # light whose direct part that is makes the picture
-        found = (
-            (answer.direct / whole.first_bounce.reshape(grid))[None] if bounced else answer.pattern
-        )
-        seen = picture[:1] if bounced else picture
-        error = float(np.linalg.norm(scene.seen(found) - seen) / np.linalg.norm(seen))
-        products = sum(s.products for s in (answer.solutions if bounced else [answer.solution]))
         facts[name] = f"{spent:.3g} s, {products} products, residual by FFT {error:.2g}"
         note(f"{name}: {facts[name]}")
     return facts
 
 
-def devices(given: Options) -> list[Row]:
+def residual(scene: Scene, light: np.ndarray, pictures: np.ndarray) -> float:
+    """Relative residual of the pictures under some light, by FFT in float64."""
+    deviation = scene.relight(light) - pictures
+    return float(np.linalg.norm(deviation) / np.linalg.norm(pictures))
+
+
+def half_devices(device: Device) -> tuple[Device, Device]:
+    """Both halves of a device, as OpenCL sub-devices."""
+    equally = [device.cl.device_partition_property.EQUALLY, device.compute_units // 2]
+    halves = []
+    for handle in device.handle.create_sub_devices(equally)[:2]:
+        index = f"half {handle}"
+        halves.append(Device(dataclasses.replace(device.description, index=index, handle=handle)))
+    first, second = halves
+    return first, second
+
+
+def compare_devices(options: Options) -> list[Row]:
     """Rows on two halves of the device against one half, and against the whole."""
-    device, n = given.device, 512 if given.smoke else 8192
+    device = options.device
     if device.compute_units < 2 or device.handle.partition_max_sub_devices < 2:
         return []
-    equally = [device.cl.device_partition_property.EQUALLY, device.compute_units // 2]
-    handles = device.handle.create_sub_devices(equally)[:2]
-    described = [
-        dataclasses.replace(device.description, index=f"half {h}", handle=h) for h in handles
-    ]
-    first, second = map(Device, described)
+    n = 512 if options.smoke else 8192
+    first, second = half_devices(device)
     matrix = np.ones((n, n), np.float32)
-    both = MultiDevice(first, [Dense(first, matrix[: n // 2]), Dense(second, matrix[n // 2 :])])
-    ways = {
-        "both": both,
-        "one half": Dense(first, matrix),
-        "the whole device": Dense(device, matrix),
-    }
-    spent = seconds({name: product(A, np.ones(n)) for name, A in ways.items()})
-    ms = {name: 1e3 * each for name, each in spent.items()}
-    question, ours = f"dense, {n} rows on two halves", ms.pop("both")
-    return [Row.from_times(question, name, theirs, ours, "ms") for name, theirs in ms.items()]
+    parts = [Dense(first, matrix[: n // 2]), Dense(second, matrix[n // 2 :])]
+    x = np.ones(n)
+    times = seconds(
+        {
+            "both": product(MultiDevice(first, parts), x),
+            "one half": product(Dense(first, matrix), x),
+            "the whole device": product(Dense(device, matrix), x),
+        }
+    )
+    question = f"dense, {n} rows on two halves"
+    ours = 1e3 * times["both"]
+    rows = []
+    for name in ("one half", "the whole device"):
+        rows.append(Row.from_times(question, name, 1e3 * times[name], ours, "ms"))
+    return rows
+
+
+def limit_memory(file: Path) -> None:
+    """Limit the memory of the process, and check that T does not fit."""
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_CAP, MEMORY_CAP))
+    with contextlib.suppress(MemoryError):
+        np.fromfile(file, np.float32)
+        raise SystemExit("the cap leaves room for all of T")
 
 
 def main() -> None:
-    os.environ.setdefault("POCL_MEMORY_LIMIT", str(CAP >> 30))  # before the device is opened
-    given = parse_options(__doc__ or "")
-    rows, side = devices(given), 32 if given.smoke else SIDE
+    # PoCL reads it when the device is opened.
+    os.environ.setdefault("POCL_MEMORY_LIMIT", str(MEMORY_CAP >> 30))
+    options = parse_options(__doc__)
+    rows = compare_devices(options)
+    side = 32 if options.smoke else SIDE
     with tempfile.TemporaryDirectory() as folder:
-        scene, size = Scene(side, Path(folder) / "T.npy"), 4 * side**4
+        scene = Scene(side, Path(folder) / "T.npy")
+        size = 4 * side**4
         if shutil.disk_usage(folder).free < 1.5 * size:
             raise SystemExit(f"{folder} has no room for {size / 1e9:.3g} GB")
         note(f"writing {size / 1e9:.3g} GB")
         scene.write()
-        if not given.smoke:
-            resource.setrlimit(resource.RLIMIT_DATA, (CAP, CAP))
-            with contextlib.suppress(MemoryError):
-                np.fromfile(scene.file, np.float32)
-                raise SystemExit("the cap leaves room for all of T")
+        if not options.smoke:
+            limit_memory(scene.file)
         T = np.load(scene.file, mmap_mode="r")
-        more, facts = speeds(given, scene, Streamed(given.device, T))
-        facts = {"file, GB": size / 1e9, "cap, GB": CAP / 1e9} | facts | answers(given, scene, T)
-    report(given, "A transport on a disk, and on two devices", rows + more, facts)
+        facts: dict[str, Any] = {"file, GB": size / 1e9, "cap, GB": MEMORY_CAP / 1e9}
+        speed_rows, speed_facts = compare_speeds(scene, Streamed(options.device, T))
+        facts |= speed_facts | solve_tasks(options, scene, T)
+    report(options, "A transport on a disk, and on two devices", rows + speed_rows, facts)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,73 +22,89 @@ from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.operators.relaxation import Sweeps, relaxation
 from ltcl.solvers.relaxation import BlockGaussSeidel
 
-PRODUCT_TARGET = 1 / 1.1  # a sweep takes at most 1.1 times one product
-PYAMG_TARGETS = {"runs of 16": 2.4, "random": 1.4}  # times faster; PyAMG's own limit is the product
-PYAMG_DENSE = 6.0
+# A sweep takes at most 1.1 times one product.
+PRODUCT_TARGET = 1 / 1.1
+# Times faster; PyAMG's own limit is the product.
+PYAMG_TARGETS = {"runs of 16": 2.4, "random": 1.4}
+PYAMG_DENSE_TARGET = 6.0
 
 
-def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
-    sparse = scipy.sparse.issparse(R)
-    S = IdentityPlus(CSR(given.device, R) if sparse else Dense(given.device, R))
+def full_matrix(R: Any) -> scipy.sparse.csr_array:
+    """S = I + R in CSR, float32."""
+    identity = scipy.sparse.eye_array(R.shape[0])
+    S = scipy.sparse.csr_array(identity + scipy.sparse.csr_array(R))
+    return S.astype(np.float32)
+
+
+def compare(options: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> list[Row]:
+    is_sparse = scipy.sparse.issparse(R)
+    operator = CSR(options.device, R) if is_sparse else Dense(options.device, R)
+    S = IdentityPlus(operator)
     n = S.shape[0]
     b = np.random.default_rng(1).random(n, dtype=np.float32)
-    on_device, host = given.device.upload(b), np.zeros(n, np.float32)
+    device_b = options.device.upload(b)
     relax = relaxation(S, "gauss_seidel")
-    block = relaxation(S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
-    upload = given.device.upload
-    sweeps, blocks = (
-        Sweeps(how, upload(host), on_device, on_device.like()) for how in (relax, block)
-    )
-    full = scipy.sparse.csr_array(scipy.sparse.eye_array(n) + scipy.sparse.csr_array(R)).astype(
-        np.float32
-    )
+    block_relax = relaxation(S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
 
-    def sweep(ours: Sweeps = sweeps) -> None:
-        ours.sweep()
-        given.device.finish()
+    def start(how: Any) -> Sweeps:
+        x = options.device.upload(np.zeros(n, np.float32))
+        return Sweeps(how, x, device_b, device_b.like())
 
-    actions: dict[str, Any] = {
+    sweeps = start(relax)
+    block_sweeps = start(block_relax)
+
+    def sweep(sweeps: Sweeps) -> None:
+        sweeps.sweep()
+        options.device.finish()
+
+    actions: dict[str, Callable[[], object]] = {
         "product": product(S.R, b),
-        "sweep": sweep,
-        "block": lambda: sweep(blocks),
+        "sweep": lambda: sweep(sweeps),
+        "block": lambda: sweep(block_sweeps),
     }
-    if theirs is not None:
-        theirs(full, host, b)
-        sweep()
-        if not np.allclose(sweeps.x.get(), host, rtol=1e-4, atol=1e-5):
+    if pyamg_sweep is not None:
+        full = full_matrix(R)
+        x = np.zeros(n, np.float32)
+        pyamg_sweep(full, x, b)
+        sweep(sweeps)
+        if not np.allclose(sweeps.x.get(), x, rtol=1e-4, atol=1e-5):
             raise SystemExit(f"the sweep of {name} is not that of PyAMG")
-        actions["pyamg"] = lambda: theirs(full, host, b)
-    times = {key: value * 1e3 for key, value in seconds(actions, repeats=15).items()}
-    sweeping, one = f"{name}, strips of {relax.block}", times["product"]
+        actions["pyamg"] = lambda: pyamg_sweep(full, x, b)
+    ms = {key: 1e3 * spent for key, spent in seconds(actions, repeats=15).items()}
+
+    def row(question: str, competitor: str, key: str, ours: str, target: float) -> Row:
+        return Row.from_times(question, competitor, ms[key], ms[ours], "ms", target)
+
+    strips = f"{name}, strips of {relax.block}"
+    block_method = f"{name}, block method"
     rows = [
-        Row.from_times(sweeping, "one product", one, times["sweep"], "ms", PRODUCT_TARGET),
-        Row.from_times(
-            f"{name}, block method", "one product", one, times["block"], "ms", PRODUCT_TARGET
-        ),
+        row(strips, "one product", "product", "sweep", PRODUCT_TARGET),
+        row(block_method, "one product", "product", "block", PRODUCT_TARGET),
     ]
-    if theirs is not None:
-        target = PYAMG_TARGETS.get(name, PYAMG_DENSE)
-        rows.append(Row.from_times(sweeping, "pyamg", times["pyamg"], times["sweep"], "ms", target))
+    if pyamg_sweep is not None:
+        target = PYAMG_TARGETS.get(name, PYAMG_DENSE_TARGET)
+        rows.append(row(strips, "pyamg", "pyamg", "sweep", target))
     return rows
 
 
+def find_pyamg_sweep() -> Callable | None:
+    """PyAMG's Gauss-Seidel sweep, or None if PyAMG is not installed (the extra `bench` brings it)."""
+    if importlib.util.find_spec("pyamg") is None:
+        return None
+    return importlib.import_module("pyamg.relaxation.relaxation").gauss_seidel
+
+
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    n, per_row, dense = (2048, 32, 256) if given.smoke else (131072, 256, 4096)
-    pyamg = importlib.util.find_spec("pyamg")  # the extra `bench` brings it
-    theirs = pyamg and importlib.import_module("pyamg.relaxation.relaxation").gauss_seidel
-    rows = []
-    for name, run in (("runs of 16", 16), ("random", 1)):
-        rows += compare(given, name, matrix(n, per_row, run), theirs)
+    options = parse_options(__doc__)
+    n, per_row, dense = (2048, 32, 256) if options.smoke else (131072, 256, 4096)
+    pyamg_sweep = find_pyamg_sweep()
+    rows = compare(options, "runs of 16", matrix(n, per_row, 16), pyamg_sweep)
+    rows += compare(options, "random", matrix(n, per_row, 1), pyamg_sweep)
     R = np.random.default_rng(2).random((dense, dense), dtype=np.float32) / dense
-    rows += compare(given, f"dense {dense}", R, theirs)
-    installed = "yes" if pyamg else "no: its rows are left out"
-    report(
-        given,
-        "Gauss-Seidel sweep",
-        rows,
-        {"pixels": n, "nonzeros a row": per_row, "PyAMG": installed},
-    )
+    rows += compare(options, f"dense {dense}", R, pyamg_sweep)
+    installed = "no: its rows are left out" if pyamg_sweep is None else "yes"
+    facts = {"pixels": n, "nonzeros a row": per_row, "PyAMG": installed}
+    report(options, "Gauss-Seidel sweep", rows, facts)
 
 
 if __name__ == "__main__":

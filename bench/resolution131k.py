@@ -15,6 +15,7 @@ numbers of R. The truth needs no inverse: of a picture l the direct light is l -
 
 from __future__ import annotations
 
+import functools
 import resource
 import time
 from collections.abc import Iterator
@@ -39,16 +40,26 @@ from ltcl.tasks.compression import SparseInverse, invert_coefficients
 from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source
 
-ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
-THRESHOLD, RTOL = 2e-5, 5e-4  # of numbers of A; of solutions with R
-ERROR, SEPARATION = (
-    1e-2,
-    2e-4,
-)  # wanted; of the solves from which bounces come, which are small beside them
-SHARE = 0.6  # of the error of a pattern, what may be left out of R for it
-MEMORY = 1 << 28  # bytes of a block of rows
+ALBEDO = (0.8, 0.65, 0.5)
+# Albedo of the rows of A, of which those of the colours are multiples.
+REFERENCE = 0.5
+# Numbers of A below this are dropped.
+THRESHOLD = 2e-5
+# Error of solutions with R.
+RTOL = 5e-4
+ERROR = 1e-2
+# Error of the solves from which bounces come, which are small beside them.
+SEPARATION_RTOL = 2e-4
+# Share of the error of a pattern that dropped numbers of R may take.
+DROPPED_SHARE = 0.6
+BLOCK_BYTES = 1 << 28
 BOUNCES = 2
-TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
+# Pictures are in this range, which the projector reaches.
+PICTURE_BASE = 0.05
+PICTURE_RANGE = 0.4
+# Bounces are drawn so many times brighter.
+BOUNCE_GAIN = 4.0
+MS_TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}
 
 
 def bounce(rows: Bounce, light: np.ndarray) -> np.ndarray:
@@ -56,8 +67,13 @@ def bounce(rows: Bounce, light: np.ndarray) -> np.ndarray:
     return rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
 
 
+def scaled_landscape(h: int, w: int) -> np.ndarray:
+    """A picture in colour, (h, w, 3) float64."""
+    return PICTURE_BASE + PICTURE_RANGE * landscape(h, w).astype(np.float64)
+
+
 class Stopwatch(dict[str, float]):
-    """Seconds by what they were spent on."""
+    """Seconds by the name of what took them."""
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -68,9 +84,9 @@ class Stopwatch(dict[str, float]):
         note(f"{name}: {self[name]:.3g} s")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Built:
-    """What was made on the way to T; `lighter` is T of the `fewer` numbers that patterns need."""
+    """The transport and its parts; `lighter` is T of the `fewer` numbers that patterns need."""
 
     A: Coefficients
     R: list[SparseInverse]
@@ -80,64 +96,86 @@ class Built:
     spent: Stopwatch
 
     def compensate(self, picture: np.ndarray) -> ltcl.Compensation:
-        """The pattern for a picture, whatever light it takes."""
+        """The pattern for a picture, however much light it takes."""
         return ltcl.compensate(self.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
 
 
-def build(given: Options, rows: Bounce) -> Built:
+def build(options: Options, rows: Bounce) -> Built:
     """The transport, from rows of A alone."""
-    W, spent = Wavelet(given.device, rows.grid, "db2"), Stopwatch()
+    W = Wavelet(options.device, rows.grid, "db2")
+    spent = Stopwatch()
     with spent("compressing A"):
-        transform, blocks = analysis(W), source("A", rows, MEMORY)
+        transform = analysis(W)
+        blocks = source("A", rows, BLOCK_BYTES)
         A = coefficients(blocks, transform, transform, THRESHOLD, first=THRESHOLD / 4)
-    found = []
+    inverses = []
     for albedo in ALBEDO:
         with spent(f"R of albedo {albedo:g}"):
-            C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
-            found.append(invert_coefficients(-C, rtol=RTOL))
-    cores, fewer, (h, w) = [-one.D for one in found], [], rows.grid
-    with spent(
-        "what a pattern needs of R"
-    ):  # that the direct light of another picture is off by 0.6 %
-        picture = 0.05 + 0.4 * landscape(h, w).astype(np.float64)
-        grey = np.roll(picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
-        exact = grey[:, None] - bounce(rows, grey[:, None])
-        for C, truth in zip(cores, exact.T, strict=True):
+            core = A.core * np.float32(albedo / REFERENCE)
+            inverses.append(invert_coefficients(-core.astype(np.float32), rtol=RTOL))
+    cores = [-inverse.D for inverse in inverses]
+    with spent("what a pattern needs of R"):
+        fewer = fewest_for_patterns(W, rows, cores)
+    return Built(
+        A=A,
+        R=inverses,
+        fewer=fewer,
+        T=transport(W, cores, ALBEDO),
+        lighter=transport(W, fewer, ALBEDO),
+        spent=spent,
+    )
 
-            def error(core: Any, truth: np.ndarray = truth) -> float:
-                core, V = restrict_to_support(core, W)
-                S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
-                return relative_error(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
 
-            fewer.append(keep_fewest(C, error, SHARE * ERROR))
-    return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
+def fewest_for_patterns(W: Wavelet, rows: Bounce, cores: list[Any]) -> list[Any]:
+    """As few numbers of each core as leave the direct light of another picture off by 0.6 %."""
+    h, w = rows.grid
+    picture = scaled_landscape(h, w).mean(axis=2)
+    grey = np.roll(picture, (h // 3, w // 5), (0, 1)).reshape(-1)
+    exact = grey[:, None] - bounce(rows, grey[:, None])
+
+    def error(truth: np.ndarray, core: Any) -> float:
+        core, V = restrict_to_support(core, W)
+        S = IdentityPlus(Compressed(CSR(W.device, core), V, V))
+        solution = ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION_RTOL)
+        return relative_error(solution.x, truth)
+
+    fewer = []
+    for core, truth in zip(cores, exact.T, strict=True):
+        channel_error = functools.partial(error, truth)
+        fewer.append(keep_fewest(core, channel_error, DROPPED_SHARE * ERROR))
+    return fewer
 
 
 def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]:
     """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
-    wanted = 0.05 + 0.4 * landscape(*rows.grid).astype(np.float64)
+    desired = scaled_landscape(*rows.grid)
     with built.spent("compensate, first call"):
-        pattern = built.compensate(wanted).pattern
+        pattern = built.compensate(desired).pattern
     with built.spent("separate, first call"):
-        separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
-    l_out = wanted.reshape(-1, 3)
-    exact = [l_out - bounce(rows, l_out)]
+        separation = ltcl.separate(built.T, desired, BOUNCES, rtol=SEPARATION_RTOL)
+    l_out = desired.reshape(-1, 3)
+    direct = l_out - bounce(rows, l_out)
+    truth = [direct]
     for _ in range(BOUNCES):
-        exact.append(bounce(rows, exact[-1]))
+        truth.append(bounce(rows, truth[-1]))
     parts = [separation.direct, *separation.bounces]
-    pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
-    return [wanted, pattern, *parts], [
-        relative_error(part.reshape(-1, 3), truth) for part, truth in pairs
-    ]
+    errors = [relative_error((pattern * ALBEDO).reshape(-1, 3), direct)]
+    for part, exact in zip(parts, truth, strict=True):
+        errors.append(relative_error(part.reshape(-1, 3), exact))
+    return [desired, pattern, *parts], errors
 
 
 def draw(names: list[str], images: list[np.ndarray]) -> Figure:
+    pixels = np.prod(images[0].shape[:2])
     figure = figures.page(
         270,
-        f"{np.prod(images[0].shape[:2])} pixels, each of which lights all of the other wall",
-        "A picture on a corner of two walls, the pattern that makes it, and its light by bounces (4 times).",
+        f"{pixels} pixels, each of which lights all of the other wall",
+        "A picture on a corner of two walls, the pattern that makes it, "
+        "and its light by bounces (4 times).",
     )
-    walls, gains, views = dihedral(2), (1.0, 0.6, 1.0, *(BOUNCES * [4.0])), []
+    walls = dihedral(2)
+    gains = [1.0, 0.6, 1.0] + BOUNCES * [BOUNCE_GAIN]
+    views = []
     for label, image, gain in zip(["wanted", *names], images, gains, strict=True):
         view = draw_view(walls.viewer, walls.walls, image.astype(np.float32), 400, 2)
         views.append((to_srgb(np.clip(gain * view, 0, 1)), label))
@@ -145,56 +183,70 @@ def draw(names: list[str], images: list[np.ndarray]) -> Figure:
     return figure
 
 
-def main() -> None:
-    given = parse_options(__doc__ or "")
-    rows = Bounce(8 if given.smoke else 256, REFERENCE)
-    built = build(given, rows)
-    images, errors = pictures(rows, built)
-    pixels, R = (
-        images[0].reshape(-1, 3).astype(np.float32),
-        cast(Compressed, built.lighter.systems[0].R),
-    )
+def measure_ms(built: Built, picture: np.ndarray) -> dict[str, float]:
+    """Milliseconds of products and tasks."""
+    columns = picture.reshape(-1, 3).astype(np.float32)
+    R = cast(Compressed, built.lighter.systems[0].R)
+    core_x = np.zeros(R.core.shape[1], np.float32)
 
     def solve() -> None:
-        for c, S in enumerate(built.lighter.systems):
-            ltcl.solve(S, pixels[:, c], rtol=ERROR)
+        for channel, S in enumerate(built.lighter.systems):
+            ltcl.solve(S, columns[:, channel], rtol=ERROR)
 
     actions = {
-        "product, on coefficients": product(R.core, np.zeros(R.core.shape[1], np.float32)),
-        "product, in pixels": product(R, pixels[:, 0]),
+        "product, on coefficients": product(R.core, core_x),
+        "product, in pixels": product(R, columns[:, 0]),
         "solve in colour": solve,
-        "compensate in colour": lambda: built.compensate(images[0]),
+        "compensate in colour": lambda: built.compensate(picture),
     }
-    ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
-    n = rows.shape[0]
+    return {name: 1e3 * spent for name, spent in seconds(actions).items()}
+
+
+def build_facts(options: Options, built: Built, n: int, ms: dict[str, float]) -> dict[str, Any]:
+    row_counts = ", ".join(f"{inverse.D.nnz / n:.3g}" for inverse in built.R)
+    fewer_counts = ", ".join(f"{core.nnz / n:.3g}" for core in built.fewer)
     facts: dict[str, Any] = {
         "pixels": n,
         "A, numbers a row": built.A.core.nnz / n,
         "A, dropped (Frobenius, at most)": built.A.dropped,
-        "R, numbers a row": ", ".join(f"{one.D.nnz / n:.3g}" for one in built.R),
-        "R, products of eq. 21": ", ".join(str(one.products) for one in built.R),
-        "R, error of (I + R)(I - A~), bound": max(one.error for one in built.R),
-        "R for patterns, numbers a row": ", ".join(f"{one.nnz / n:.3g}" for one in built.fewer),
+        "R, numbers a row": row_counts,
+        "R, products of eq. 21": ", ".join(str(inverse.products) for inverse in built.R),
+        "R, error of (I + R)(I - A~), bound": max(inverse.error for inverse in built.R),
+        "R for patterns, numbers a row": fewer_counts,
         "bytes of T, for bounces and for patterns": f"{built.T.nbytes}, {built.lighter.nbytes}",
         "bytes of R, were it dense": 3 * 4 * n * n,
-        **{f"{name}, s": spent for name, spent in built.spent.items()},
-        **{f"{name}, ms": spent for name, spent in ms.items()},
-        "peak memory, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "largest buffer allowed, MB": given.device.max_allocation / 2**20,
     }
-    names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
-    claims, limit = [], f"at most {ERROR:.0%}"
+    facts |= {f"{name}, s": spent for name, spent in built.spent.items()}
+    facts |= {f"{name}, ms": spent for name, spent in ms.items()}
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    facts["peak memory, MB"] = usage.ru_maxrss / 1024
+    facts["largest buffer allowed, MB"] = options.device.max_allocation / 2**20
+    return facts
+
+
+def claims(names: list[str], errors: list[float], ms: dict[str, float]) -> list[Claim]:
+    listed = []
     for name, error in zip(names, errors, strict=True):
         text = f"{name} of 131072 pixels in colour"
-        claims.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
-    for name, most in TARGETS.items():
-        claims.append(
-            Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most)
-        )
+        limit = f"at most {ERROR:.0%}"
+        listed.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
+    for name, most in MS_TARGETS.items():
+        is_fast = ms[name] <= most
+        listed.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", is_fast))
+    return listed
+
+
+def main() -> None:
+    options = parse_options(__doc__)
+    rows = Bounce(8 if options.smoke else 256, REFERENCE)
+    built = build(options, rows)
+    images, errors = pictures(rows, built)
+    ms = measure_ms(built, images[0])
+    facts = build_facts(options, built, rows.shape[0], ms)
+    names = ["pattern", "direct"] + [f"bounce {k}" for k in range(1, BOUNCES + 1)]
+    listed = [] if options.smoke else claims(names, errors, ms)
     title = "131072 pixels in colour"
-    figures.conclude(
-        given, title, [] if given.smoke else claims, facts, lambda: draw(names, images)
-    )
+    figures.conclude(options, title, listed, facts, lambda: draw(names, images))
 
 
 if __name__ == "__main__":

@@ -25,9 +25,12 @@ from csr import matrix
 from ltcl.operators import CSR, IdentityPlus
 
 RTOL = 1e-2
-PRODUCTS_TARGET = 4.0  # times fewer than Neumann
-NEUMANN_TARGET, GMRES_TARGET = 10.0, 5.0  # times faster
-DIVERGENT_TARGET = 8  # products at rho(R) = 4
+# Times fewer products than Neumann, and times faster.
+PRODUCTS_TARGET = 4.0
+NEUMANN_TARGET = 10.0
+GMRES_TARGET = 5.0
+# Products at rho(R) = 4.
+DIVERGENT_TARGET = 8
 REPEATS = 3
 
 
@@ -40,18 +43,36 @@ class Problem:
     S: IdentityPlus
     b: np.ndarray
 
-    def check(self, who: str, x: np.ndarray) -> None:
+    @property
+    def is_sparse(self) -> bool:
+        """Whether R is a sparse matrix."""
+        return scipy.sparse.issparse(self.R)
+
+    def full_matrix(self) -> Any:
+        """S on the host."""
+        identity = scipy.sparse.eye_array(self.R.shape[0]).astype(np.float32)
+        if self.is_sparse:
+            return scipy.sparse.csr_array(identity + self.R)
+        return self.R + identity.toarray()
+
+    def solve(self) -> ltcl.Solution:
+        """Solve as a caller does."""
+        return ltcl.solve(self.S, self.b, rtol=RTOL)
+
+    def check(self, name: str, x: np.ndarray) -> None:
         """Stop where a solution is not within the tolerance, in float64."""
         x = np.asarray(x, np.float64)
-        residual = relative_error(x + self.R.astype(np.float64) @ x, self.b.astype(np.float64))
+        product = x + self.R.astype(np.float64) @ x
+        residual = relative_error(product, self.b.astype(np.float64))
         if residual > RTOL * (1 + 1e-3):
-            raise SystemExit(f"{who} misses the tolerance of {self.name}: {residual:.3g}")
+            raise SystemExit(f"{name} misses the tolerance of {self.name}: {residual:.3g}")
 
 
-def box(given: Options, rho: float) -> Problem:
+def box(options: Options, rho: float) -> Problem:
     """A closed box of one albedo m, rho(R) = m / (1 - m), with its true first bounce."""
-    scene = ltcl.scenes.box(10 if given.smoke else 26, sides=6, albedo=rho / (1 + rho))
-    T = scene.transport(first_bounce=scene.first_bounce, device=given.device)
+    n = 10 if options.smoke else 26
+    scene = ltcl.scenes.box(n, sides=6, albedo=rho / (1 + rho))
+    T = scene.transport(first_bounce=scene.first_bounce, device=options.device)
     R = (T.matrices[0] / T.first_bounce - np.eye(T.shape[0])).astype(np.float32)
     return problem(f"box of {len(R)}, rho {rho:g}", R, T.systems[0])
 
@@ -59,13 +80,28 @@ def box(given: Options, rho: float) -> Problem:
 def problem(name: str, R: Any, S: IdentityPlus, columns: int | None = None) -> Problem:
     """The picture S l_d of random light l_d; `columns` of them."""
     n = R.shape[0]
-    l_d = np.random.default_rng(1).random(n if columns is None else (n, columns), dtype=np.float32)
-    return Problem(name if columns is None else f"{name}, k = {columns}", R, S, l_d + R @ l_d)
+    random = np.random.default_rng(1)
+    if columns is None:
+        l_d = random.random(n, dtype=np.float32)
+    else:
+        name = f"{name}, k = {columns}"
+        l_d = random.random((n, columns), dtype=np.float32)
+    return Problem(name, R, S, l_d + R @ l_d)
+
+
+def sparse_R(smoke: bool) -> Any:
+    """A sparse R whose row sums are rho(R) = 0.8."""
+    R = matrix(2048, 32, 16) if smoke else matrix(131072, 256, 16)
+    factors = np.repeat(0.8 / R.sum(axis=1), np.diff(R.indptr))
+    R.data *= factors.astype(np.float32)
+    return R
 
 
 def neumann(problem: Problem) -> tuple[np.ndarray, int]:
     """I - R + R^2 - ... until the next term, which is the residual, is small in every column."""
-    x, term, products = np.zeros_like(problem.b), problem.b, 0
+    x = np.zeros_like(problem.b)
+    term = problem.b
+    products = 0
     target = RTOL * np.linalg.norm(problem.b, axis=0)
     while np.any(np.linalg.norm(term, axis=0) > target):
         x += term
@@ -77,71 +113,82 @@ def neumann(problem: Problem) -> tuple[np.ndarray, int]:
 
 def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
     """One right-hand side after the other; the products are those inside its iteration."""
-    calls: list[float] = []
-    sides = problem.b.reshape(len(problem.b), -1).T
-    rules: dict[str, Any] = {"rtol": RTOL, "restart": 20, "callback": calls.append}
-    columns = [gmres(full, side, callback_type="pr_norm", **rules)[0] for side in sides]
-    return np.stack(columns, axis=-1).reshape(problem.b.shape), len(calls)
+    residuals: list[float] = []
+    columns = []
+    for side in problem.b.reshape(len(problem.b), -1).T:
+        x, _ = gmres(
+            full, side, rtol=RTOL, restart=20, callback=residuals.append, callback_type="pr_norm"
+        )
+        columns.append(x)
+    return np.stack(columns, axis=-1).reshape(problem.b.shape), len(residuals)
 
 
 def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
-    R, identity = problem.R, scipy.sparse.eye_array(problem.R.shape[0]).astype(np.float32)
-    full = (
-        scipy.sparse.csr_array(identity + R) if scipy.sparse.issparse(R) else R + identity.toarray()
-    )
-    first = 1e3 * ltcl.solve(problem.S, problem.b, rtol=RTOL).seconds  # builds kernels, tunes
-    ours = [ltcl.solve(problem.S, problem.b, rtol=RTOL) for _ in range(2)][1]  # surveys S
-    series, products = neumann(problem)
-    krylov, steps = scipy_gmres(problem, full)
-    for who, x in (("ours", ours.x), ("neumann", series), ("gmres", krylov)):
-        problem.check(who, x)
-    facts[f"{problem.name}: chosen"] = f"{ours.method}, {ours.products} products: {ours.reason}"
-    facts[f"{problem.name}: products of SciPy's GMRES"] = steps
+    full = problem.full_matrix()
+    # The first solve builds kernels and tunes, the second one surveys S.
+    first_ms = 1e3 * problem.solve().seconds
+    problem.solve()
+    ours = problem.solve()
+    series, neumann_products = neumann(problem)
+    krylov, gmres_products = scipy_gmres(problem, full)
+    problem.check("ours", ours.x)
+    problem.check("neumann", series)
+    problem.check("gmres", krylov)
+    name = problem.name
+    facts[f"{name}: chosen"] = f"{ours.method}, {ours.products} products: {ours.reason}"
+    facts[f"{name}: products of SciPy's GMRES"] = gmres_products
     actions: dict[str, Callable[[], object]] = {
-        "ours": lambda: ltcl.solve(problem.S, problem.b, rtol=RTOL),
+        "ours": problem.solve,
         "neumann": lambda: neumann(problem),
         "gmres": lambda: scipy_gmres(problem, full),
     }
-    times = {name: 1e3 * spent for name, spent in seconds(actions, repeats=REPEATS).items()}
-    loop, name = (
-        f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop",
-        problem.name,
+    ms = {action: 1e3 * spent for action, spent in seconds(actions, repeats=REPEATS).items()}
+
+    has_one_column = problem.b.ndim == 1
+    rows = []
+    if has_one_column:
+        rows.append(Row.from_times(name, "3 later solves", 3 * ms["ours"], first_ms, "ms", 1.0))
+    fewer = Row.from_times(
+        name, "Neumann's products", neumann_products, ours.products, "products", PRODUCTS_TARGET
     )
-    of_neumann, of_gmres = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
-    new = [Row.from_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (
-        problem.b.ndim == 1
-    )
+    library = "scipy.sparse" if problem.is_sparse else "numpy"
+    neumann_target = NEUMANN_TARGET if has_one_column else None
+    gmres_target = GMRES_TARGET if has_one_column else None
+    loop = f"{library} Neumann loop"
     return [
-        *new,
-        Row.from_times(
-            name, "Neumann's products", products, ours.products, "products", PRODUCTS_TARGET
-        ),
-        Row.from_times(name, loop, times["neumann"], times["ours"], "ms", of_neumann),
-        Row.from_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", of_gmres),
+        *rows,
+        fewer,
+        Row.from_times(name, loop, ms["neumann"], ms["ours"], "ms", neumann_target),
+        Row.from_times(name, "scipy GMRES", ms["gmres"], ms["ours"], "ms", gmres_target),
     ]
 
 
+def compare_divergent(problem: Problem, facts: dict[str, Any]) -> Row:
+    """Products at a radius where the paper's series diverges."""
+    series = ltcl.solve(problem.S, problem.b, "neumann", rtol=RTOL, throw=False)
+    facts[f"{problem.name}: Neumann"] = series.status.name.lower()
+    # The second solve surveys S.
+    problem.solve()
+    problem.solve()
+    ours = problem.solve()
+    problem.check("ours", ours.x)
+    allowed = DIVERGENT_TARGET
+    return Row.from_times(problem.name, "products allowed", allowed, ours.products, "products", 1.0)
+
+
 def main() -> None:
-    given, facts = parse_options(__doc__ or ""), {}
-    R = matrix(2048, 32, 16) if given.smoke else matrix(131072, 256, 16)
-    R.data *= np.repeat(0.8 / R.sum(axis=1), np.diff(R.indptr)).astype(
-        np.float32
-    )  # row sums are rho(R)
-    dense, S = box(given, 0.8), IdentityPlus(CSR(given.device, R))
-    large = problem(f"sparse {R.shape[0]}, rho 0.8", R, S)
-    rows = compare(dense, facts) + compare(large, facts)
-    for k in (3, 8):
-        rows += compare(problem(large.name, R, S, k), facts)
-    beyond = box(given, 4.0)  # where the paper's series diverges
-    paper = ltcl.solve(beyond.S, beyond.b, "neumann", rtol=RTOL, throw=False)
-    facts[f"{beyond.name}: Neumann"] = paper.status.name.lower()
-    ours = [ltcl.solve(beyond.S, beyond.b, rtol=RTOL) for _ in range(3)][2]  # the second surveys S
-    beyond.check("ours", ours.x)
-    due = DIVERGENT_TARGET
-    rows.append(
-        Row.from_times(beyond.name, "products allowed", due, ours.products, "products", 1.0)
-    )
-    report(given, "Solve to 1 %", rows, facts)
+    options = parse_options(__doc__)
+    facts: dict[str, Any] = {}
+    dense = box(options, 0.8)
+    R = sparse_R(options.smoke)
+    S = IdentityPlus(CSR(options.device, R))
+    name = f"sparse {R.shape[0]}, rho 0.8"
+    rows = compare(dense, facts)
+    rows += compare(problem(name, R, S), facts)
+    for columns in (3, 8):
+        rows += compare(problem(name, R, S, columns), facts)
+    rows.append(compare_divergent(box(options, 4.0), facts))
+    report(options, "Solve to 1 %", rows, facts)
 
 
 if __name__ == "__main__":

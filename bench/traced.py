@@ -2,17 +2,19 @@
 """Deviations, denoising and `rtol="noise"` of path-traced transports, judged by independent measurements.
 
 Mitsuba traces (`scenes.tracing`) a corner, a box, and a box with blocks ten times each. Twice, one
-is judged by the mean of eight others, whose own errors are taken off all ratios; with the noise
-that T tells itself, and with that of the tenth. Deviations over errors: root mean squares over
-pixels, under white. Errors denoised and compressed, over those before: of ten patterns of each
-kind, and of bounces of one of each. Also, what no measurement mends: the bounces of one view, by
-its `first_bounce`, against those traced.
+is judged by the mean of eight others, whose own errors are subtracted from all ratios; with the
+noise that T itself shows, and with that of the tenth. Deviations over errors: root mean squares
+over pixels, under white. Errors denoised and compressed, over those before: of ten patterns of each
+kind, and of bounces of one of each. Also reported, as no measurement mends it: the deviation of the
+bounces of one view, by its `first_bounce`, from those traced.
 """
 
 from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,107 +31,196 @@ from scenes import tracing
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import measure, noise_of, truth
 
-GRID, PATHS, SEEDS, JUDGED = (
-    (32, 32),
-    2560,
-    10,
-    2,
-)  # as many paths an entry of T as in compression.py
-OWN = 1.0 / (SEEDS - 1)  # share of the truth's own errors in the variance of those against it
+GRID = (32, 32)
+# As many paths an entry of T as in compression.py.
+PATHS = 2560
+SEEDS = 10
+# Measurements that are judged by others.
+JUDGED = 2
+# Share of the truth's own errors in the variance of those against it.
+TRUTH_VARIANCE = 1.0 / (SEEDS - 1)
 PARTS = ("direct", "bounce 1", "bounce 2", "bounce 3", "pattern", "appearance")
-LIMITS: dict[str, Any] = {
-    "deviations over errors": (PARTS, 0.75, 1.33),
-    "denoised": (QUANTITIES, 0.0, 1.0),
-    "compressed": (QUANTITIES[:3], 0.0, 1.1),
-}
+SCENES = ("corner", "box", "blocks")
 
 
-def measurements(scene: str, smoke: bool) -> tuple[list[ltcl.Transport], dict[str, float]]:
-    """All, and how far the bounces of their mean are from those traced; simulated ones for --smoke."""
-    if smoke:
-        T = truth("corner", 6)
-        return [measure(T, noise_of(T, 1e-3), seed, known=False) for seed in range(4)], {}
+@dataclass(frozen=True)
+class Limits:
+    """Names of ratios, and the range in which they must be."""
+
+    names: Sequence[str]
+    least: float
+    most: float
+
+    def claim(self, text: str, values: np.ndarray) -> Claim:
+        """Judge ratios of several measurements, (measurements, names)."""
+        cells = []
+        for name, column in zip(self.names, values.T, strict=True):
+            cells.append(f"{name} {column.min():.2f} to {column.max():.2f}")
+        is_within = (self.least <= values) & (values <= self.most)
+        limits = f"{self.least:g} to {self.most:g}"
+        return Claim(text, ", ".join(cells), limits, bool(is_within.all()))
+
+
+DEVIATION_LIMITS = Limits(PARTS, 0.75, 1.33)
+DENOISED_LIMITS = Limits(QUANTITIES, 0.0, 1.0)
+COMPRESSED_LIMITS = Limits(QUANTITIES[:3], 0.0, 1.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """Ratios of one measurement, relative errors of T, and bytes a row."""
+
+    deviations: np.ndarray
+    denoised: np.ndarray
+    compressed: np.ndarray
+    errors: np.ndarray
+    row_nbytes: float
+
+
+def traced_measurements(scene: str) -> tuple[list[ltcl.Transport], dict[str, float]]:
+    """All measurements, and how far the bounces of their mean are from those traced."""
     traced = [tracing.trace(scene, GRID, PATHS, seed) for seed in range(1, SEEDS + 1)]
-    mean, off = np.mean(traced, axis=0, dtype=np.float64), {}
-    white = mean.sum(axis=2).reshape(-1, *GRID)
-    for first in ("diagonal", "exact"):
-        T = ltcl.Transport(mean.sum(axis=0), GRID, first_bounce=first)
-        b = ltcl.separate(T, T @ np.ones(GRID), 3, rtol=1e-5)
-        off[first] = float((norms([b.direct, *b.bounces] - white[:4]) / norms(white[:1])).max())
-    return [ltcl.Transport(T.sum(axis=0), GRID) for T in traced], off
+    mean = np.mean(traced, axis=0, dtype=np.float64)
+    bounces = mean.sum(axis=2).reshape(-1, *GRID)[:4]
+    deviations = {}
+    for first_bounce in ("diagonal", "exact"):
+        T = ltcl.Transport(mean.sum(axis=0), GRID, first_bounce=first_bounce)
+        separation = ltcl.separate(T, T @ np.ones(GRID), 3, rtol=1e-5)
+        off = norms(separation_light(separation) - bounces) / norms(bounces[:1])
+        deviations[first_bounce] = float(off.max())
+    transports = [ltcl.Transport(T.sum(axis=0), GRID) for T in traced]
+    return transports, deviations
 
 
-def norms(arrays: Any) -> np.ndarray:
-    """Of each one."""
-    return np.array([np.linalg.norm(each) for each in arrays])
+def simulated_measurements() -> list[ltcl.Transport]:
+    """Measurements for --smoke, which need no Mitsuba."""
+    T = truth("corner", 6)
+    noise = noise_of(T, 1e-3)
+    return [measure(T, noise, seed, known=False) for seed in range(4)]
 
 
-def deviations(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
+def separation_light(separation: Any) -> np.ndarray:
+    """Direct light and bounces of a separation, or of its deviations."""
+    return np.stack([separation.direct, *separation.bounces])
+
+
+def norms(arrays: Iterable[np.ndarray]) -> np.ndarray:
+    """The norm of each array."""
+    return np.array([np.linalg.norm(array) for array in arrays])
+
+
+def deviation_ratios(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     """`.std` over errors of `PARTS`, under white."""
     white = true @ np.ones(true.grid)
-    b, exact = (ltcl.separate(A, white, 3, rtol=1e-5) for A in (T, true))
-    c = ltcl.compensate(T, white, bounds=(-99.0, 99.0), rtol=1e-5)
-    shown, F = c.appearance - true @ c.pattern, b.direct - exact.direct
-    errors = [F, *b.bounces - exact.bounces, c.pattern - 1.0, shown]
-    return norms([b.std.direct, *b.std.bounces, c.std.pattern, c.std.appearance]) / norms(errors)
+    separation = ltcl.separate(T, white, 3, rtol=1e-5)
+    exact = ltcl.separate(true, white, 3, rtol=1e-5)
+    compensation = ltcl.compensate(T, white, bounds=(-99.0, 99.0), rtol=1e-5)
+    pattern_error = compensation.pattern - 1.0
+    appearance_error = compensation.appearance - true @ compensation.pattern
+    light_errors = separation_light(separation) - separation_light(exact)
+    deviations = [*separation_light(separation.std)]
+    deviations += [compensation.std.pattern, compensation.std.appearance]
+    return norms(deviations) / norms([*light_errors, pattern_error, appearance_error])
 
 
-def errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
-    """Relative ones of `QUANTITIES`: T p of ten patterns of each kind; bounces of pictures of one of each."""
-    kinds = patterns(T.grid)
-    image = true @ np.stack([kind[0] for kind in kinds])
-    ours, exact = (
-        [*(A @ kind for kind in kinds), *ltcl.separate(A, image, 3).bounces] for A in (T, true)
+def quantities(T: ltcl.Transport, images: np.ndarray) -> list[np.ndarray]:
+    """`QUANTITIES` of T: T p of ten patterns of each kind; bounces of `images`."""
+    relit = [T @ kind for kind in patterns(T.grid)]
+    return [*relit, *ltcl.separate(T, images, 3).bounces]
+
+
+def relative_errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
+    """Relative errors of `QUANTITIES`; bounces are of pictures of one pattern of each kind."""
+    images = true @ np.stack([kind[0] for kind in patterns(T.grid)])
+    exact = quantities(true, images)
+    deviations = []
+    for value, exact_value in zip(quantities(T, images), exact, strict=True):
+        deviations.append(value - exact_value)
+    return norms(deviations) / norms(exact)
+
+
+def judge(T: ltcl.Transport, true: ltcl.Transport) -> Judgement:
+    compressed = ltcl.compress(T, "noise")
+    errors = relative_errors(T, true)
+
+    def error_ratio(better: ltcl.Transport) -> np.ndarray:
+        squares = (relative_errors(better, true) / errors) ** 2
+        return np.sqrt(np.maximum(squares - TRUTH_VARIANCE, 0.0) / (1.0 - TRUTH_VARIANCE))
+
+    nbytes = compressed.compression.channels[0].nbytes
+    return Judgement(
+        deviations=deviation_ratios(T, true) / (1.0 - TRUTH_VARIANCE) ** 0.5,
+        denoised=error_ratio(ltcl.denoise(T)),
+        compressed=error_ratio(compressed)[: len(COMPRESSED_LIMITS.names)],
+        errors=errors,
+        row_nbytes=nbytes / len(T.first_bounce),
     )
-    return norms(a - b for a, b in zip(ours, exact, strict=True)) / norms(exact)
 
 
-def judge(T: ltcl.Transport, true: ltcl.Transport) -> tuple[Any, ...]:
-    """Values of `LIMITS`, relative errors of T, and bytes a row."""
-    C, raw = ltcl.compress(T, "noise"), errors(T, true)
-    squares = np.array([errors(A, true) / raw for A in (ltcl.denoise(T), C)]) ** 2
-    left, kept = np.sqrt(np.maximum(squares - OWN, 0.0) / (1.0 - OWN))
-    row = C.compression.channels[0].nbytes / len(T.first_bounce)
-    return deviations(T, true) / (1.0 - OWN) ** 0.5, left, kept[:3], raw, row
+def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
+    """Judge some measurements, by the noise model they are options."""
+    alone = []
+    with_second = []
+    for k in range(JUDGED):
+        first, second, *others = measured[k:] + measured[:k]
+        matrix = first.to_numpy()
+        mean = np.mean([T.to_numpy() for T in others], axis=0)
+        true = ltcl.Transport(mean, first.grid)
+        alone.append(judge(ltcl.Transport(matrix, first.grid), true))
+        twice = ltcl.Transport(matrix, first.grid, noise=second)
+        with_second.append(judge(twice, true))
+    return {"noise by T alone": alone, "noise by two measurements": with_second}
+
+
+def way_claims(name: str, judgements: list[Judgement]) -> list[Claim]:
+    deviations = np.array([judgement.deviations for judgement in judgements])
+    denoised = np.array([judgement.denoised for judgement in judgements])
+    compressed = np.array([judgement.compressed for judgement in judgements])
+    return [
+        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", deviations),
+        DENOISED_LIMITS.claim(f"{name}: denoised", denoised),
+        COMPRESSED_LIMITS.claim(f"{name}: compressed", compressed),
+    ]
+
+
+def list_errors(judgements: list[Judgement]) -> str:
+    """Largest relative errors of T, by the quantity."""
+    largest = np.max([judgement.errors for judgement in judgements], axis=0)
+    cells = [f"{name} {error:.2%}" for name, error in zip(QUANTITIES, largest, strict=True)]
+    return ", ".join(cells)
 
 
 def main() -> None:
     """Judge each scene, or say why not."""
-    given = parse_options(__doc__ or "")
-    if why := "" if given.smoke else tracing.unavailable():
-        raise SystemExit(f"not measured: {why}")
-    logging.getLogger("ltcl").setLevel(logging.ERROR)  # of T that is noisy
-    facts: dict[str, Any] = {"path-traced": "not measured: --smoke"} if given.smoke else {}
-    claims, half = list[Claim](), list[bool]()
-    for scene in ["simulated"] if given.smoke else ("corner", "box", "blocks"):
-        measured, facts[f"{scene}: bounces of one view, off"] = measurements(scene, given.smoke)
-        found: dict[str, list[Any]] = {"noise by T alone": [], "noise by two measurements": []}
-        for k in range(JUDGED):
-            first, second, *others = measured[k:] + measured[:k]
-            true = ltcl.Transport(np.mean([T.to_numpy() for T in others], axis=0), first.grid)
-            for noise, values in zip((None, second), found.values(), strict=True):
-                values.append(
-                    judge(ltcl.Transport(first.to_numpy(), first.grid, noise=noise), true)
-                )
-        for way, values in found.items():
-            *columns, raw, rows = (np.array(each) for each in zip(*values, strict=True))
-            errors_of_T = zip(QUANTITIES, raw.max(axis=0), strict=True)
-            facts[f"{scene}: relative errors"] = ", ".join(
-                f"{name} {x:.2%}" for name, x in errors_of_T
-            )
-            facts[f"{scene}, {way}: bytes a row"] = float(rows.max())
-            half += list((columns[1] <= 0.5).ravel())
-            for (text, (names, least, most)), x in zip(LIMITS.items(), columns, strict=True):
-                cells = zip(names, x.min(axis=0), x.max(axis=0), strict=True)
-                listed = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in cells)
-                holds = bool(((least <= x) & (x <= most)).all())
-                claims.append(
-                    Claim(f"{scene}, {way}: {text}", listed, f"{least:g} to {most:g}", holds)
-                )
-    claims.append(
-        Claim("denoised: at most half is left", f"{sum(half)} of {len(half)}", "all", all(half))
-    )
-    figures.conclude(given, "Path-traced transports", [] if given.smoke else claims, facts, Figure)
+    options = parse_options(__doc__)
+    facts: dict[str, Any] = {}
+    if options.smoke:
+        facts["path-traced"] = "not measured: --smoke"
+    else:
+        reason = tracing.unavailable()
+        if reason:
+            raise SystemExit(f"not measured: {reason}")
+    # A noisy T warns.
+    logging.getLogger("ltcl").setLevel(logging.ERROR)
+    claims: list[Claim] = []
+    is_halved: list[bool] = []
+    for scene in ("simulated",) if options.smoke else SCENES:
+        if options.smoke:
+            measured, off = simulated_measurements(), {}
+        else:
+            measured, off = traced_measurements(scene)
+        facts[f"{scene}: bounces of one view, off"] = off
+        for way, judgements in judge_scene(measured).items():
+            name = f"{scene}, {way}"
+            facts[f"{scene}: relative errors"] = list_errors(judgements)
+            facts[f"{name}: bytes a row"] = max(judgement.row_nbytes for judgement in judgements)
+            for judgement in judgements:
+                is_halved += [bool(ratio <= 0.5) for ratio in judgement.denoised]
+            claims += way_claims(name, judgements)
+    halved = f"{sum(is_halved)} of {len(is_halved)}"
+    claims.append(Claim("denoised: at most half is left", halved, "all", all(is_halved)))
+    listed = [] if options.smoke else claims
+    figures.conclude(options, "Path-traced transports", listed, facts, Figure)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ and by eights as `ltcl.batch.compensate_frames` does, which is timed with its pi
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,91 +19,145 @@ import scipy.sparse
 import _coefficients
 import ltcl
 from _harness import Options, Row, parse_options, report, seconds
+from ltcl.images import from_srgb, to_srgb
 from ltcl.operators import Compressed, Wavelet
 from ltcl.scenes import landscape
 
 ALBEDO = (0.4, 0.3, 0.2)
-NUMBERS, RTOL, BATCH = 10, 1e-2, 8
-SOLVES, KEPT = 60.0, 120.0  # frames a second
-TO_LINEAR = ltcl.images.from_srgb(np.arange(256, dtype=np.float32) / 255)
-STEPS = 4095  # of light between 0 and 1, of which each has a code
-TO_CODES = np.rint(
-    255 * ltcl.images.to_srgb(np.linspace(0, 1, STEPS + 1, dtype=np.float32))
-).astype(np.uint8)
+# Numbers of the core a row.
+ROW_NUMBERS = 10
+RTOL = 1e-2
+BATCH = 8
+# Frames a second with solves, and with a kept inverse.
+SOLVE_TARGET = 60.0
+INVERSE_TARGET = 120.0
+# Light of each code, and the code of each of LIGHT_STEPS + 1 levels of light between 0 and 1.
+TO_LINEAR = from_srgb(np.arange(256, dtype=np.float32) / 255)
+LIGHT_STEPS = 4095
 
 
-def transport(given: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> ltcl.Transport:
-    """T = (I + R) F with R symmetric in the `coarse` wavelet coefficients and of norm m / (1 - m) at most."""
-    rng, W = np.random.default_rng(0), Wavelet(given.device, grid, "db2")
+def to_codes(light: np.ndarray) -> np.ndarray:
+    """The nearest 8-bit codes of light in [0, 1]."""
+    return np.rint(255 * to_srgb(light)).astype(np.uint8)
+
+
+TO_CODES = to_codes(np.linspace(0, 1, LIGHT_STEPS + 1, dtype=np.float32))
+
+
+def transport(options: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> ltcl.Transport:
+    """T = (I + R) F with R symmetric in the `coarse` wavelet coefficients.
+
+    The norm of R is m / (1 - m) at most.
+    """
+    W = Wavelet(options.device, grid, "db2")
+    core = symmetric_core(grid, coarse)
+    cores = []
+    for albedo in ALBEDO:
+        scale = albedo / (1.0 - albedo)
+        cores.append((core * scale).astype(np.float32))
+    return _coefficients.transport(W, cores, ALBEDO)
+
+
+def symmetric_core(grid: tuple[int, int], coarse: tuple[int, int]) -> Any:
+    """Random numbers between near coarse coefficients, with row sums of 1 at most."""
+    random = np.random.default_rng(0)
     n = grid[0] * grid[1]
-    places = (np.arange(coarse[0])[:, None] * grid[1] + np.arange(coarse[1])).ravel()
-    rows = np.repeat(np.arange(len(places)), NUMBERS // 2)
-    columns = (rows + rng.integers(-4 * NUMBERS, 4 * NUMBERS, rows.size)) % len(places)
-    numbers = rng.uniform(0.0, 1.0, rows.size)
+    places = np.arange(coarse[0])[:, None] * grid[1] + np.arange(coarse[1])
+    places = places.ravel()
+    rows = np.repeat(np.arange(len(places)), ROW_NUMBERS // 2)
+    shifts = random.integers(-4 * ROW_NUMBERS, 4 * ROW_NUMBERS, rows.size)
+    columns = (rows + shifts) % len(places)
+    numbers = random.uniform(0.0, 1.0, rows.size)
     half = scipy.sparse.csr_array((numbers, (places[rows], places[columns])), shape=(n, n))
     core = scipy.sparse.csr_array(half + half.T)
     core *= 1.0 / abs(core).sum(axis=1).max()
-    cores = [(core * (m / (1.0 - m))).astype(np.float32) for m in ALBEDO]
-    return _coefficients.transport(W, cores, ALBEDO)
+    return core
 
 
 def film(T: ltcl.Transport, frames: int) -> np.ndarray:
     """Decoded frames, (frames, h, w, 3) uint8: a landscape that drifts, within reach of the projector."""
     h, w = T.grid
-    light = 0.1 + 0.2 * np.asarray(landscape(h, w), np.float32).reshape(h, w, -1)[..., :3]
-    codes = np.rint(255 * ltcl.images.to_srgb(np.broadcast_to(light, (h, w, 3)))).astype(np.uint8)
+    picture = np.asarray(landscape(h, w), np.float32).reshape(h, w, -1)[..., :3]
+    light = np.broadcast_to(0.1 + 0.2 * picture, (h, w, 3))
+    codes = to_codes(light)
     return np.stack([np.roll(codes, 2 * k, axis=1) for k in range(frames)])
 
 
-def shown(T: ltcl.Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
-    """The projector's codes under which the scene shows these."""
-    done = ltcl.compensate(T, TO_LINEAR[codes], rtol=RTOL, clamp=True, **settings)
-    return TO_CODES[(STEPS * done.pattern + 0.5).astype(np.int16)]
+def projector_codes(T: ltcl.Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
+    """The projector's codes under which the scene looks like these."""
+    compensation = ltcl.compensate(T, TO_LINEAR[codes], rtol=RTOL, clamp=True, **settings)
+    levels = (LIGHT_STEPS * compensation.pattern + 0.5).astype(np.int16)
+    return TO_CODES[levels]
+
+
+def measure(
+    options: Options, T: ltcl.Transport, inverse: ltcl.Inverse, frames: np.ndarray
+) -> dict[str, float]:
+    """Seconds of BATCH frames, in all ways."""
+
+    def run_each(**settings: Any) -> None:
+        for codes in frames:
+            projector_codes(T, codes, **settings)
+
+    def run_files(folder: Path, **settings: Any) -> None:
+        rules: Any = {"batch": BATCH, "rtol": RTOL, "clamp": True, **settings}
+        with tempfile.TemporaryDirectory() as out:
+            ltcl.batch.compensate_frames(T, folder, out, **rules)
+
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent) / "film"
+        for number, codes in enumerate(frames):
+            ltcl.images.write(folder / f"{number}.png", TO_LINEAR[codes])
+        actions: dict[str, Callable[[], object]] = {
+            "solves, one by one": run_each,
+            "solves, 8 at a time": lambda: projector_codes(T, frames),
+            "inverse, one by one": lambda: run_each(inverse=inverse),
+            "inverse, 8 at a time": lambda: projector_codes(T, frames, inverse=inverse),
+            "solves, compensate_frames, .png to .png": lambda: run_files(folder),
+            "inverse, compensate_frames, .png to .png": lambda: run_files(folder, inverse=inverse),
+        }
+        return seconds(actions, 1 if options.smoke else 7)
+
+
+def rate_row(name: str, spent: float) -> Row:
+    rate = BATCH / spent
+    target = INVERSE_TARGET if name.startswith("inverse") else SOLVE_TARGET
+    ratio = rate / target
+    # Files take as long as the machine's disk.
+    least = None if "png" in name else 1.0
+    return Row(name, f"{target:g} frames/s", target, rate, "frames/s", ratio, least)
+
+
+def frame_facts(T: ltcl.Transport) -> dict[str, Any]:
+    """Method, products and error of one frame."""
+    (codes,) = film(T, 1)
+    compensation = ltcl.compensate(T, TO_LINEAR[codes], rtol=RTOL, clamp=True)
+    solutions = compensation.solution
+    if not isinstance(solutions, tuple):
+        solutions = (solutions,)
+    return {
+        "method": solutions[0].method,
+        "products of a channel": max(solution.products for solution in solutions),
+        "error of a frame": compensation.error,
+        "clipped": compensation.clipped,
+    }
 
 
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    grid, coarse = ((16, 32), (4, 8)) if given.smoke else ((256, 512), (32, 64))
-    T = transport(given, grid, coarse)
-    inverse, frames = ltcl.invert(T, RTOL), film(T, BATCH)
-    kept = {"inverse": inverse}
-    with tempfile.TemporaryDirectory() as folder:
-        for number, codes in enumerate(frames):
-            ltcl.images.write(Path(folder) / "film" / f"{number}.png", TO_LINEAR[codes])
-
-        def files(**settings: Any) -> None:
-            with tempfile.TemporaryDirectory() as out:
-                rules: Any = {"batch": BATCH, "rtol": RTOL, "clamp": True, **settings}
-                ltcl.batch.compensate_frames(T, Path(folder) / "film", out, **rules)
-
-        actions = {
-            "solves, one by one": lambda: [shown(T, codes) for codes in frames],
-            "solves, 8 at a time": lambda: shown(T, frames),
-            "inverse, one by one": lambda: [shown(T, codes, **kept) for codes in frames],
-            "inverse, 8 at a time": lambda: shown(T, frames, **kept),
-            "solves, compensate_frames, .png to .png": files,
-            "inverse, compensate_frames, .png to .png": lambda: files(**kept),
-        }
-        spent = seconds(actions, 1 if given.smoke else 7)
-    rows = []
-    for name, time in spent.items():
-        rate, target = BATCH / time, KEPT if name.startswith("inverse") else SOLVES
-        goal = None if "png" in name else 1.0
-        rows.append(
-            Row(name, f"{target:g} frames/s", target, rate, "frames/s", rate / target, goal)
-        )
-    done = ltcl.compensate(T, TO_LINEAR[film(T, 1)[0]], rtol=RTOL, clamp=True)
-    solutions = done.solution if isinstance(done.solution, tuple) else (done.solution,)
+    options = parse_options(__doc__)
+    grid, coarse = ((16, 32), (4, 8)) if options.smoke else ((256, 512), (32, 64))
+    T = transport(options, grid, coarse)
+    inverse = ltcl.invert(T, RTOL)
+    times = measure(options, T, inverse, film(T, BATCH))
+    rows = [rate_row(name, spent) for name, spent in times.items()]
+    R = cast(Compressed, T.systems[0].R)
     facts = {
         "pixels": grid[0] * grid[1],
-        "coefficients of the core": cast(Compressed, T.systems[0].R).core.shape[0],
-        "method": solutions[0].method,
-        "products of a channel": max(one.products for one in solutions),
-        "error of a frame": done.error,
-        "clipped": done.clipped,
+        "coefficients of the core": R.core.shape[0],
+        **frame_facts(T),
         "error of the inverse, bound": inverse.error,
     }
-    report(given, "Video, 256 x 512 in colour", rows, facts)
+    report(options, "Video, 256 x 512 in colour", rows, facts)
 
 
 if __name__ == "__main__":

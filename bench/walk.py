@@ -23,34 +23,45 @@ from csr import matrix
 from ltcl.operators import CSR
 from ltcl.operators.walks import Lengths, Tables, Walker, linked, tables
 
-TARGET = 1.5  # times faster
+# Times faster.
+TARGET = 1.5
+# Chance that a walk goes on, and its mean number of steps.
 GO_ON = 0.5
-STEPS = 1.0 / (1.0 - GO_ON)  # of a walk, in the mean
+STEPS = 1.0 / (1.0 - GO_ON)
+LENGTHS = Lengths.geometric(GO_ON, -1.0)
 
 
 def numba_walker(
-    R: Any, b: np.ndarray, made: Tables, samples: int
+    R: Any, b: np.ndarray, alias_tables: Tables, samples: int
 ) -> Callable[[], np.ndarray] | None:
-    """The same by alias tables, or None where Numba is not installed (the extra `bench` brings it)."""
+    """The same walks in Numba, or None if it is not installed (the extra `bench` brings it)."""
     if "numba" in missing():
         return None
     numba: Any = importlib.import_module("numba")
-    entry = made.entries.get()
+    # An entry has 18 bits of threshold, and 23 each of its own target and of its alias.
+    entry = alias_tables.entries.get()
+    mask = np.uint64(0x7FFFFF)
     threshold = ((entry >> np.uint64(46)) / 2**18).astype(np.float32)
-    own = (entry >> np.uint64(23) & np.uint64(0x7FFFFF)).astype(np.int32)
-    other = (entry & np.uint64(0x7FFFFF)).astype(np.int32)
-    sums, pointers, go_on = made.sums(), R.indptr.astype(np.int64), np.float32(GO_ON)
+    own_target = (entry >> np.uint64(23) & mask).astype(np.int32)
+    alias = (entry & mask).astype(np.int32)
+    sums = alias_tables.sums()
+    pointers = R.indptr.astype(np.int64)
+    go_on = np.float32(GO_ON)
 
     @numba.njit(parallel=True, fastmath=True)
-    def walk(pointers, threshold, own, other, sums, b, out) -> np.ndarray:
+    def walk(pointers, threshold, own_target, alias, sums, b, out) -> np.ndarray:
         for pixel in numba.prange(len(out)):
             total = 0.0
             for _ in range(samples):
-                row, weight = np.int64(pixel), np.float32(1.0)
+                row = np.int64(pixel)
+                weight = np.float32(1.0)
                 while True:
                     place = np.random.random() * (pointers[row + 1] - pointers[row])  # noqa: NPY002
                     slot = pointers[row] + int(place)
-                    target = own[slot] if place - int(place) < threshold[slot] else other[slot]
+                    target = alias[slot]
+                    if place - int(place) < threshold[slot]:
+                        target = own_target[slot]
+                    # The lowest bit is the sign.
                     weight *= sums[row] * (1 if target & 1 else -1)
                     row = np.int64(target >> 1)
                     total += weight * b[row]
@@ -61,70 +72,107 @@ def numba_walker(
         return out
 
     out = np.zeros(len(b))
-    return lambda: walk(pointers, threshold, own, other, sums, b, out)
+    return lambda: walk(pointers, threshold, own_target, alias, sums, b, out)
 
 
-def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
-    """Steps of walks that three channels share, counted for each, beside those of a walk a channel."""
-    random, n = np.random.default_rng(3), len(R.indptr) - 1
-    Rs: list[CSR] = []
+def coloured_matrices(
+    options: Options, R: scipy.sparse.csr_array, random: np.random.Generator
+) -> list[CSR]:
+    """R of three colours with one sparsity pattern."""
+    n = R.shape[0]
+    matrices: list[CSR] = []
     for _ in range(3):
-        rows = np.repeat(random.uniform(0.3, 1.0, n), np.diff(R.indptr))
-        data = R.data * rows * random.uniform(0.9, 1.1, R.nnz)
-        host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
-        Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
-    b, lengths = random.random((n, 3), dtype=np.float32), Lengths.geometric(GO_ON, -1.0)
-    of_light = [
-        (linked(Rs, (1.0, 1.0, 1.0)), b),
-        *((tables(M), l) for M, l in zip(Rs, b.T, strict=True)),
-    ]
-    walkers = [(Walker(made, lengths, 0), given.device.upload(light)) for made, light in of_light]
+        albedos = np.repeat(random.uniform(0.3, 1.0, n), np.diff(R.indptr))
+        data = R.data * albedos * random.uniform(0.9, 1.1, R.nnz)
+        numbers = (data.astype(np.float32), R.indices, R.indptr)
+        host = scipy.sparse.csr_array(numbers, shape=R.shape)
+        pattern = matrices[0].pattern if matrices else None
+        matrices.append(CSR(options.device, host, pattern))
+    return matrices
 
-    def walk(some: list[Any]) -> list[Any]:
-        return [walker.rows(light, np.arange(n), samples) for walker, light in some]
 
-    times = seconds({"one": lambda: walk(walkers[:1]), "three": lambda: walk(walkers[1:])})
-    ours, theirs = (3 * samples * n * STEPS / times[name] / 1e6 for name in ("one", "three"))
+def compare_colours(options: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
+    """Steps of walks that three channels share, counted for each, beside those of a walk a channel."""
+    random = np.random.default_rng(3)
+    n = R.shape[0]
+    pixels = np.arange(n)
+    matrices = coloured_matrices(options, R, random)
+    b = random.random((n, 3), dtype=np.float32)
+
+    def prepare(walk_tables: Any, light: np.ndarray) -> Callable[[], Any]:
+        walker = Walker(walk_tables, LENGTHS, 0)
+        device_light = options.device.upload(light)
+        return lambda: walker.rows(device_light, pixels, samples)
+
+    shared_walk = prepare(linked(matrices, (1.0, 1.0, 1.0)), b)
+    channel_walks = []
+    for channel, light in zip(matrices, b.T, strict=True):
+        channel_walks.append(prepare(tables(channel), light))
+
+    def walk_channels() -> list[Any]:
+        return [walk() for walk in channel_walks]
+
+    times = seconds({"one": shared_walk, "three": walk_channels})
+    millions = 3 * samples * n * STEPS / 1e6
+    ours = millions / times["one"]
+    theirs = millions / times["three"]
     return Row("steps for three colours", "three walks", theirs, ours, "M/s", ours / theirs)
 
 
-def main() -> None:
-    given = parse_options(__doc__ or "")
-    n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
-    R, b = matrix(n, per_row, 1), np.random.default_rng(2).random(n, dtype=np.float32)
-    values = np.random.default_rng(0).uniform(
-        -0.3, 1.2, R.nnz
-    )  # a fifth negative; row sums around 0.45
+def signed_matrix(n: int, per_row: int) -> Any:
+    """R with a fifth of negative entries, and row sums around 0.45."""
+    R = matrix(n, per_row, 1)
+    values = np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz)
     R.data = (values / per_row).astype(np.float32)
-    made, light, pixels = Tables(CSR(given.device, R)), given.device.upload(b), np.arange(n)
-    walker = Walker(made, Lengths.geometric(GO_ON, -1.0), 0)
+    return R
+
+
+def exact_indirect(R: Any, b: np.ndarray) -> np.ndarray:
+    """The light that walks estimate: (I + R)^-1 b - b in float64."""
+    S = scipy.sparse.eye_array(len(b)) + R.astype(float)
+    x, _ = scipy.sparse.linalg.bicgstab(S, b, rtol=1e-8)
+    return x - b
+
+
+def main() -> None:
+    options = parse_options(__doc__)
+    n, per_row = (1024, 16) if options.smoke else (131072, 100)
+    samples = 32
+    R = signed_matrix(n, per_row)
+    b = np.random.default_rng(2).random(n, dtype=np.float32)
+    alias_tables = Tables(CSR(options.device, R))
+    light = options.device.upload(b)
+    pixels = np.arange(n)
+    walker = Walker(alias_tables, LENGTHS, 0)
     actions: dict[str, Callable[[], Any]] = {
         "ours": lambda: walker.rows(light, pixels, samples).mean
     }
-    if (theirs := numba_walker(R, b, made, samples)) is not None:
-        actions["Numba alias"] = theirs
-    exact = (
-        scipy.sparse.linalg.bicgstab(scipy.sparse.eye_array(n) + R.astype(float), b, rtol=1e-8)[0]
-        - b
-    )
-    for name, action in actions.items():  # nobody is timed doing less
-        if abs(float(np.mean(action() - exact))) > 5.0 / (n * samples) ** 0.5:
+    numba_walk = numba_walker(R, b, alias_tables, samples)
+    if numba_walk is not None:
+        actions["Numba alias"] = numba_walk
+    exact = exact_indirect(R, b)
+    # Nobody is timed doing less.
+    for name, walk in actions.items():
+        bias = abs(float(np.mean(walk() - exact)))
+        if bias > 5.0 / (n * samples) ** 0.5:
             raise SystemExit(f"the walks of {name} do not lead to the solution")
-    rate = {name: samples * n * STEPS / time / 1e6 for name, time in seconds(actions).items()}
-    ours = rate.pop("ours")
-    rows = [
-        Row("steps of walks", who, peer, ours, "M/s", ours / peer, TARGET)
-        for who, peer in rate.items()
-    ]
+    millions = samples * n * STEPS / 1e6
+    rates = {name: millions / spent for name, spent in seconds(actions).items()}
+    ours = rates.pop("ours")
+    rows = []
+    for name, theirs in rates.items():
+        rows.append(Row("steps of walks", name, theirs, ours, "M/s", ours / theirs, TARGET))
+    rows.append(compare_colours(options, R, samples))
+    table_bytes = alias_tables.records.nbytes + alias_tables.entries.nbytes
     facts = {
         "pixels": n,
         "nonzeros": R.nnz,
         "samples a pixel": samples,
-        "MB of tables": (made.records.nbytes + made.entries.nbytes) / 1e6,
+        "MB of tables": table_bytes / 1e6,
         "steps, M/s": ours,
         "not installed": ", ".join(missing()) or "none",
     }
-    report(given, "Random walks", [*rows, colours(given, R, samples)], facts)
+    report(options, "Random walks", rows, facts)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""For sphinx-gallery: every figure that a block of an example leaves in a variable, drawn without pyplot.
+"""Scraper for sphinx-gallery: saves each figure that a block of an example leaves in a variable.
 
-Each picture in a figure is saved, too, not to be shown but as a thumbnail: of a first figure with
-three pictures `sphinx_gallery_thumbnail_number` is 1 for all of it and 2 to 4 for these.
+Figures are drawn without pyplot. Each picture in a figure is saved, too, not to be shown but as a
+thumbnail: of a first figure with three pictures `sphinx_gallery_thumbnail_number` is 1 for all of
+it and 2 to 4 for these.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _shown: WeakSet[Figure] = WeakSet()
 
 
 def scrape(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]) -> str:
-    """Save the new figures of a block; return the lines that show them, with their titles for the blind."""
+    """Save the new figures of a block; return lines that show them, with titles for the blind."""
     paths, titles = [], []
     for value in [*block_vars["example_globals"].values()]:
         if isinstance(value, Figure) and value not in _shown:

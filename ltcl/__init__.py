@@ -4,12 +4,11 @@
 A projector lights a concave, coloured scene; light bounces before the camera sees it: picture = T
 pattern. ltcl undoes the bounces with matrix-vector products only.
 
-    T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40,
-    sides=3).transport() T = ltcl.acquire(rig, store="scan.zarr")   # any projector and camera;
-    stopped and resumed at will T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of
-    N^2, pictures within 1 % c = ltcl.compensate(T, desired)            # c.pattern makes the wall
-    look like `desired` b = ltcl.separate(T, image)                # b.direct, b.bounces: each
-    bounce as its own picture
+    T = ltcl.load("transport.npz")    # measured; `ltcl.scenes` also makes transports
+    T = ltcl.acquire(rig, store="scan.zarr")    # photographed; stopped and resumed at will
+    T = ltcl.compress(T, rtol=1e-2)    # few numbers instead of N^2, pictures within 1 %
+    c = ltcl.compensate(T, desired)    # c.pattern makes the wall look like `desired`
+    b = ltcl.separate(T, image)    # b.direct, b.bounces: each bounce as its own picture
 
 After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport,
 IEEE PAMI 2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL

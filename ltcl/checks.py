@@ -67,7 +67,7 @@ def real(name: str, value: Any) -> np.ndarray:
 
 
 def unmasked(name: str, value: Any) -> None:
-    """Refuse an array with masked values, or a list of such rows: np.asarray would drop the mask."""
+    """Refuse masked values in an array or a list of rows; np.asarray would drop the mask."""
     rows = value if isinstance(value, (list, tuple)) else [value]
     masked = 0
     for row in rows:
@@ -195,8 +195,8 @@ def compressed(
     if len(indptr) != rows + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
         first = indptr[0] if len(indptr) else "none"
         raise InputError(
-            f"{name}.indptr has {len(indptr)} entries from {first}; it must have {rows + 1}, from 0, "
-            "and must never fall"
+            f"{name}.indptr has {len(indptr)} entries from {first}; "
+            f"it must have {rows + 1}, from 0, and must never fall"
         )
     if indptr[-1] != len(indices) or len(indices) != len(data):
         counts = f"{len(indices)} indices and {len(data)} values"
@@ -215,12 +215,12 @@ def _check_vector(name: str, array: np.ndarray, kinds: str, expected: str) -> No
 
 
 def host_memory() -> int:
-    """Bytes of memory the host can still give, as far as the system and limits of this process say."""
+    """Bytes of memory that the host can still give, by the system and limits of this process."""
     return min(_memory_of_system(), _memory_within_limits())
 
 
 def _memory_of_system() -> int:
-    """Bytes that the system has free; unlimited where unknown: then the allocation itself decides."""
+    """Bytes that the system has free; unlimited if unknown, as the allocation itself decides."""
     with contextlib.suppress(OSError, KeyError, ValueError):
         with open("/proc/meminfo", encoding="ascii") as file:
             fields = dict(line.split(":", 1) for line in file)
@@ -249,7 +249,7 @@ def _memory_within_limits() -> int:
 
 
 def fits_host(what: str, needed: int, most: int = UNLIMITED) -> None:
-    """Refuse an allocation of `needed` bytes beyond `most` or what the host has, before it is tried."""
+    """Refuse to allocate `needed` bytes beyond `most` or beyond what the host has."""
     if needed > most:
         raise MemoryLimitError(f"{what} needs {size(needed)}; it may take at most {size(most)}")
     available = host_memory()

@@ -42,7 +42,7 @@ class FileError(InputError, OSError):
 
 
 class MemoryLimitError(LtclError, MemoryError):
-    """Something would not fit in the memory of the host or of the device; said before allocation."""
+    """Something would not fit in the memory of host or device; raised before allocation."""
 
 
 class DeviceError(LtclError, RuntimeError):
@@ -54,7 +54,7 @@ class ClusterError(LtclError, RuntimeError):
 
 
 class BatchError(LtclError, RuntimeError):
-    """Some of many scenes failed; `results` has all results in order, errors in the failed places."""
+    """Scenes failed; `results` has all results in order, with the errors of those that failed."""
 
     def __init__(self, message: str, results: Any = ()) -> None:
         super().__init__(message)
@@ -66,7 +66,7 @@ class AcquisitionError(LtclError, RuntimeError):
 
 
 class ScanRefused(AcquisitionError):
-    """Photographs that are in a store already cannot be used; a scan that goes on would fail again."""
+    """Photographs in a store cannot be used; a scan that goes on would fail again."""
 
 
 class PhotographMissing(AcquisitionError):

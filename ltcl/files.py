@@ -62,7 +62,7 @@ def input_file(path: Any) -> Path:
 
 
 def as_path(path: Any, name: str = "path") -> Path:
-    """Return `path` (str or os.PathLike) as a Path; refuse everything else, an empty text, and NUL."""
+    """Return `path` (str or os.PathLike) as a Path; refuse all else, an empty text, and NUL."""
     text = str(path)
     if not text or "\0" in text:
         raise FileError(f"{path or name} is {text!r}; it must name a file or a folder")
@@ -294,7 +294,7 @@ def _flush_handle(handle: int) -> None:
 
 
 def read_ahead(read: Callable[[Any], Any], keys: Iterable[Any], ahead: int = 2) -> Iterator[Any]:
-    """Yield `read(key)` of each key, in order; threads read up to `ahead` keys before the caller."""
+    """Yield `read(key)` of each key, in order; threads read up to `ahead` keys ahead."""
     with ThreadPoolExecutor(ahead) as threads:
         waiting: deque[Future[Any]] = deque()
         for key in keys:

@@ -32,7 +32,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c() -> None:
-    """Ctrl-C interrupts, also where a shell that started the tests in the background makes them ignore it."""
+    """Ctrl-C interrupts, even if a shell that started tests in the background ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -95,5 +95,5 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def disk_without_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Flushing matters to a power cut, which no test can cause; `test_flushing.py` counts the calls."""
+    """Flushing matters to power cuts, which no test can cause; `test_flushing.py` counts calls."""
     monkeypatch.setattr(os, "fsync", lambda handle: None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Small matrices that have broken kernels before, in float32 so that device and reference start alike.
+"""Small matrices that have broken kernels, in float32, so device and reference start alike.
 
 Whole light transports with known answers are in `tests/problems.py`.
 """

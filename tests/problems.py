@@ -55,7 +55,7 @@ def lambertian(n: int, rho: float, seed: int = 0, density: float = 1.0) -> Scene
 
 
 def enclosure(n: int, albedo: float, seed: int = 0) -> Scene:
-    """A closed room of equal patches and one albedo m: A = m G with G = G^T, row sums 1, no self-view.
+    """Closed room of equal patches of albedo m: A = m G with G = G^T, row sums 1, no self-view.
 
     Hence rho(A) = m, rho(R) = m / (1 - m), row sums of S are 1 / (1 - m), and S is symmetric.
     """

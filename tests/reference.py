@@ -92,7 +92,7 @@ def relax_correct(inverse: np.ndarray, s: np.ndarray, x: np.ndarray) -> np.ndarr
 
 
 def relax_windows(M: np.ndarray, block: int, panel: int, *, inverses: bool) -> np.ndarray:
-    """The first entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
+    """First entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
     i = np.arange(len(M))
     edges = np.stack([i - i % panel, i - i % block if inverses else i], axis=1)
     before = np.cumsum(
@@ -211,7 +211,7 @@ def walk_rows(tables, steps, b, pixels, samples, seed: int, stream: int, chunk: 
 
 
 def walk_columns(tables, steps, source: int, samples, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where samples from row `source` end, and what they bring there, float32."""
+    """Ends of samples from row `source`, and what they bring there, float32."""
     scores, ends = walk(tables, steps, None, np.full(len(samples), source), samples, seed, 0)
     return ends, scores[:, 0]
 
@@ -219,7 +219,7 @@ def walk_columns(tables, steps, source: int, samples, seed: int) -> tuple[np.nda
 def _draw(
     records: np.ndarray, entries: np.ndarray, word: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Column and sign in one number, and what weights are multiplied by, of one entry of each row."""
+    """Column and sign in one number, and the factor of weights, of one entry of each row."""
     count = records[:, 2].astype(np.uint64)
     start = records[:, 0].astype(np.uint64) | records[:, 1].astype(np.uint64) << np.uint64(32)
     factor = np.ascontiguousarray(records[:, 3]).view(np.float32)
@@ -244,7 +244,7 @@ def _linked(
 
 
 def form_factor_pair(p, q, n, m, clip: bool = True) -> np.ndarray:
-    """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
+    """cos cos / (pi r^2) of points p (M, 3) with normals n and q (N, 3) with normals m: (M, N)."""
     d = q[None] - p[:, None]
     r2 = (d**2).sum(axis=2)
     here = np.einsum("mnc,mc->mn", d, n)
@@ -259,7 +259,7 @@ def form_factor_pairs(G: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray
 
 
 def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) -> np.ndarray:
-    """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
+    """G (N, N) of what `kernels/form_factor.cl` reads: geometry (13, N), blocks (B, 6)."""
     centre, right, down, normal = (
         geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4)
     )
@@ -308,7 +308,7 @@ def form_factor_matvec(G, left, right, x, scale: float, add: np.ndarray | None) 
 
 
 def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Whether the way from p to q (..., 3) passes through a box (B, 6) given as centre and half sides.
+    """True where the way from p to q (..., 3) passes a box (B, 6) given as centre and half sides.
 
     By slabs: the stretches of the way within each pair of faces have a part in common.
     """
@@ -329,7 +329,7 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
 
 
 def form_factor_visible(starts, ends, normals, blocks: np.ndarray) -> np.ndarray:
-    """Of the rays from starts to ends (rays, 3, N) before both normals (3, N), the share that meet no box."""
+    """Share of the rays from starts to ends (rays, 3, N) before both normals that meet no box."""
     faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
     for a, b in zip(starts.astype(np.float64), ends.astype(np.float64), strict=True):
         d = b.T[None] - a.T[:, None]
@@ -350,7 +350,7 @@ def gamma(roundings: float) -> float:
 
 
 def product_error(matrix, x, scale: float = 1.0, add: np.ndarray | None = None) -> np.ndarray:
-    """Largest error of float32 in each value of out = scale * (A x) + add, in whatever order it sums.
+    """Largest float32 error of each value of out = scale * (A x) + add, in any order of the sum.
 
     A sum of n products passes through n roundings at most, `scale` and `add` bring two each and a
     composed operator a few more: gamma_(n + 8) (|scale| |A| |x| + |add|), Higham, section 3.5.
@@ -379,7 +379,7 @@ def vector_dots(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray)
 
 
 def krylov_subtract(V, w, h, square: np.ndarray | None = None) -> np.ndarray:
-    """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
+    """w - sum_j h_j v_j, h (J, k); of length 1 if `square`, <w, w> of orthonormal v_j, is given."""
     left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
     if square is None:
         return left
@@ -431,7 +431,7 @@ def bounded_look(lower, upper, x, g, h) -> np.ndarray:
 
 
 def bounded_direction(alpha, beta, lower, upper, x, g, d) -> tuple[np.ndarray, np.ndarray]:
-    """d (N, k); then g.d, d.d and the largest share of the way to a bound of every column, (3, k)."""
+    """d (N, k); then g.d, d.d and the largest share of the way to a bound per column, (3, k)."""
     lower, upper, x, g, d = _float64(lower[:, None], upper[:, None], x, g, d)
     z = _free(lower, upper, x, g)
     step = np.clip(x + alpha * np.where(z == 0, 0, z + beta * d), lower, upper) - x
@@ -455,7 +455,7 @@ def _free(lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray) ->
 
 
 def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
-    """The orthonormal matrix that splits a side, already halved `level` times: approximation above details.
+    """Orthonormal matrix that splits a side halved `level` times: approximation above details.
 
     What is regular goes round in a circle of its own, however often the filters wrap around it. The
     last sample stands for the pixels left over; joined to another by weights, it keeps a constant
@@ -501,7 +501,7 @@ def ordered_gather(order: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def pyramid_gather(x: np.ndarray) -> np.ndarray:
-    """Sums of pictures (h, w, k) over the cells of all levels, (cells, k), each straight from its pixels."""
+    """Sums of pictures (h, w, k) over cells of all levels, (cells, k), each from its pixels."""
     h, w, k = x.shape
     sizes = [2**level for level in range((max(h, w) - 1).bit_length() + 1)]
     rows = [np.add.reduceat(np.asarray(x, np.float64), range(0, h, size), axis=0) for size in sizes]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pages for those who report and contribute: what they name exists, and the rig that they show scans."""
+"""Pages for those who report and contribute: they name what exists, and their rig scans."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PAGES = [ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / ".githu
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_pages_for_contributors_name_what_exists(page: Path) -> None:
-    """Commands of ltcl, links, and files of the repository in code, but for those with a NAME to choose."""
+    """Commands, links, and files of the repository in code, but for those with a NAME to choose."""
     text = page.read_text(encoding="utf-8")
     program: Any = typer.main.get_command(app)
     for first, second in re.findall(r"`ltcl ([a-z]+)(?: ([a-z]+))?", text):

@@ -76,7 +76,7 @@ def test_masked_pixels_stay_dark(device):
 
 @pytest.mark.parametrize("task", [ltcl.compensate, ltcl.separate])
 def test_results_tell_of_which_T_they_are(device, task):
-    """A target that is met with T~ is missed with T by at most T~.error: ||E S~^-1|| is below it."""
+    """A target met with T~ is missed with T by at most T~.error: ||E S~^-1|| is below it."""
     C, T = pair(device)
     desired = T @ rng.uniform(0.3, 0.7, GRID)
     with pytest.raises(InputError, match=r"rtol is 1e-06.* 0\.\d+.*exact=T"):
@@ -115,7 +115,7 @@ def test_tasks_beside_the_exact_one(device, channels, rtol, close):
 
 
 def test_beyond_the_projector(device):
-    """Least squares within the bounds takes products with the transpose, compressed ones or exact."""
+    """Least squares within bounds take products with the transpose, compressed or exact."""
     C, T = pair(device)
     desired = rng.uniform(0.0, 3.0, GRID)
     alone = ltcl.compensate(C, desired, rtol=C.error)

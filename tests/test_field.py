@@ -97,7 +97,10 @@ def test_a_method_that_writes_the_truth_has_no_error(
         f"truth = np.load({str(tmp_path / 'truth.npz')!r})",
         "for name in truth: np.save(out / name, truth[name])",
     )
-    kept = "(out / 'representation.bin').write_bytes(bytes(1500)), (out / 'photographs.txt').write_text('7')"
+    kept = (
+        "(out / 'representation.bin').write_bytes(bytes(1500)), "
+        "(out / 'photographs.txt').write_text('7')"
+    )
     scores = scoring.run(method(*lines, kept), scene)
     assert max(max(scores[f"bounce {k}"]) for k in range(4)) < 1e-6
     assert max(scores["compensation"]) < 2e-3  # the noise of the judge

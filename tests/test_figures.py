@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Benches of the paper's figures: claims that fail end them, and what they compute with is right."""
+"""Benches of the paper's figures: failed claims end them, and their computations are right."""
 
 from __future__ import annotations
 

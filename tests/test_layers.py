@@ -124,5 +124,5 @@ def test_import_of_ltcl_is_light() -> None:
 
 
 def test_ways_of_data_stay_short() -> None:
-    for name, (length, limit, files) in house.ways().items():
-        assert length <= limit, (name, files)
+    for name, way in house.ways().items():
+        assert way.length <= way.limit, (name, way.files)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The installed package: one version, typed, with its command; `.ci/check_archives.py` opens archives."""
+"""The installed package: one version, typed, with its command.
+
+`.ci/check_archives.py` opens the archives.
+"""
 
 from __future__ import annotations
 

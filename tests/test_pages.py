@@ -64,7 +64,7 @@ EXAMPLES = "\n".join(re.findall(r"```pycon\n(.*?)```", PYTHON, re.DOTALL))
 
 
 def test_every_public_name_has_an_example() -> None:
-    """An example is in the docstring, in that of a method, or on the page; the message of an error is one."""
+    """An example is in the docstring, a method's, or on the page; an error's message is one."""
     without = []
     for name in re.findall(r"^   (ltcl\.[\w.]+)$", PYTHON, re.MULTILINE):
         own = resolve(name)

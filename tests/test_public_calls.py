@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Every public call once, small, in the launch shape of a GPU: all other tests run in that of a CPU.
+"""Every public call once, small, in the launch shape of a GPU; other tests use a CPU's.
 
 CI runs this file again with work-groups of 8 items at most (``POCL_MAX_WORK_GROUP_SIZE``): no
 launch may ask for more than its kernel and device allow.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The README's lines of Python run as printed, and its shell commands run on the files these make."""
+"""Lines of Python in the README run as printed, and its shell commands on their files."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 4: the series takes the bounces out ==========================================
+"""
+Figure 4: the series takes the bounces out
+==========================================
 
 A closed box with a red and a green wall. Each term of the inverse series takes away more of the
 light that bounced: the first takes too much, the second gives some of it back, and so on. What is

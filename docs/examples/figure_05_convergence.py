@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 5: when the series converges ===================================
+"""
+Figure 5: when the series converges
+===================================
 
 The paper's series needs walls that are not too bright, or a box that is open. Chebyshev's
 iteration, which ltcl uses, undoes the same boxes in about ten steps, whatever the walls.

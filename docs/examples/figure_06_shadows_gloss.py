@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 6: shadows and gloss ===========================
+"""
+Figure 6: shadows and gloss
+===========================
 
 A lamp and a block that casts a shadow; below, glossy walls. In both the direct light comes back:
 shadows get as dark as they are, and highlights as sharp.

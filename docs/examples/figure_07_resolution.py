@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 7: time over resolution ==============================
+"""
+Figure 7: time over resolution
+==============================
 
 How long it takes to find the direct light of a picture, from 128 to 131 072 pixels, with an error
 of at most 1 %. A matrix inverse by the series is the slowest way; two sides in wavelets, on which
@@ -25,5 +27,6 @@ print(record["device"])
 for name, method in fig7.METHODS.items():
     last = [point for point in points if point.method == name][-1]
     print(
-        f"{method.label:20} {last.pixels:7} pixels {1e3 * last.seconds:10.4g} ms, error {last.way.error:.2%}"
+        f"{method.label:20} {last.pixels:7} pixels {1e3 * last.seconds:10.4g} ms, "
+        f"error {last.way.error:.2%}"
     )

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 8: inverse by random walks =================================
+"""
+Figure 8: inverse by random walks
+=================================
 
 Each pixel of the direct light is the mean of random walks of its own. Thirty walks a pixel are
 noisy; one exact product with their result (final gather) takes most of the noise out.

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 9: every bounce as a picture ===================================
+"""
+Figure 9: every bounce as a picture
+===================================
 
 Green light falls on the left wall only. The first bounce is on the right wall, the second on the
 left one, and so on: no flat wall lights itself. Below, a glossy board stands in the corner; its

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Figure 10: every pixel lights every other =========================================
+"""
+Figure 10: every pixel lights every other
+=========================================
 
 A picture on a corner of two coloured walls, the pattern that makes it, and its light by bounces. T
 is never formed: its rows are compressed as they come.

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bounces with sliders ====================
+"""
+Bounces with sliders
+====================
 
 After separation each bounce can have a strength of its own: 0 switches it off, 2 doubles it, and -1
 takes it away twice. ``ltcl view`` has these sliders in the browser.
@@ -21,7 +23,7 @@ def mixed(*strengths, rest=1.0):
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

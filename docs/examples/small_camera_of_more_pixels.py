@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A camera of more pixels =======================
+"""
+A camera of more pixels
+=======================
 
 The camera has more pixels than the projector: T is then not square, and has no inverse. ltcl finds
 the pattern whose picture is closest to the wanted one, as the camera sees it.

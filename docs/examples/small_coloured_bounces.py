@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Light takes the colour of what it met =====================================
+"""
+Light takes the colour of what it met
+=====================================
 
 White light falls on one red wall. The first bounce makes the blue wall and the floor purple and
 red; each further one is redder.
@@ -23,7 +25,7 @@ parts = ltcl.separate(T, seen, bounces=3)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

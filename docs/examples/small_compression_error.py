@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What compression costs, and where =================================
+"""
+What compression costs, and where
+=================================
 
 The same T compressed three times. The fewer bytes, the more a picture differs from that of the
 exact T; nowhere by a pattern that the eye would see at once, since it is smooth parts that are left
@@ -18,7 +20,7 @@ exact = T @ pattern
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A noisy T, denoised ===================
+"""
+A noisy T, denoised
+===================
 
 One column of T, as it was measured and after ``ltcl.denoise``: the light of one projector pixel on
 the other wall. No other measurement was used, only what is known about light.

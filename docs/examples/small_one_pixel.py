@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One pixel alone ===============
+"""
+One pixel alone
+===============
 
 Random walks find the direct light of single pixels, without the others. Each value has a standard
 error; ask for a smaller one, and more walks are taken.

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is out of reach ====================
+"""
+What is out of reach
+====================
 
 A projector cannot take light away. Next to something bright, a place cannot be darker than the
 light that bounces into it. ltcl finds the best pattern there is, proves how good it is, and shows
@@ -28,7 +30,7 @@ shown += np.clip(-missing, 0, None)[..., None] * 6 * (0.1, 0.4, 1.0)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

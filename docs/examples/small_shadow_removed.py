@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A shadow removed ================
+"""
+A shadow removed
+================
 
 A lamp stands in a room, and a block casts its shadow. A projector fills the shadow in: ltcl finds
 the light that is missing, and takes into account that it will bounce.

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How sure is a bounce? =====================
+"""
+How sure is a bounce?
+=====================
 
 A measured T is noisy, and so are the bounces that are found with it. ``std`` says by how much,
 pixel by pixel. Here the truth is known: where ltcl says one standard deviation, about two thirds of
@@ -25,7 +27,7 @@ exact = ltcl.separate(ltcl.Transport(true, corner.grid), white, bounces=2)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

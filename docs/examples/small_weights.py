@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where it matters most =====================
+"""
+Where it matters most
+=====================
 
 Not all of a picture can be had: the projector is not dark enough next to the bright wall.
 ``weights`` say where the error counts more. Here it is the middle of the right wall.
@@ -25,7 +27,7 @@ weighted = ltcl.compensate(T, wanted, weights=region)
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Your first bounce of light ==========================
+"""
+Your first bounce of light
+==========================
 
 Ten minutes, no hardware. You throw a picture into the corner of a room, see why it looks wrong, and
 let ltcl find the pattern that makes it look right. Then you take the light apart, bounce by bounce.
@@ -26,7 +28,7 @@ wanted = 0.25 + 0.75 * corner.sample(photo)  # its pixels on the three walls, as
 
 
 def view(light):
-    """What somebody sees who stands in front of the corner."""
+    """The corner as somebody sees it who stands in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 
@@ -118,11 +120,11 @@ figure = pictures(
 # ===================  ======================  =================================================
 # in this page         in the paper            what it is
 # ===================  ======================  =================================================
-# ``transport``        T                       picture = T pattern; a column for each projector
-# pixel ``result.pattern``   p                       the pattern, so that T p is the picture that
-# you want ``parts.direct``     l\ :sub:`d`             the direct light ``parts.bounces``    A l\
-# :sub:`d`, ...      bounce 1, bounce 2 and so on ===================  ======================
-# =================================================
+# ``transport``        T                       picture = T pattern; one column per projector pixel
+# ``result.pattern``   p                       the pattern, so that T p is the picture that you want
+# ``parts.direct``     l\ :sub:`d`             the direct light
+# ``parts.bounces``    A l\ :sub:`d`, ...      bounce 1, bounce 2 and so on
+# ===================  ======================  =================================================
 #
 # Where to go on: :doc:`with a matrix that you have <2_my_matrix>`, :doc:`with a corner of your own
 # <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""I have a matrix ===============
+"""
+I have a matrix
+===============
 
 You have measured or computed light transport yourself, and it is in a file. This page reads it,
 asks whether it is good enough, and uses it: with its noise, and with pixels that no light reaches.
@@ -9,10 +11,10 @@ asks whether it is good enough, and uses it: with its noise, and with pixels tha
 # What ltcl expects
 # -----------------
 #
-# One matrix T for each colour. Column j is the picture that the camera sees when projector pixel j alone is
-# lit with light of 1, unrolled row by row. The picture is on the same grid as the projector, so T
-# is square. The numbers are *linear* light: twice the light, twice the number. Undo the gamma of
-# the camera first.
+# One matrix T for each colour. Column j is the picture that the camera sees when projector pixel j
+# alone is lit with light of 1, unrolled row by row. The picture is on the same grid as the
+# projector, so T is square. The numbers are *linear* light: twice the light, twice the number. Undo
+# the gamma of the camera first.
 #
 # We make such a file here: two white walls that meet in a corner, 12 x 24 pixels. To be like a
 # measured one it has noise, and three projector pixels miss the walls.
@@ -133,7 +135,7 @@ better = ltcl.denoise(T)
 
 
 def error(M):
-    """Of the light that bounced: the diagonal, which is the direct light, counts as right."""
+    """Error of the light that bounced; the diagonal, the direct light, counts as right."""
     off = (M.to_numpy() - true * lit) * (1 - np.eye(len(true)))
     return np.linalg.norm(off) / np.linalg.norm(true * (1 - np.eye(len(true))))
 

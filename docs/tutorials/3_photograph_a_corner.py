@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photograph your own corner ==========================
+"""
+Photograph your own corner
+==========================
 
 With any projector, and a camera or phone that can hold its settings. ltcl tells you what to project
 and how long to expose; you take the photographs; ltcl checks each of them and makes the transport
@@ -13,17 +15,19 @@ small simulated corner in place of yours, and then makes every mistake, to show 
 # The set-up
 # ----------
 #
-# 1. Put the projector in front of the corner so that its picture fills both walls. Put the camera beside it,
-#    on a tripod. It must see all of the projected picture.
-# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. A phone needs an
-#    app with a manual ("pro") mode. Let it save raw files (or PNG, TIFF), and not JPEG: ltcl reads JPEG, but
-#    most of the dim light that bounced is lost in it.
-# 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes does.
-# 4. Install what shows patterns on a projector, ``python -m pip install ".[projector]"``, and for raw files
-#    ``".[camera]"``. Let the projector extend the desktop of your computer, not mirror it.
+# 1. Put the projector in front of the corner so that its picture fills both walls. Put the camera
+#    beside it, on a tripod. It must see all of the projected picture.
+# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. A phone
+#    needs an app with a manual ("pro") mode. Let it save raw files (or PNG, TIFF), and not JPEG:
+#    ltcl reads JPEG, but most of the dim light that bounced is lost in it.
+# 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes
+#    does.
+# 4. Install what shows patterns on a projector, ``python -m pip install ".[projector]"``, and for
+#    raw files ``".[camera]"``. Let the projector extend the desktop of your computer, not mirror
+#    it.
 # 5. Make a folder ``scan``, with a file ``acquisition.toml`` in it. It says how many pixels you
-# want, and which exposures your camera has, in seconds: 0.0167 is 1/60 s. Without that line ltcl
-# asks for any time, such as 0.0783 s. Begin with few pixels; the time grows with their number.
+#    want, and which exposures your camera has, in seconds: 0.0167 is 1/60 s. Without that line ltcl
+#    asks for any time, such as 0.0783 s. Begin with few pixels; the time grows with their number.
 #
 # .. code-block:: toml
 #
@@ -50,17 +54,18 @@ small simulated corner in place of yours, and then makes every mistake, to show 
 #    # copies your photographs from the folder CARD
 #    ltcl acquire run scan --take CARD
 #
-# The last command also writes the next patterns. So you repeat the second and the third, six to eight times:
-# ltcl first needs to see white and black to know how long to expose, then stripes to know where
-# each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be stopped at any
-# time, and goes on where it was.
+# The last command also writes the next patterns. So you repeat the second and the third, six to
+# eight times: ltcl first needs to see white and black to know how long to expose, then stripes to
+# know where each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be
+# stopped at any time, and goes on where it was.
 #
-# * Each pattern on the list needs one photograph, with the exposure that stands there, in that order.
-# * ``--take`` copies new files in the order of the numbers in their names. Older ones may stay in CARD. There
-# must be as many new ones as are missing: delete those that are too many. Of a camera that saves a
-# raw and a JPEG file of each photograph, leave the raw ones only. * A photograph that is refused:
-# delete it in ``scan/photographs``, and in CARD. Then ``ltcl acquire run scan`` asks for it again,
-# and ``ltcl show scan`` shows its pattern alone.
+# * Each pattern on the list needs one photograph, with the exposure that stands there, in that
+#   order.
+# * ``--take`` copies new files in the order of the numbers in their names. Older ones may stay in
+#   CARD. There must be as many new ones as are missing: delete those that are too many. Of a camera
+#   that saves a raw and a JPEG file of each photograph, leave the raw ones only.
+# * A photograph that is refused: delete it in ``scan/photographs``, and in CARD. Then ``ltcl
+#   acquire run scan`` asks for it again, and ``ltcl show scan`` shows its pattern alone.
 #
 # At the end
 # ----------
@@ -127,7 +132,8 @@ def scan(folder, photographer=None):
             if photographer is None:
                 raise
             print(
-                f"{missing.missing:3} photographs, the first: {str(missing).partition(': ')[2][:47]} ..."
+                f"{missing.missing:3} photographs, the first: "
+                f"{str(missing).partition(': ')[2][:47]} ..."
             )
             photographer(folder, rig)
 
@@ -180,10 +186,11 @@ figure = pictures(
 # Every mistake, and what ltcl says then
 # --------------------------------------
 #
-# For each line of the table the photographs were copied, and one mistake made in them. The message is what
-# ltcl really said when this page was built. ltcl compares each group of photographs with what it
-# knows already before it keeps them, so nothing is lost. Some mistakes can only be seen with the
-# photographs of the next round. Exchange or delete what is named, and run the same command again.
+# For each line of the table the photographs were copied, and one mistake made in them. The message
+# is what ltcl really said when this page was built. ltcl compares each group of photographs with
+# what it knows already before it keeps them, so nothing is lost. Some mistakes can only be seen
+# with the photographs of the next round. Exchange or delete what is named, and run the same command
+# again.
 #
 # The code is long, as there are many mistakes. The table is below it.
 
@@ -206,7 +213,7 @@ def exchange(files):
 
 
 def moved(files):
-    """From photograph 80 on the camera looks elsewhere."""
+    """The camera looks elsewhere from photograph 80 on."""
     for path in files[79:]:
         Image.fromarray(np.roll(np.asarray(Image.open(path)), 2, axis=1)).save(path)
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A webcam and a second display =============================
+"""
+A webcam and a second display
+=============================
 
 A projector on the second output, a webcam on a cable: ltcl shows the patterns and takes the
 photographs itself. It measures how long a picture takes from one to the other, and checks each
@@ -70,7 +72,7 @@ class MyRig:
         self.photographs = []
 
     def photograph(self, codes, seconds):
-        """Show codes (h, w) or (h, w, 3), expose so long, return uint8, uint16 or float (H, W, 3)."""
+        """Show codes (h, w[, 3]), expose so long, return uint8, uint16 or float (H, W, 3)."""
         # display.show(codes); time.sleep(0.2)
         # image = camera.read(seconds)
         image = simulated.photograph(codes, seconds)
@@ -118,7 +120,7 @@ exact = photograph_of(result.pattern)
 
 
 def view(light):
-    """As seen from in front, as bright as the wanted picture."""
+    """The corner seen from in front, as bright as the wanted picture."""
     return corner.view(light * np.median(wanted) / np.median(light), size=320, supersample=2)
 
 

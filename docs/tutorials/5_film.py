@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A film onto a wall ==================
+"""
+A film onto a wall
+==================
 
 A film on two coloured walls that meet in a corner: every frame is compensated, all with the same
 brightness, so that nothing flickers. A run that was stopped goes on where it was.
@@ -61,7 +63,7 @@ print(f"{done.worst.error:.1%} ({done.worst.name})")
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=240, supersample=2)
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""131 072 pixels and more =======================
+"""
+131 072 pixels and more
+=======================
 
 T has as many numbers as the projector has pixels, times as many as the camera has. With 131 072
 pixels, 256 x 512, these are 1.7e10 numbers, 69 GB for each colour. This page shows, with a small T,
@@ -45,7 +47,7 @@ small = ltcl.compensate(C, wanted, gain="auto")
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(light, size=320, supersample=2)
 
 
@@ -103,10 +105,12 @@ for claim in record["claims"][:4]:
 # ---------------------
 #
 # - T is in a file larger than memory: ``ltcl.compress("T.npy")`` reads it in blocks
-# (:doc:`../guide/scale`). - T is larger than memory and must stay exact: ``ltcl.load`` leaves it on
-# the disk (:doc:`../guide/scale`). - Several GPUs in one machine: ``device="all"``, or a process
-# for each (:doc:`../guide/scale`). - A film, or many scenes, and several machines: ``--cluster``
-# (:doc:`../guide/cluster`). - One solve over many machines: :doc:`../guide/mpi`. - T comes from
-# walls that you know: ``ltcl.scenes.FormFactor`` computes it in each product.
+#   (:doc:`../guide/scale`).
+# - T is larger than memory and must stay exact: ``ltcl.load`` leaves it on the disk
+#   (:doc:`../guide/scale`).
+# - Several GPUs in one machine: ``device="all"``, or a process for each (:doc:`../guide/scale`).
+# - A film, or many scenes, and several machines: ``--cluster`` (:doc:`../guide/cluster`).
+# - One solve over many machines: :doc:`../guide/mpi`.
+# - T comes from walls that you know: ``ltcl.scenes.FormFactor`` computes it in each product.
 
 # sphinx_gallery_thumbnail_number = 3

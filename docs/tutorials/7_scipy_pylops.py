@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From SciPy and PyLops =====================
+"""
+From SciPy and PyLops
+=====================
 
 The operators of ltcl are SciPy's ``LinearOperator``: whatever takes one of these takes them. And
 SciPy's matrices and operators can be used in ltcl.
@@ -55,10 +57,10 @@ print(np.sort(values)[::-1].round(3))
 # In PyLops
 # ---------
 #
-# ``pylops.aslinearoperator`` takes it, and it can be joined with the operators of PyLops. Here something
-# stands before the wall, and hides two fifths of the picture from the camera. A restriction keeps
-# the pixels that are seen; a second derivative makes the answer smooth where nothing is known. ltcl
-# alone does not do that.
+# ``pylops.aslinearoperator`` takes it, and it can be joined with the operators of PyLops. Here
+# something stands before the wall, and hides two fifths of the picture from the camera. A
+# restriction keeps the pixels that are seen; a second derivative makes the answer smooth where
+# nothing is known. ltcl alone does not do that.
 
 A = pylops.aslinearoperator(S)
 rows, columns = np.mgrid[: corner.grid[0], : corner.grid[1]]
@@ -72,7 +74,7 @@ found = pylops.optimization.leastsquares.regularized_inversion(
 
 
 def view(light):
-    """As seen from in front of the corner."""
+    """The corner as seen from in front of it."""
     return corner.view(np.reshape(light, corner.grid), size=320, supersample=2)
 
 

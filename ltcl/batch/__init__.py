@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Work on more frames than memory holds, or on many scenes: here, or on the workers of a Dask cluster."""
+"""Work on more frames than memory holds, or on many scenes, here or on a cluster of Dask."""
 
 from __future__ import annotations
 

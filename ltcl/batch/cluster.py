@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One function of many items on the workers of a Dask cluster: results in order, in bounded memory.
+"""Apply one function to many items on a Dask cluster: results in order, in bounded memory.
 
 A worker that comes is asked for its version of ltcl and its device, and gets the function, before
 its first task. Dask does the tasks of a lost worker on others. The next item is taken when a result
@@ -68,7 +68,8 @@ def stream(
     window : int
         Number of items on the way for each worker: one is computed, others are there when it ends.
     share_gpu : bool
-        Let several workers use one GPU; else all but the first are excluded. A CPU is always shared.
+        Let several workers use one GPU; else all but the first are excluded. Workers always share
+        a CPU.
     errors : bool
         Yield the error of an item in its place, instead of raising it, which ends the stream.
 
@@ -133,7 +134,10 @@ def is_there(client: Any, path: Any) -> bool:
 
 
 def require(client: Any) -> str:
-    """Address of the scheduler; refuses what is no connected `distributed.Client`, and a missing Dask."""
+    """Return the address of the scheduler of a connected client.
+
+    Anything but a connected `distributed.Client` is refused, and so is a missing Dask.
+    """
     if not isinstance(client, _distributed().Client):
         kind = type(client).__name__
         raise InputTypeError(f"client is a {kind}; it must be a distributed.Client")
@@ -201,7 +205,7 @@ def _check_address(cluster: str) -> None:
 
 
 def _processes(workers: int | None, device: str | None) -> Any:
-    """Workers on this machine, each with an environment of its own, unlike those of a LocalCluster."""
+    """Workers on this machine, each with its own environment, unlike those of a LocalCluster."""
     distributed = _distributed()
     devices = _worker_devices(device or os.environ.get("LTCL_DEVICE"))
     count = len(devices) if workers is None else checks.count("workers", workers)
@@ -249,7 +253,7 @@ def _pickled(
 
 @dataclass(eq=False)
 class _Task:
-    """One item on its way."""
+    """Item that is being worked on, and its future."""
 
     item: bytes
     future: Any = None
@@ -340,7 +344,7 @@ class _Crew:
         raise outcome.error
 
     def _submit_lost(self, first: _Task) -> bool:
-        """Submit the tasks that have lost all their workers; False where the first has no try left."""
+        """Submit the tasks that have lost all their workers; False if the first has no try left."""
         lost = []
         for task in self.tasks:
             has_workers = bool(task.workers & self.ready.keys())
@@ -355,7 +359,7 @@ class _Crew:
         return True
 
     def _wait(self, task: _Task, patience: float) -> _Outcome | None:
-        """Wait for a task for a while; raises TimeoutError, or what says that its worker is lost."""
+        """Wait for a task for a while; raises TimeoutError, or an error if its worker is lost."""
         from distributed import KilledWorker, wait
 
         with self.client.as_current():
@@ -371,7 +375,7 @@ class _Crew:
         return _Outcome(result=result, refusal=refusal)
 
     def leave(self) -> None:
-        """Leave nothing on the scheduler and the workers, also where a traceback holds this object."""
+        """Leave nothing on the scheduler and the workers, even if a traceback holds this object."""
         self.tasks.clear()
         if self.ready and self.client.status == "running":
             with contextlib.suppress(OSError):
@@ -432,7 +436,7 @@ class _Crew:
     def admit(self, address: str, answer: Any) -> None:
         """Make a worker ready, or exclude it and name it once.
 
-        `answer` is its device, or the reason why it can take no work, empty where it is asked again.
+        `answer` is its device, or the reason why it can take no work, empty if it is asked again.
         """
         self.ready.pop(address, None)
         reason = answer
@@ -453,7 +457,7 @@ class _Crew:
 
 @dataclass(frozen=True, kw_only=True)
 class _Outcome:
-    """How a task ended: a result, an error, or a worker that has no such function and why."""
+    """End of a task: a result, an error, or the reason of a worker that lacks the function."""
 
     result: Any = None
     error: BaseException | None = None

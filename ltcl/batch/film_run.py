@@ -80,7 +80,7 @@ class BatchSolver:
         )
 
     def _survey(self) -> None:
-        """Let "auto" see the same survey of S in every batch, so that all choose the same method."""
+        """Let "auto" see one survey of S in every batch, so that all choose the same method."""
         is_auto = self.options.get("method", "auto") == "auto"
         if is_auto and self.T.is_square and self.T.shape[0] > SMALL:
             for S in self.T.systems:
@@ -141,7 +141,7 @@ class FilmRun:
         return min(self.source.count, self.limit)
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
-        """Solve all batches; yields how many frames are done, at the beginning and after each batch."""
+        """Solve all batches; yields how many frames are done, at first and after each batch."""
         # The next batch is read while one is solved.
         ahead = read_ahead(lambda batches: next(batches, None), repeat(self._batches()), 1)
         batches = iter(lambda: next(ahead), None)
@@ -187,7 +187,10 @@ class FilmRun:
         raise FileError(f"{self.source.path}: frames were left out: {named}")
 
     def _find_gain(self, gain: float | str, loss: float | None, first: list[ReadFrame]) -> float:
-        """The gain of all frames; by "auto" of a sample, the first frames where their number is unknown."""
+        """Return the gain of all frames, which "auto" derives from a sample.
+
+        The sample is the first frames if the number of frames is unknown.
+        """
         if not isinstance(gain, str):
             return float(gain)
         count = self.count or self.batch_size
@@ -215,7 +218,10 @@ class FilmRun:
                 yield batch
 
     def _read(self, frame: Frame) -> list[ReadFrame]:
-        """One frame, on the camera's grid; none where it is done, or broken, which is noted."""
+        """Read a frame onto the camera's grid.
+
+        The list is empty if the frame is done, or broken, which is noted.
+        """
         place = f"{self.source.path}: frame {frame.number} ({frame.name})"
         try:
             digest = frame.digest()
@@ -255,7 +261,7 @@ class FilmRun:
         raise InputError(f"{place} is {size}; {advice}")
 
     def patterns(self) -> Iterator[np.ndarray]:
-        """Patterns as they were written, white at 1; codes as the light of which sRGB makes them."""
+        """Patterns as they were written, white at 1; codes as the light that sRGB makes of them."""
         for number in sorted(self.done):
             pattern = images.read(self._files(number)[0])
             if self.format == "exr":

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`compensate_frames`: patterns for a folder or a video of frames, a batch of right-hand sides at a time.
+"""`compensate_frames`: patterns for a folder or video of frames, a batch of frames at a time.
 
 Every frame gets the same gain: one that followed the frames would make the scene flicker. Batches
-begin at the same frames in every run and share nothing but T and a survey of S. So a resumed run, or
-one on a cluster, gives what an uninterrupted one does, to the last bit on devices of one kind with
-one memory of timings. Frames that are missing from a batch are solved alone, to the same tolerance:
-the rest after `frames=`, or a lost pattern.
+begin at the same frames in every run and share nothing but T and a survey of S. So a resumed run,
+or one on a cluster, gives what an uninterrupted one does, to the last bit on devices of one kind
+with one memory of timings. Frames that are missing from a batch are solved alone, to the same
+tolerance: the rest after `frames=`, or a lost pattern.
 """
 
 from __future__ import annotations
@@ -277,7 +277,8 @@ def _check_pictures(T: Transport, options: dict[str, Any]) -> None:
         _, layout = picture_frames.unpack(name, value, T.camera_grid, T.channels)
         if layout.frames is not None:
             raise InputError(
-                f"{name} holds {layout.frames} frame(s); it must be one picture, for all frames alike"
+                f"{name} holds {layout.frames} frame(s); "
+                "it must be one picture, for all frames alike"
             )
 
 

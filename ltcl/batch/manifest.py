@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The list of a folder of patterns, frames.json: its transport, its settings, and the frames that are done.
+"""List of a folder of patterns, frames.json: its transport, its settings, its finished frames.
 
 The list is replaced whole after every batch, when the patterns of the batch are on the disk: a run
 that ends early loses one batch.
@@ -36,7 +36,7 @@ class OtherRun(InputError):
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One frame of a film.
+    """Entry of a frame of a film.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class FrameRecord:
 
 
 def write(folder: Path, head: dict[str, Any], records: dict[int, FrameRecord]) -> None:
-    """Replace the list of a folder: `head` has versions, settings, transport and gain of the run."""
+    """Replace the list of a folder; `head` has versions, settings, transport and gain."""
     head_text = report.dumps({"format": FORMAT, **head})
     lines = [json.dumps(asdict(records[number])) for number in sorted(records)]
     frames = ",\n    ".join(lines)

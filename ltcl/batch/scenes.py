@@ -21,7 +21,7 @@ def map(
     share_gpu: bool = False,
     progress: Callable[[str, int, int | None], object] | None = None,
 ) -> list[Any]:
-    """Results of a function of each scene, in order; a scene that fails is named, and the rest go on.
+    """Results of a function of each scene, in order; failing scenes are named, the others go on.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ def map(
     Raises
     ------
     BatchError
-        `function` raised an LtclError for some scenes. `results` has all results, with the errors in
-        their places.
+        `function` raised an LtclError for some scenes. `results` has all results, with the
+        errors in their places.
 
     Examples
     --------

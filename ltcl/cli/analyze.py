@@ -66,8 +66,8 @@ def analyze(
         "Spectrum of R, bounds on that of S, and checks of the measurement",
         _table(spectra),
         "  negative light: in one bounce between parts of the picture; should be 0",
-        "  light passed on: share of each pixel's light, by one bounce; must be at least 0 and below"
-        " 1",
+        "  light passed on: share of each pixel's light, by one bounce; "
+        "must be at least 0 and below 1",
         f"\nProducts with S to a relative residual of {rtol:g}, two more by sweeps; -: no forecast",
         _table(forecasts),
     ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The shared part of `ltcl compensate` and `ltcl film`: the transport, the projector, the settings."""
+"""Shared part of `ltcl compensate` and `ltcl film`: the transport, projector and settings."""
 
 from __future__ import annotations
 

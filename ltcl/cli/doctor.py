@@ -220,7 +220,7 @@ def _driver_files() -> list[Path]:
 
 
 def _crashes(driver_file: Path) -> bool:
-    """Whether a child process with this driver alone crashes or hangs."""
+    """True if a child process with this driver alone crashes or hangs."""
     search_path = os.pathsep.join(folder for folder in sys.path if folder)
     environment = {
         **os.environ,

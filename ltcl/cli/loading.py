@@ -78,7 +78,7 @@ def _given_options(context: Context, *names: str) -> dict[str, Any]:
 
 
 def is_measured(path: Path) -> bool:
-    """Whether `ltcl.acquire` made this store; False for a damaged one, which loading refuses."""
+    """True if `ltcl.acquire` made this store; False if damaged, which loading refuses."""
     with suppress(InputError):
         return path.is_dir() and "strategy" in store.BlockStore.open(path).attributes
     return False
@@ -157,7 +157,7 @@ def _load_original(context: Context, T: Transport) -> Transport:
 
 
 def has_std(T: Transport, settings: dict[str, Any]) -> bool:
-    """Whether results have standard deviations: the noise was measured, or T has its entries."""
+    """True if results have standard deviations: the noise was measured, or T has its entries."""
     judged = T if settings["exact"] is None else settings["exact"]
     return not judged.is_compressed or judged.measured_noise is not None
 

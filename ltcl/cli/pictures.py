@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures from files on the grid of a camera or projector, and a folder of results with a report."""
+"""Pictures from files on the grid of a camera or projector, and a folder of results."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def separate(
 
 @dataclass(kw_only=True)
 class PartsWriter:
-    """Writes the parts of one picture after the other, and gathers the rows of the contact sheet."""
+    """Writes the parts of picture after picture, and gathers the rows of the contact sheet."""
 
     # Exposure of the run.
     factor: float

@@ -25,7 +25,10 @@ STEPS = (*experiment.STEPS, "pictures")
 
 @dataclass(frozen=True)
 class Demo:
-    """Result of `run`: the `folder`, the contents of report.json, and all `files` written, relative to it."""
+    """Result of `run`: the `folder`, the contents of report.json, and the `files`.
+
+    `files` are all that were written, relative to the folder.
+    """
 
     folder: Path
     report: dict[str, Any]

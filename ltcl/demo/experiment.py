@@ -6,8 +6,8 @@ Chebyshev with the free bounds does not. The target is a sunset in just as much 
 makes necessary: no projector can make a place darker than the light that bounces into it from the
 rest of the picture. With x = S^-1 picture and y = S^-1 mist, (N,) a channel, a target picture + b
 mist asks for the direct light x + b y; cutting off where that is negative changes what is seen by
-S min(x + b y, 0). The smallest b for which this stays below one percent is found by bisection, with a
-product a step.
+S min(x + b y, 0). The smallest b for which this stays below one percent is found by bisection,
+with a product a step.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ PANORAMA_WIDTH = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """What is seen under one pattern; at `exposure` it comes closest to the target, to the relative `error`."""
+    """Scene under one pattern.
+
+    At `exposure` it comes closest to the target, to the relative `error`.
+    """
 
     seen: np.ndarray
     exposure: float
@@ -60,7 +63,10 @@ class Look:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """All results. Pictures are linear, (h, w, 3) on the walls' grid; `worst` is the channel of `race`."""
+    """All results: pictures are linear, (h, w, 3) on the walls' grid.
+
+    `worst` is the channel of `race`.
+    """
 
     scene: Scene
     T: Transport
@@ -76,7 +82,7 @@ class Experiment:
 
 
 class Target(NamedTuple):
-    """A picture (h, w, 3), its share of mist, and the brightest projector light that it asks for."""
+    """Picture (h, w, 3), its share of mist, and the brightest projector light it asks for."""
 
     picture: np.ndarray
     mist: float

@@ -22,9 +22,9 @@ from ltcl.tasks import report
 VIEW_PIXELS = 800  # along the longer side of a view
 TITLE = "A picture projected into a coloured corner"
 SUBTITLE = (
-    "The walls colour it and light each other. With the pattern of ltcl they look like a flat white "
-    "screen.\nBelow: the light of the first picture taken apart, by how often it went from wall to "
-    "wall."
+    "The walls colour it and light each other. "
+    "With the pattern of ltcl they look like a flat white screen.\n"
+    "Below: the light of the first picture taken apart, by how often it went from wall to wall."
 )
 STORY = ("uncompensated", "pattern", "compensated")
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ltcl import checks
 from ltcl.errors import InputError, MemoryLimitError
@@ -128,3 +129,22 @@ def rounded(values: Any, dtype: Any) -> np.ndarray:
         raise MemoryLimitError(
             f"the host has no room for {nbytes} to copy from as {dtype.name}"
         ) from error
+
+
+def round_inwards(lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Round bounds to float32 within the interval; to the nearest if it holds no float32.
+
+    >>> low, high = round_inwards(0.1, 0.7)
+    >>> bool(np.float32(0.7) > 0.7 >= high), bool(low >= 0.1)
+    (False, True)
+    """
+    lower = np.asarray(lower, np.float64)
+    upper = np.asarray(upper, np.float64)
+    nearest_low = lower.astype(np.float32)
+    nearest_high = upper.astype(np.float32)
+    next_above = np.nextafter(nearest_low, np.float32(np.inf))
+    next_below = np.nextafter(nearest_high, np.float32(-np.inf))
+    low = np.where(nearest_low < lower, next_above, nearest_low)
+    high = np.where(nearest_high > upper, next_below, nearest_high)
+    is_empty = low > high
+    return np.where(is_empty, nearest_low, low), np.where(is_empty, nearest_high, high)

@@ -45,7 +45,7 @@ def figure_of(width: int, height: int) -> Figure:
 
 
 def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:
-    """Text whose top is `y` pixels below the top of the figure; sizes in points, 1.4 pixels each."""
+    """Draw text whose top is `y` pixels below the figure's top; a point has 1.4 pixels."""
     width, height = figure.get_size_inches() * DPI
     style = {"va": "top", "color": INK, **style}
     figure.text(x / width, 1 - y / height, text, fontsize=size, **style)

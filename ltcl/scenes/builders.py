@@ -126,8 +126,8 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (2,), one per wall; (3,), one colour; (2, 3), one colour per wall.
     angle : float
-        Angle between the walls, in degrees, above 0 and below 180. The smaller, the more light stays
-        inside.
+        Angle between the walls, in degrees, above 0 and below 180. The smaller, the more light
+        stays inside.
 
     Returns
     -------
@@ -181,8 +181,8 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (1, 3), one colour; (3, 1), one per wall; (3, 3), one colour per wall.
     angle : float
-        Angle between any two of the three edges, in degrees, above 0 and below 120. 90 gives the corner
-        of a cube, 120 would be a flat hexagon, and towards 0 it becomes a narrow tube.
+        Angle between any two of the three edges, in degrees, above 0 and below 120. 90 gives the
+        corner of a cube, 120 would be a flat hexagon, and towards 0 it becomes a narrow tube.
 
     Returns
     -------
@@ -265,7 +265,7 @@ def _assemble(
 def _with_block(
     albedos: np.ndarray, walls: int, block_albedo: Any, faces: int, n: int
 ) -> np.ndarray:
-    """Albedos of all patches (channels, n * walls * n), with those of the faces of a block behind."""
+    """Albedos of all patches (channels, n * walls * n), then those of the faces of a block."""
     of_walls = albedos.reshape(len(albedos), n, walls, n)[:, 0, :, 0].T
     of_block = np.atleast_1d(np.asarray(block_albedo, np.float64))
     channels = max(len(albedos), len(of_block))
@@ -277,7 +277,10 @@ def _with_block(
 
 
 def _lit_faces(block: Block) -> tuple[Wall, ...]:
-    """Faces of a block in the unit cube that light can meet: none if black, none on the cube's faces."""
+    """Faces of a block in the unit cube that light can meet.
+
+    There are none if it is black, and none on the cube's faces.
+    """
     low = block.low
     high = block.high
     if low.min() < -CUBE_TOLERANCE or high.max() > 1 + CUBE_TOLERANCE:

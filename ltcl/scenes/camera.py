@@ -67,7 +67,7 @@ class SceneCamera:
         return bool(towards @ wall.normal > 0)
 
     def homography(self, wall: Wall) -> np.ndarray:
-        """H (3, 3) from (u, v, 1) on the wall to homogeneous image plane coordinates, x right, y down."""
+        """H (3, 3) from (u, v, 1) on the wall to homogeneous image coordinates, x right, y down."""
         forward = np.subtract(self.target, self.eye).astype(np.float64)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         axes = np.stack([right, np.cross(forward, right), forward])
@@ -122,7 +122,7 @@ def draw(
     supersample: int,
     screens: Sequence[Wall] = (),
 ) -> np.ndarray:
-    """Image (H, W[, c]) float32 of a picture (h, w[, c]) on the walls; 0 on screens and beside all."""
+    """Image (H, W[, c]) float32 of a picture (h, w[, c]) on the walls, 0 on screens and beside."""
     visible = frame(camera, (*walls, *screens))
     height, width = visible.pixels(size)
     scale = supersample * visible.scale(height, width)
@@ -172,7 +172,7 @@ def read(
     grid: tuple[int, int],
     screens: Sequence[Wall] = (),
 ) -> np.ndarray:
-    """Picture (h, w[, 3]) float32 on the walls' grid: means of an image (H, W[, 3]) over the patches.
+    """Picture (h, w[, 3]) float32 on the walls' grid: means of an image (H, W[, 3]) by patches.
 
     The image just covers the frame, centred. The mean of a patch that is partly hidden is over what
     shows; patches that are hidden or seen from behind are 0.
@@ -221,7 +221,7 @@ def _lattice(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places on a wall (..., 2) of points of the image plane (..., 3), and 1 / depth there; 0 beside it."""
+    """Places (..., 2) on a wall of image points (..., 3), and 1 / depth there; 0 beside it."""
     mapped = points @ np.linalg.inv(homography).T
     nearness = mapped[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):  # the wall's plane may lie edge-on
@@ -237,7 +237,7 @@ def _read_wall(
     patches: tuple[int, int],
     hiding: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """Mean of the image over the footprint of each patch of one wall, where walls `hiding` leave it open."""
+    """Mean of the image over the footprint of each patch, where walls `hiding` leave it open."""
     h, w = patches
     border_lattice = _lattice(np.linspace(0, 1, w + 1), np.linspace(0, 1, h + 1))
     borders = _apply(to_pixels @ homography, border_lattice)

@@ -2,12 +2,12 @@
 """Exact form factors between flat patches at any angle and distance, without occlusion.
 
     a_i F_ij = int_i int_j  cos(t_i) cos(t_j) / (pi r^2)  da_j da_i
-             = 1 / (2 pi)  sum over the edges p of i, q of j:  (p . q)  int int ln r  ds dt,   0 <
-             s, t < 1
+             = 1 / (2 pi)  sum_p sum_q (p . q)  int_0^1 int_0^1  ln r  ds dt
 
-(the second line by Stokes' theorem; p and q run around the fronts). Pairs farther apart than they
-are large take Gauss-Legendre points on both patches: the kernel is smooth there and every term
-positive. Nearer pairs, and those where the plane of one patch cuts the other, take the integral
+(the second line by Stokes' theorem: edges p run around the front of patch i, q around that of j).
+Pairs farther apart than they are large take Gauss-Legendre points on both patches: the kernel is
+smooth there and every term positive. Nearer pairs, and those where the plane of one patch cuts the
+other, take the integral
 over both outlines, of what lies in front: along q it has a closed form, and along p it is smooth
 but for logarithms where p passes the ends of q and where both lines come closest, so p is cut there
 and Gauss points crowd towards the ends of each piece. Far patches would lose digits so, a factor
@@ -57,7 +57,7 @@ CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
 
 
 def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
-    """Form factors of all patches of walls, (N, N) float64, N = n * n * len(walls), without occlusion.
+    """Form factors of all patches, (N, N) float64, N = n * n * len(walls), without occlusion.
 
     None of the walls may cut through another. MemoryLimitError if the host has no room for the
     matrix.
@@ -74,7 +74,7 @@ def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
 
 
 def fill(matrix: np.ndarray, walls: Sequence[Wall], pairs: Iterable[tuple[int, int]]) -> None:
-    """Write the form factors between pairs of walls, both ways, in a matrix (n, walls, n, n, walls, n)."""
+    """Write form factors of pairs of walls, both ways, in a matrix (n, walls, n, n, walls, n)."""
     n = len(matrix)
     known: dict[bytes, np.ndarray] = {}
     for i, j in pairs:
@@ -192,7 +192,7 @@ def _offset_steps(
 
 
 def form_factors_of_pairs(patches: Patches, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """F_ij of listed pairs of patches, (P,) float64: shares of the light from patches i that meet patches j.
+    """F_ij of listed pairs, (P,) float64: share of the light from patch i that meets patch j.
 
     It is meant for pairs a few sizes apart: entries are right to 1e-6 up to 10 sizes.
 
@@ -352,7 +352,10 @@ def _mean_log(p: np.ndarray, q: np.ndarray, points: int) -> np.ndarray:
 
 
 def _cuts(edge: np.ndarray, along: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Places (P, 5), ascending from 0 to 1, where segments p are cut: at the ends of q and nearest its line."""
+    """Places (P, 5), ascending from 0 to 1, where segments p are cut.
+
+    They are at the ends of q and nearest to its line.
+    """
     square = np.einsum("pi,pi->p", edge, edge)
     at_start = -np.einsum("pi,pi->p", edge, offset) / square
     at_end = at_start + np.einsum("pi,pi->p", edge, along) / square
@@ -376,7 +379,7 @@ def _outline(edges: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def _clip(outlines: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """The part in front of a plane of outlines (P, E, 2, 3) whose starts are `height` (P, E) above it.
+    """Part in front of a plane of outlines (P, E, 2, 3) that start `height` (P, E) above it.
 
     The result (P, E + 1, 2, 3) has the same edges, shortened, to nothing where they lie behind, and
     one more along the cut.

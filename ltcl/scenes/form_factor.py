@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Form factors as an operator that stores no matrix: A = diag(albedo) F for scenes of 100 000 patches.
+"""Form factors as an operator without a matrix: A = diag(albedo) F of scenes of 100 000 patches.
 
 Every product computes all N^2 form factors anew, by `kernels/form_factor.cl`: about 20 operations
 each, no memory traffic to speak of, 52 bytes a patch stored. Distant pairs are taken at their
 centres, nearer ones with the curvature between them, still nearer ones at eight pairs of points.
-Within `NEAR_DISTANCE` sizes that is not good enough: there the exact form factors come from the host, and
-what they differ from the kernel's is added as a sparse matrix.
+Within `NEAR_DISTANCE` sizes that is not good enough: there the exact form factors come from the
+host, and their difference from the kernel's is added as a sparse matrix.
 
 Measured on boxes of 6 to 131424 patches, and walls at 30, 70 and 130 degrees: for smooth x, F x is
 within 1e-4 of its largest value (row sums of the largest box: 6e-5), and F within 1e-4 in the
@@ -61,7 +61,7 @@ GROUP = 64
 
 
 class FormFactor(Operator):
-    """One bounce A = diag(albedo) F between patches, computed anew in every product, never stored.
+    """Bounce A = diag(albedo) F between patches, computed anew in every product, never stored.
 
     F_ij is the share of the light leaving patch i that meets patch j.
 
@@ -139,7 +139,7 @@ class FormFactor(Operator):
 
     @classmethod
     def of(cls, scene: Scene, device: Device | str | None = None) -> tuple[FormFactor, ...]:
-        """One bounce in a scene of `box`, `dihedral` or `trihedral`, one operator per channel.
+        """Bounce in a scene of `box`, `dihedral` or `trihedral`, one operator per channel.
 
         They are computed from the scene's walls and blocks, not from its matrix of form factors.
 
@@ -286,7 +286,7 @@ def _near_pairs(patches: Patches) -> tuple[np.ndarray, np.ndarray]:
 def _rises_above(
     patches: Patches, plane: np.ndarray, patch: np.ndarray, offset: np.ndarray
 ) -> np.ndarray:
-    """True where a point of a patch is above the plane of another, whose centre is `offset` below it."""
+    """True if a point of a patch is above another's plane, whose centre is `offset` below it."""
     normal = patches.normal[plane]
     rise = np.abs((patches.right[patch] * normal).sum(axis=1))
     rise += np.abs((patches.down[patch] * normal).sum(axis=1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A picture to show on walls: sunset over mountains and a lake, painted by a program of this project.
+"""Picture to show on walls: sunset over mountains and a lake, painted by this program.
 
 It asks much of a projector on purpose: saturated blues and oranges, whites, deep blacks and fine
 detail.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Walls cut into flat patches: the geometry that form factors, rays and visibility are computed from.
+"""Walls cut into flat patches: the geometry of form factors, rays and visibility.
 
 A picture on the walls has grid (n, walls * n), row-major: patch (r, c) of wall w is number
 r * walls * n + w * n + c. Kernels compute in float32, so for them lengths are counted from the
@@ -141,7 +141,7 @@ def check_blocks(blocks: Any) -> np.ndarray:
 
 
 def scaled(device: Device, patches: Patches, blocks: np.ndarray) -> tuple[Patches, Array]:
-    """The patches in the units of kernels, and boxes (B, 2, 3) as centre and half sides, shrunk a little.
+    """Patches in units of kernels, and boxes (B, 2, 3) as centre and half sides, a little smaller.
 
     Where there are no boxes, the array has one row that is not used.
     """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Rays and lines of sight, past walls with a front and opaque black blocks.
 
-A ray o + t d meets a wall where o + t d = corner + u right + v down with u and v in [0, 1]. Walls stop
-light from both sides; from behind they are black, as blocks are from everywhere. All rays are tried
-against all walls, which suits rooms of a few walls and millions of rays.
+A ray o + t d meets a wall where o + t d = corner + u right + v down with u and v in [0, 1]. Walls
+stop light from both sides; from behind they are black, as blocks are from everywhere. All rays are
+tried against all walls, which suits rooms of a few walls and millions of rays.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ltcl.errors import InputError
 from ltcl.scenes.patches import Patches, check_blocks
 from ltcl.scenes.walls import Wall, point
 
-# Tolerance as a part of the side of a wall or block: a ray that aims at a seam must not slip through
-# it, and a ray that runs along a face of a block is not stopped by it. As a part of a ray's length:
-# its start and its target may lie on a surface, and a wall is in front of the face of a block that it
-# lies on.
+# Tolerance as a part of the side of a wall or block: a ray that aims at a seam must not slip
+# through it, and a ray that runs along a face of a block is not stopped by it. As a part of a ray's
+# length: its start and its target may lie on a surface, and a wall is in front of the face of a
+# block that it lies on.
 RAY_TOLERANCE = 1e-9
 # Points along a side of a patch that are tried for a line of sight.
 SIGHT_POINTS = 4
@@ -72,9 +72,10 @@ def cast(
 def clear(
     walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks: Any = ()
 ) -> np.ndarray:
-    """True where nothing stands between points (R, 3) and a place (3,), or a place (R, 3) each; (R,).
+    """True where nothing stands between points (R, 3) and one place (3,) or a place (R, 3) each.
 
-    Walls, from either side, and blocks are as in `cast`. The points and the place may lie on them.
+    The result has shape (R,). Walls, from either side, and blocks are as in `cast`. The points and
+    the place may lie on them.
 
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
     >>> clear([floor], np.array([[0.5, 0.5, 0], [0.5, 0.5, -1]]), np.array([0.5, 0.5, 1])).tolist()
@@ -102,7 +103,7 @@ def sight(
 ) -> Sight:
     """View of the patches of walls from a projector or camera that stands at `stand` (3,).
 
-    InputError if that is no place, lies on a wall or in a block, or if it sees no patch from its front.
+    InputError if that is no place, lies on a wall or in a block, or sees no patch from its front.
 
     >>> from ltcl.scenes import cut
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))

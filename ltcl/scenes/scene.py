@@ -35,7 +35,7 @@ FORM_FACTOR_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Patches that light each other; made by `dihedral`, `trihedral`, `box`, or from own form factors.
+    """Patches that light each other; made by `dihedral`, `trihedral`, `box`, or of form factors.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class Scene:
 
     @property
     def A(self) -> np.ndarray | tuple[np.ndarray, ...]:
-        """One physical bounce, diag(albedo) @ form_factors (eq. 4): (N, N), or a tuple of three.
+        """Physical bounce diag(albedo) @ form_factors (eq. 4): (N, N), or a tuple of three.
 
         `ltcl.scenes.FormFactor.of` gives it as operators that store no matrix.
         """
@@ -134,7 +134,7 @@ class Scene:
         return bounces[0] if self.channels == 1 else bounces
 
     def matrices(self) -> tuple[np.ndarray, ...]:
-        """Light transport T = (I - A)^-1 diag(albedo) (eq. 4), exact, one (N, N) float64 array per channel.
+        """Exact light transport T = (I - A)^-1 diag(albedo) (eq. 4), (N, N) float64 per channel.
 
         T_ij is what patch i shows when unit light falls on patch j.
 
@@ -207,7 +207,7 @@ class Scene:
         return np.moveaxis(values.reshape(3, *self.grid), 0, -1)
 
     def view(self, picture: Any, size: int = 480, supersample: int = 3) -> np.ndarray:
-        """Image of a picture on the walls, as the viewer of the room sees it; backs of walls are left out.
+        """Image of a picture on the walls as the viewer of the room sees it; backs are left out.
 
         Parameters
         ----------
@@ -347,9 +347,9 @@ class Scene:
 
 
 def transport_matrix(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """T = (I - A)^-1 diag(r), (N, N) float64, with A = diag(r) F, form factors F, albedos r and areas a (N,).
+    """T = (I - A)^-1 diag(r), (N, N) float64, of form factors F, albedos r and areas a (N,).
 
-    Reciprocity says that diag(a) F is symmetric. With s = sqrt(r / a) this gives
+    A is diag(r) F. Reciprocity says that diag(a) F is symmetric. With s = sqrt(r / a) this gives
 
         B = diag(s) diag(a) F diag(s) = B^T,    T = diag(s) (I - B)^-1 diag(s) diag(a)
 

@@ -2,8 +2,9 @@
 """Visibility V (N, N) of patches past opaque boxes: symmetric, 1 where nothing is between.
 
 V_ij is the share of the rays between the fronts of patches i and j that meet no box. Rays that
-leave or meet a back carry no light and do not count: where the plane of one patch cuts the other, V
-is that of the part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or almost.
+leave or meet a back carry no light and do not count: where the plane of one patch cuts the other,
+V is that of the part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or
+almost.
 
 Each patch has s x s points, one at random in each cell of a regular division, and ray k joins point
 k of one patch with point partner(k) of the other, where partner is a fixed random exchange: both
@@ -72,7 +73,7 @@ class Rays:
         return np.concatenate(parts)
 
     def _launch(self, i: np.ndarray, start: np.ndarray, columns: int) -> np.ndarray:
-        """V of patches i and the `columns` from `start` on, in whole lanes: (columns or more, len(i))."""
+        """V of patches i and `columns` from `start`, in whole lanes: (columns or more, len(i))."""
         width = lanes(self.device)
         kernel = self.device.kernel(
             "form_factor", "form_factor_visible", K=1, LANES=width, BLOCKS=self.boxes
@@ -121,7 +122,7 @@ def _partners(rays: int) -> np.ndarray:
 def visibility(
     patches: Patches, blocks: Any, device: Device | str | None = None, *, samples: int = 4
 ) -> np.ndarray:
-    """Shares of the rays between the fronts of all patches that meet no box, (N, N) float32 on the host.
+    """Shares of rays between fronts of all patches that meet no box, (N, N) float32 on the host.
 
     Parameters
     ----------

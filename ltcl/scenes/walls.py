@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Walls and blocks of a room: where they stand, how bright they are, and that none cuts through another."""
+"""Walls and blocks of a room: their places, their albedos, and that none cuts through another."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def point(name: str, value: Any) -> Vector:
 
 
 def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
-    """Albedo of every patch, (channels, n * walls * n), from one number, one per wall, per colour or both.
+    """Albedo of every patch, (channels, n * walls * n), of one number, or one per wall or colour.
 
     `albedo` is a scalar; (walls,), one per wall; (3,), one colour for all walls; or (walls, 3),
     (walls, 1) or (1, 3) in full. Three numbers for three walls could be either, and are refused.
@@ -204,7 +204,7 @@ def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
 
 
 def check_albedo(albedo: np.ndarray) -> None:
-    """Refuse albedos outside [0, 1): a patch cannot give back all the light it gets, let alone more."""
+    """Refuse albedos outside [0, 1): a patch cannot give back all the light it gets, or more."""
     bad = ~((albedo >= 0) & (albedo < 1))
     if bad.any():
         count = np.count_nonzero(bad)
@@ -230,7 +230,7 @@ def refuse_crossing(walls: Sequence[Wall]) -> None:
 
 
 def _crossing(first: Wall, second: Wall) -> str:
-    """How two walls cross, empty where they do not."""
+    """Describe how two walls cross; the text is empty if they do not."""
     a = first.outline
     b = second.outline
     longest_edge = max(np.abs(np.diff(corners, axis=0)).max() for corners in (a, b))
@@ -273,7 +273,10 @@ def _normal(corners: np.ndarray) -> np.ndarray:
 
 
 def _span(corners: np.ndarray, height: np.ndarray, line: np.ndarray) -> tuple[float, float]:
-    """Interval of a line that a wall fills; the line is where a plane, `height` below the corners, cuts it."""
+    """Interval of a line that a wall fills.
+
+    The line is where a plane, `height` below the corners, cuts the wall.
+    """
     next_corners = np.roll(corners, -1, axis=0)
     next_height = np.roll(height, -1)
     is_crossing = (height < 0) != (next_height < 0)

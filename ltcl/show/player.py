@@ -153,7 +153,7 @@ class _Timing:
         return self.start + number * self.period
 
     def is_too_late(self, number: int, now: float) -> bool:
-        """Whether the next frame will be due before this one can be there."""
+        """True if the next frame will be due before this one can be there."""
         computed_at = now + median(self.computing)
         window_free_at = self.sent_at + median(self.drawing)
         return self.shown > 0 and self.due_at(number + 1) < max(computed_at, window_free_at)

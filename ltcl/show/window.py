@@ -64,7 +64,7 @@ class Window(ViewerScene, contextlib.AbstractContextManager):
         return self._drawn_at
 
     def key_pressed(self) -> bool:
-        """Whether a key was pressed since the last call."""
+        """True if a key was pressed since the last call."""
         was_pressed = self._is_pressed.is_set()
         self._is_pressed.clear()
         return was_pressed

@@ -17,10 +17,10 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Device, open_device
+from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus, Operator, stored
 from ltcl.operators.interreflection import nbytes
-from ltcl.solvers.bounded import round_inwards
 from ltcl.solvers.problem import scale_rhs, unscale
 from ltcl.solvers.result import Solution, Status
 from ltcl.transport import frames as layout

@@ -295,7 +295,12 @@ class Monitor:
             return digits / -np.log(factor)
 
     def _confirm(self, x: Any, r: Array, norms: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return norms (k,) of the newest residual, as exact as needed, and whether x solves."""
+        """Return norms (k,) of the newest residual, as exact as needed, and whether x solves.
+
+        A claim is decided by the first of these that can decide it: the bound on what rounding may
+        hide in the residual at hand; the same bound for the residual computed anew; the residual in
+        float64, where that is cheap (small systems) or after too many refusals.
+        """
         system = self.system
         seems_solved = bool(np.all(norms <= self._target))
         seems_recursive = self._recursion_steps > 0 and np.all(norms <= self._recursion_limit)
@@ -341,6 +346,8 @@ class Monitor:
         if self._recursion_steps and not norm.is_bound:
             return False
         size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
+        # Each product rounds by UNIT ||S|| times what it multiplies: x itself when r was computed,
+        # and since then steps whose lengths add up to the way of x.
         way = size + self._travelled
         hidden = precision.UNIT * norm.value * (self._recursion_steps + 1) * way
         rounding_of_b = 0.5 * precision.EPS * self.system.norms

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transports on disk: .npz, .npy, .mtx, .h5, .mat and .zarr, whose declared sizes are checked; no pickles."""
+"""Transports on disk: .npz, .npy, .mtx, .h5, .mat and .zarr, of checked sizes, without pickles."""
 
 from ltcl.store.array_log import ArrayLog
 from ltcl.store.block_store import BlockStore

@@ -36,7 +36,7 @@ class ArrayLog:
         return sorted(match[1] for match in matches if match is not None)
 
     def put(self, name: str, **arrays: Any) -> None:
-        """Commit arrays of numbers or texts; an earlier set of this name is replaced whole, or stays."""
+        """Commit arrays of numbers or texts; an earlier set of this name is replaced or kept."""
         if not ENTRY_FILE.fullmatch(f"{name}.npz"):
             raise InputError(
                 f"name is {name!r:.60}; it must be letters, digits, _, - and ., a letter first"

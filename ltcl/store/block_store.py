@@ -2,9 +2,9 @@
 """`BlockStore`: a transport on disk that grows by batches of columns, and is never half of one.
 
 A growing store is a folder of `zarr.json` (sizes, provenance, attributes, checksum) and `log/`, an
-`ArrayLog` with an entry for each batch and small array. `finalize` turns the columns into rows, which
-zarr writes next to the log; with the rename of zarr.json, which then has the SHA-256 of every file,
-the store is final, and the log goes. Whenever a process ends, all that was committed stays.
+`ArrayLog` with an entry for each batch and small array. `finalize` turns the columns into rows,
+which zarr writes next to the log; with the rename of zarr.json, which then has the SHA-256 of every
+file, the store is final, and the log goes. Whenever a process ends, all that was committed stays.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ class BlockStore:
     ----------
     layout : StoreLayout
     provenance, attributes : dict
-        Plain JSON: where the transport comes from; what `update` keeps.
+        Plain JSON: where the transport comes from; what `update` keeps. Those of the last time
+        that this object read or wrote the store; `update` adds to what others have written since.
     final : bool
 
     Examples
@@ -117,7 +118,7 @@ class BlockStore:
 
     @property
     def written(self) -> frozenset[tuple[int, int]]:
-        """(channel, batch) of all in the log; the disk is asked, so other writers' batches count."""
+        """Set of (channel, batch) in the log on the disk, so other writers' batches count."""
         matches = map(COLUMNS.fullmatch, self._log.names)
         return frozenset((int(match[1]), int(match[2])) for match in matches if match)
 
@@ -154,7 +155,7 @@ class BlockStore:
             return Block(matrix, arrays.get("variance"))
 
     def rows_again(self, channel: int, block: int) -> tuple[int, scipy.sparse.csr_array]:
-        """First row and matrix of a `block` checked before, read without checks: as fast as the disk."""
+        """First row and matrix of a `block` checked before, read without checks, at disk speed."""
         first, _ = self.layout.span(block)
         matrix = self._read_bare(channel, block)
         if matrix is None:  # in another layout, or damaged
@@ -201,7 +202,7 @@ class BlockStore:
         return [name.removeprefix(EXTRA) for name in names if name.startswith(EXTRA)]
 
     def update(self, **attributes: Any) -> None:
-        """Change some of the `attributes`, at once or not at all; other processes' changes are kept."""
+        """Change some of the `attributes`, at once or not at all; keep other processes' changes."""
         with self._writing():
             changed = self.attributes | attributes
             write_document(self.path, self.layout, self.provenance, changed)
@@ -369,7 +370,7 @@ def places_of_arrays(files: Any) -> dict[str, dict[str, str]]:
 
 
 def read(path: Path) -> StoreRecord | CompressedRecord:
-    """The transport in a store, its matrices still on the disk; each block is checked once, here."""
+    """Transport in a store, its matrices still on the disk; each block is checked once, here."""
     store = BlockStore.open(path)
     if not store.final:
         raise FileError("is a scan that is not finished; finalize it first")

@@ -96,7 +96,7 @@ class StoreLayout:
 def write_document(
     root: Path, layout: StoreLayout, provenance: Any, state: Any, **files: Any
 ) -> None:
-    """Seal and write the zarr.json of a store; `files` has the SHA-256 of the files of a final one."""
+    """Seal and write the zarr.json of a store; `files` has the SHA-256 of files of a final one."""
     attributes = {
         "checksum": UNSEALED.decode(),
         "ltcl": asdict(layout),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The files of a final store, written by zarr: rows of T in blocks, and small arrays.
 
-Block k of a channel is the group `channel_0/block_00000k.0` in binsparse's CSR layout, a small array
-the group `extra/NAME.0`. Each array is one chunk with crc32c. Last comes the zarr.json of the store
-with the SHA-256 of every file: with it the store is final.
+Block k of a channel is the group `channel_0/block_00000k.0` in binsparse's CSR layout, a small
+array the group `extra/NAME.0`. Each array is one chunk with crc32c. Last comes the zarr.json of the
+store with the SHA-256 of every file: with it the store is final.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BINSPARSE = {"values": "data", "indices_1": "indices", "pointers_to_1": "indptr"
 
 
 class Block(NamedTuple):
-    """Rows of T, or columns of it as rows, and the variance of their entries, None where unknown."""
+    """Rows of T, or columns of it as rows, and the variance of their entries, None if unknown."""
 
     matrix: scipy.sparse.csr_array
     variance: np.ndarray | None

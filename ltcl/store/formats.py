@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transport files by extension: transports (`load`, `save`), and what files hold (`read`, `write`)."""
+"""Transport files by extension: transports (`load`, `save`) and contents (`read`, `write`)."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
 
 
 def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
-    """Save what `ltcl.invert` made as .npz, whole or not at all; FileError where that is not possible.
+    """Save what `ltcl.invert` made as .npz, whole or not at all; FileError if impossible.
 
     Examples
     --------
@@ -191,7 +191,7 @@ def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
 
 
 def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse:
-    """Load an inverse of `save_inverse` onto a device (see `open_device`); errors are those of `load`."""
+    """Load an inverse of `save_inverse` onto a device (see `open_device`); errors as of `load`."""
     record = read(path)
     with about(path):
         is_inverse = isinstance(record, CompressedRecord) and record.format == INVERSE_FORMAT
@@ -238,7 +238,7 @@ def write(path: str | os.PathLike[str], record: StoreRecord | CompressedRecord) 
 
 
 def check_losses(path: Path, file_format: Format, record: StoreRecord | CompressedRecord) -> None:
-    """Refuse a format that cannot hold `record`; warn where it leaves out what can be found again."""
+    """Refuse a format that cannot hold `record`; warn if it drops what can be found again."""
     loss = f"{path}: {path.suffix} does not keep"
     if isinstance(record, CompressedRecord):
         if not file_format.keeps_operators:
@@ -264,7 +264,7 @@ def _is_diagonal(record: StoreRecord) -> bool:
 
 
 def find(path: Path, *, inverse: bool = False) -> str:
-    """The extension by which the format of `path` is known; a folder may be a store by any other."""
+    """Extension by which the format of `path` is known; a folder may be a store by any other."""
     suffix = path.suffix.lower()
     if inverse and suffix != ".npz":
         raise FileError(f"{path}: the extension is {path.suffix!r}; inverses are .npz")
@@ -277,7 +277,7 @@ def find(path: Path, *, inverse: bool = False) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """Functions by which a format is read and written, and what it keeps of a transport beside the matrices."""
+    """Functions that read and write a format, and what it keeps beside the matrices."""
 
     read: Callable[..., Any]
     write: Callable[[Path, Any], None]

@@ -72,7 +72,7 @@ def check_declared(
 
 
 def floats(what: str, array: np.ndarray) -> np.ndarray:
-    """Real values as float32 where their type fits it exactly (at most 16 bits), else as float64."""
+    """Real values as float32 if their type fits it exactly (at most 16 bits), else as float64."""
     fits_float32 = np.result_type(array.dtype, np.float32) == np.float32
     dtype = np.float32 if fits_float32 else np.float64
     return np.ascontiguousarray(checks.real(what, array), dtype)
@@ -81,7 +81,7 @@ def floats(what: str, array: np.ndarray) -> np.ndarray:
 def sparse_floats(
     make: Callable[[], Any], shape: Sequence[int], entries: int
 ) -> scipy.sparse.csr_array:
-    """A matrix of SciPy in any layout as checked rows of floats, made after its sizes are checked."""
+    """SciPy matrix in any layout as checked rows of floats, made after its sizes are checked."""
     most = MAX_ROWS_WITHOUT_ENTRIES + MAX_ROWS_PER_ENTRY * entries
     if min(shape) < 1 or max(shape) > most:
         raise FileError(

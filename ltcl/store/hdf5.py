@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """HDF5 files (.h5, .hdf5), by h5py of the extra `hdf5`.
 
-A file holds `EXTRAS` and `T` (M, N) or (3, M, N); or `T`, or `T_0` to `T_2`, as MATLAB's sparse groups:
-`data`, `ir` (rows), `jc` (starts of columns), and the attribute MATLAB_sparse (number of rows).
+A file holds `EXTRAS` and `T` (M, N) or (3, M, N); or `T`, or `T_0` to `T_2`, as MATLAB's sparse
+groups: `data`, `ir` (rows), `jc` (starts of columns), and the attribute MATLAB_sparse (number of
+rows).
 """
 
 from __future__ import annotations

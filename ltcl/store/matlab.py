@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """MATLAB's .mat files.
 
-A file holds `EXTRAS`, `first_bounce` as (N, channels), and `LTM`, (M, N) or (M, N, 3) or sparse, or
-`LTM_r`, `LTM_g`, `LTM_b`, or any one matrix. Version 7.3 is HDF5 with axes in reverse order; version
-5 is a list of elements: type, bytes, values (MathWorks, "MAT-File Format").
+A file holds `EXTRAS`, `first_bounce` as (N, channels), and `LTM`, (M, N) or (M, N, 3) or sparse,
+or `LTM_r`, `LTM_g`, `LTM_b`, or any one matrix. Version 7.3 is HDF5 with axes in reverse order;
+version 5 is a list of elements: type, bytes, values (MathWorks, "MAT-File Format").
 
 Damaged files of version 5 crash SciPy, so they are read with NumPy, here.
 """
@@ -45,7 +45,8 @@ NUMBER_TYPES = {
     12: "i8",
     13: "u8",
 }
-# Classes of variables: sparse, and all of real numbers. The mask takes the flag of complex ones along.
+# Classes of variables: sparse, and all of real numbers. The mask takes the flag of complex ones
+# along.
 SPARSE_CLASS = 5
 NUMBER_CLASSES = range(5, 16)
 CLASS_AND_COMPLEX = 0x8FF

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""NumPy's files: .npz, whose declared sizes are checked, and .npy. Nothing is compressed or pickled.
+"""NumPy's files: .npz, with checked sizes, and .npy; nothing is compressed or pickled.
 
-An .npz holds SciPy's `save_npz` layouts; or named arrays, `T` (M, N) or (3, M, N) or the only matrix;
-or, by its `format`, a compressed transport, an inverse, or three sparse channels ("ltcl-rgb-csr-1":
-`shape`, `indptr_0`, `indices_0`, `data_0` to `data_2`); and perhaps `EXTRAS`.
+An .npz holds SciPy's `save_npz` layouts; or named arrays, `T` (M, N) or (3, M, N) or the only
+matrix; or, by its `format`, a compressed transport, an inverse, or three sparse channels
+("ltcl-rgb-csr-1": `shape`, `indptr_0`, `indices_0`, `data_0` to `data_2`); and perhaps `EXTRAS`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Headers = dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
 def read_npz(path: Path, variable: str | None = None) -> StoreRecord | CompressedRecord:
-    """Read an .npz; MemoryLimitError or FileError before an array that does not fit is allocated."""
+    """Read an .npz; MemoryLimitError or FileError before any array that does not fit is made."""
     headers = _headers(path)
     with np.load(path, allow_pickle=False) as archive:
 
@@ -75,7 +75,7 @@ def read_npz(path: Path, variable: str | None = None) -> StoreRecord | Compresse
 def _sparse_matrices(
     path: Path, layout: str, headers: Headers, load: Callable[[str], np.ndarray]
 ) -> dict[str, scipy.sparse.csr_array]:
-    """One sparse matrix in a layout of SciPy, or three channels."""
+    """Sparse matrix in a layout of SciPy, or three channels."""
     if "shape" not in headers:
         raise FileError(f"array 'format' is {layout!r:.60}, which is unknown")
     shape = checks.grid("array 'shape'", load("shape").tolist())
@@ -99,7 +99,7 @@ def _sparse_matrices(
 
 
 def _headers(path: Path) -> Headers:
-    """Shape and type of each array by name, after they were compared with the sizes that are stored."""
+    """Shape and type of each array by name, after comparison with the sizes that are stored."""
     headers: Headers = {}
     file_size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:

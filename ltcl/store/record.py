@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Contents of transport files: `StoreRecord` of matrices, `CompressedRecord` of compressed operators."""
+"""Contents of transport files: `StoreRecord` of matrices, `CompressedRecord` of operators."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ class StoreRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class FileNames:
-    """Names that a format gives to T and its channels, and whether it holds axes in reverse order."""
+    """Names that a format gives to T and its channels, and the order of its axes."""
 
     matrix: str = "T"
     channels: tuple[str, ...] = CHANNELS
@@ -290,7 +290,7 @@ def _is_matrix(shape: tuple[int, ...]) -> bool:
 class CompressedRecord:
     """Arrays of a compressed transport or, by its `format`, of an inverse.
 
-    Names are those of `ltcl.transport`. InputError where the arrays do not fit each other, or are not
+    Names are those of `ltcl.transport`. InputError if the arrays do not fit each other, or are not
     finite; operators are checked where they are made.
     """
 

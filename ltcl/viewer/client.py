@@ -134,7 +134,7 @@ class Client:
             return messages.encode({"id": number, "do": do, "error": line})
 
     def is_superseded(self, do: str) -> bool:
-        """Whether the page has gone, or has asked again."""
+        """True if the page has gone, or has asked again."""
         return self not in self._clients or do in self._waiting
 
     def send_soon(self, header: dict[str, Any]) -> None:

@@ -68,7 +68,7 @@ def _padding(size: int) -> int:
 
 
 def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return header and arrays of codes, (h, w[, c]) uint8, of a question; InputError if invalid."""
+    """Decode a question: header and arrays of codes, (h, w[, c]) uint8; InputError if invalid."""
     if isinstance(message, str):
         text: str | bytes = message
         data = b""

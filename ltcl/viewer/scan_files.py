@@ -83,7 +83,7 @@ class PhotographReader:
         self._format: Any = None
 
     def read(self, name: str, file: ScanFile, rig: Any) -> np.ndarray:
-        """Read a photograph of a rig by hand, or of a calibration; AcquisitionError as `acquire`."""
+        """Read a photograph taken by hand or of a calibration; AcquisitionError as in `acquire`."""
         if file.shot is None:
             image = ArrayLog(file.path.parent).get(file.path.stem)["image"]
             channels = 1 if image.ndim == 2 else 3

@@ -239,7 +239,7 @@ class Viewer(contextlib.AbstractContextManager):
         await response(scope, receive, send)
 
     def _is_allowed(self, scope: Any, token: str, is_reading: bool) -> bool:
-        """Whether token, host and origin are those of the viewer's own page."""
+        """True if token, host and origin are those of the viewer's own page."""
         headers = HTTPConnection(scope).headers
         host = headers.get("host", "")
         origins = headers.getlist("origin")

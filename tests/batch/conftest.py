@@ -25,7 +25,7 @@ WORKERS |= {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0
 
 @pytest.fixture(scope="module")
 def cluster(private_cache) -> Iterator[Client]:
-    """A cluster of two workers, each with the device that ltcl opens by default, and what tests remember."""
+    """A cluster of two workers, each with ltcl's default device and what tests remember."""
     from distributed import Client, LocalCluster  # imported here it mutes no handler of pytest
 
     slowly = dask.config.set(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Work on a cluster of two processes: in order, whatever is killed, and with the bytes of a serial run."""
+"""Work on a cluster of two processes: in order, whatever is killed, bytes as of a serial run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Patterns for many frames: each as good as alone, and the same however often a run was ended early."""
+"""Patterns for many frames: each as good as alone, the same however often a run was ended."""
 
 from __future__ import annotations
 
@@ -271,7 +271,9 @@ import ltcl
 _, matrix, source, out = sys.argv
 T = ltcl.Transport(np.load(matrix), (8, 8))
 say = lambda step, done, total: print(done, flush=True)
-ltcl.batch.compensate_frames(T, source, out, batch=2, gain="auto", resume=True, appearance=True, progress=say)
+ltcl.batch.compensate_frames(
+    T, source, out, batch=2, gain="auto", resume=True, appearance=True, progress=say
+)
 """
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Many scenes, here and on a cluster: what fails, in whatever way, is named, and the rest goes on."""
+"""Many scenes, here and on a cluster: failures are named, and the rest goes on."""
 
 from __future__ import annotations
 

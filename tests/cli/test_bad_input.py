@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bad input to all commands: one line that names it, its exit code and JSON, and nothing is written."""
+"""Bad input to all commands: a line that names it, exit code and JSON; nothing is written."""
 
 from __future__ import annotations
 

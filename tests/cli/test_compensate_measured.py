@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl compensate` with a measured transport: codes for its projector, and the scene under them."""
+"""`ltcl compensate` with a measured transport: its projector's codes, the scene under them."""
 
 from __future__ import annotations
 

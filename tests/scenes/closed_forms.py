@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Form factors known otherwise: closed forms at right angles, random pairs of points, rooms that are closed.
+"""Form factors known otherwise: closed forms at right angles, random points, closed rooms.
 
 Sources: Ehlert and Smith, "View factors for perpendicular and parallel rectangular plates", J.
 Thermophysics and Heat Transfer 7(1), 1993; C-13 and C-15 in Howell, "A catalog of radiation heat
@@ -17,7 +17,7 @@ from tests import reference
 
 
 def parallel(n: int, gap: int) -> np.ndarray:
-    """F of unit squares x and y apart in planes `gap` apart, (n, n): differences of the primitive of C-13."""
+    """F of unit squares x, y apart in planes `gap` apart, (n, n): differences by C-13."""
     x = np.arange(-1.0, n + 1)[:, None]
     y = np.arange(-1.0, n + 1)
     across_x = np.hypot(x, gap)
@@ -28,7 +28,7 @@ def parallel(n: int, gap: int) -> np.ndarray:
 
 
 def perpendicular(n: int) -> np.ndarray:
-    """F of unit squares d apart along a seam, p and q away from it, (n, n, n): C-15, exact below 8."""
+    """F of unit squares d apart along a seam, p and q away, (n, n, n): C-15, exact below 8."""
     d = np.arange(-1.0, n + 1)[:, None, None]
     p = np.arange(n + 1.0)[:, None]
     q = np.arange(n + 1.0)

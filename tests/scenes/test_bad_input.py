@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bad input to scenes: one line that names the argument and its value, before anything is computed."""
+"""Bad input to scenes: a line that names argument and value, before anything is computed."""
 
 from __future__ import annotations
 

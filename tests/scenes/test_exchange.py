@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Exact form factors: closed forms at right angles, closed rooms, parts and wholes, sampling, limits."""
+"""Exact form factors: closed forms at right angles, closed rooms, parts, sampling, limits."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_walls_at_any_angle_agree_with_sampling(walls: tuple[Wall, Wall]) -> Non
 
 
 def test_a_long_wedge_takes_what_its_opening_lets_go() -> None:
-    """Strips of infinite length that share an edge: F = 1 - sin(angle / 2); the ends take 1 / length."""
+    """Strips of infinite length with a shared edge: F = 1 - sin(angle / 2); ends: 1 / length."""
     floors = [
         Wall("floor", FLOOR.corner, (0.0, length, 0.0), FLOOR.down) for length in (200.0, 400.0)
     ]

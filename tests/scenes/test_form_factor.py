@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bounces that store no matrix, and rays past boxes: against their twins, exact matrices and in solves."""
+"""Bounces without a stored matrix, and rays past boxes: twins, exact matrices, solves."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_products_are_those_of_the_exact_matrix(device, walls, n):
     ],
 )
 def test_a_scene_gives_its_operators(device, block):
-    """Against exact form factors times 256 rays a pair: 1.5 % of the norm, and light through them as good."""
+    """Exact form factors times 256 rays a pair agree to 1.5 % of the norm, and so does light."""
     room = box(8, albedo=0.5, occluder=block, device=device)
     l_d = np.random.default_rng(2).random(len(room.area))
     matrices = room.A if room.channels == 3 else (room.A,)

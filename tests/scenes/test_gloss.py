@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Glossy scenes: bins, lobes and beams keep light; eq. 28 and 29; limits; an integral without bins."""
+"""Glossy scenes: bins, lobes, beams keep light; eq. 28 and 29; limits; an integral without bins."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_without_gloss_it_is_the_diffuse_scene_and_reciprocal() -> None:
 
 
 def first_bounce_by_integration(gloss: float, exponent: float) -> float:
-    """Light from left to right wall of `dihedral(1)` to the camera, by rays in closed form, without bins."""
+    """Light from left to right wall of `dihedral(1)` to the camera, by rays, without bins."""
     shine = brdf.lobe(exponent, 16)
     u, v, a, b = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(12).T + 2.0**-13
     radius = np.sqrt(a)

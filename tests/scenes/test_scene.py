@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scenes: walls and albedos, eq. 4, boxes and corners as theory has them, views, light; T on a wrong grid."""
+"""Scenes: walls, albedos, eq. 4, boxes, corners, views, light; T on a wrong grid."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_view_shows_each_wall_where_it_stands(corner: Scene) -> None:
 
 
 def test_a_lamp_follows_cosine_inverse_square_and_the_shadow_of_a_block() -> None:
-    """A thin plate at half the lamp's height: its shadow on the floor is twice as large, and straight."""
+    """A thin plate at half the lamp's height: its shadow is straight and twice as large."""
     plate = Block(corner=(0.4, 0.4, 0.5), size=(0.2, 0.2, 1e-6))
     lamp = (0.5, 0.5, 1.0)
     n = 20
@@ -258,7 +258,7 @@ SCENES = [
 
 @pytest.mark.parametrize("scene", SCENES, ids=["corner", "closed", "dihedral", "trihedral"])
 def test_a_wrong_grid_is_found(scene, tmp_path, caplog):
-    """Half and double the width, rows as columns, all in a row; with texture or noise the right one fits."""
+    """Wrong grids are half and double width, swapped sides, one row; noise fits the right one."""
     transport = scene.transport()
     h, w = transport.grid
     T = transport.to_numpy()

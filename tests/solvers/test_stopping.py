@@ -11,7 +11,7 @@ import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl.operators import Dense, IdentityPlus, as_operator
+from ltcl.operators import Dense, IdentityPlus, as_operator, base
 from ltcl.solvers import Solution, Status
 from tests.problems import enclosure, lambertian, residual
 from tests.solvers.helpers import ITERATIVE, failed, slow_cases, small_blocks
@@ -36,6 +36,20 @@ def test_converged_is_true_of_x_and_met_down_to_rounding(device, method, rtol, r
         # Residuals of cg and bicgstab rise and fall between two readings.
         if method not in ("cg", "bicgstab") and rtol > 1e-6:
             assert all(value > rtol for value in s.residuals[:-1])
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_a_recomputed_residual_forgets_the_way_of_x_before_it(device, monkeypatch, method):
+    """Claims near rounding take few products even without float64 to decide them."""
+    scene = lambertian(64, 0.5, seed=11)
+    S = IdentityPlus(Dense(device, scene.R))
+    b = np.random.default_rng(0).uniform(size=64)
+    options = small_blocks(method)
+    cheap = ltcl.solve(S, b, method, rtol=1e-6, **options)
+    monkeypatch.setattr(base, "CHEAP_PRODUCT_BYTES", 0)
+    s = ltcl.solve(S, b, method, rtol=1e-6, throw=False, **options)
+    assert s.status is Status.CONVERGED
+    assert s.products <= 1.5 * cheap.products
 
 
 @pytest.mark.parametrize("method", ITERATIVE)

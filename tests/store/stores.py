@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Small matrices and stores whose every entry is known, and acquisitions that end at a given moment."""
+"""Small matrices and stores of known entries, and acquisitions that end at a given moment."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def contents(path: Path) -> dict[str, str]:
 
 
 def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -> None:
-    """The steps of an acquisition: begin or resume, write what is missing, `report` every block, finish."""
+    """Acquire: begin or resume, write what is missing, `report` every block, finish."""
     sizes: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5, "channels": 3}
     store = BlockStore.open(path) if path.exists() else make(path, **sizes)
     if not store.final:

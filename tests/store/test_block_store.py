@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Stores: what is written comes back by rows, plain zarr reads it, and damage to any file is noticed."""
+"""Stores: rows come back as written, plain zarr reads them, damage to any file is noticed."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_missing_blocks_are_named_and_written_ones_replaced(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("sigmas", [0.0, 0.5])
 def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
-    """Variances of `fill` are 1, 2, ... in the order of the entries; only the first few are far above."""
+    """Variances of `fill` are 1, 2, ... in order of the entries; only the first are far above."""
     store = make(tmp_path / "T.zarr", **SQUARE, channels=3)
     fill(store, with_variance=True, final=False).finalize(sigmas=sigmas)
     expected = []
@@ -171,6 +171,17 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
         store.extra("../escape", np.ones(2))
     with pytest.raises(InputTypeError, match="words"):
         store.extra("words", np.array(["a"]))
+
+
+def test_update_keeps_what_others_have_changed_since_it_was_opened(tmp_path: Path) -> None:
+    first = make(tmp_path / "T.zarr")
+    first.update(both=0)
+    second = BlockStore.open(first.path)
+    first.update(one=1, both=1)
+    second.update(two=2)
+    expected = {"one": 1, "two": 2, "both": 1}
+    assert second.attributes == expected
+    assert BlockStore.open(first.path).attributes == expected
 
 
 @pytest.mark.parametrize(

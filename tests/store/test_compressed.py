@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files of compressed transports and of inverses: the same bits come back, damage is refused in one line."""
+"""Files of compressed transports and inverses: the same bits come back, damage is refused."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transport files: what is written comes back, others' files are read, what lies is refused in one line."""
+"""Transport files: what is written comes back, others' files are read, lies are refused."""
 
 from __future__ import annotations
 

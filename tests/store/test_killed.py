@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A process that ends at any moment loses nothing that was committed, and going on gives the same store.
+"""A process that ends at any moment loses nothing committed; going on gives the same store.
 
 It ends by SIGKILL or by Ctrl-C at a line of ltcl's code, or is killed from outside at a random
 time. LTCL_KILLS=N in the environment takes N moments of each kind, and 0 every line.
@@ -137,7 +137,7 @@ def test_one_store_is_there_at_every_line_of_replacing_it(
 
 
 def test_writers_at_once(tmp_path: Path) -> None:
-    """Distinct blocks are never lost; one writer of an array wins; after the end all are refused."""
+    """Distinct blocks are never lost; one writer of an array wins; late ones are refused."""
     path = tmp_path / "T.zarr"
     T = stores.transport(12, 60)
     store = stores.make(path, shape=(12, 60), grid=(6, 10), camera_grid=(3, 4))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Damaged files of every format: no crash, no error of a library, no memory for what is only declared.
+"""Damaged files of every format: no crash, no library error, no memory for declared sizes.
 
 LTCL_MUTANTS=4000 in the environment tries as many; by default it is a tenth. They are read in a
 process of its own, ``python -m tests.store.test_mutants FOLDER COUNT``: each file (of a store, one

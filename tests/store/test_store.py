@@ -112,7 +112,7 @@ def test_paths_that_lead_nowhere(tmp_path):
 
 
 def test_a_store_whose_every_entry_is_known_is_dense_elsewhere(tmp_path):
-    """A full store becomes an array: it can be written as .npy, and its first bounce can be exact."""
+    """A full store becomes an array: it can be written as .npy; its first bounce can be exact."""
     T = np.random.default_rng(0).uniform(0.1, 0.2, (3, 6, 6)) + np.eye(6)
     store.save(tmp_path / "T.zarr", Transport(T, (2, 3)))
     exact = store.load(tmp_path / "T.zarr", first_bounce="exact")

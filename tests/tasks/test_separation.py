@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`separate`: each bounce is A^k F p where F is true, and nothing of the picture is lost whatever F is."""
+"""`separate`: each bounce is A^k F p if F is true; no light is lost whatever F is."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A page without a browser: asks the viewer by its protocol, which is written down here once more."""
+"""Page without a browser: it asks the viewer by its protocol, written down here once more."""
 
 from __future__ import annotations
 

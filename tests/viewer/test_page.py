@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The viewer's page in Chromium: every view by clicks and keys, its pixels against Python's result."""
+"""The viewer's page in Chromium: views by clicks and keys, pixels against Python's results."""
 
 from __future__ import annotations
 
@@ -474,9 +474,12 @@ def test_late_compensation_is_not_that_of_another_picture(
         page.goto(f"{viewer.url}#compensate")
         assert late.asked.wait(PATIENCE)
         page.evaluate(
-            """() => { const target = document.getElementById("compensate-target-canvas"); window.drawn = 0;
-            new MutationObserver(() => { window.drawn++; })
-              .observe(target, { attributes: true, attributeFilter: ["data-frame"] }); }"""
+            """() => {
+              const target = document.getElementById("compensate-target-canvas");
+              window.drawn = 0;
+              new MutationObserver(() => { window.drawn++; })
+                .observe(target, { attributes: true, attributeFilter: ["data-frame"] });
+            }"""
         )
         page.locator("#compensate-source").select_option("dim")
         late.come.set()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Hostile requests: none passes, none crashes the viewer, its memory is bounded, and others are served."""
+"""Hostile requests: none passes or crashes the viewer; memory is bounded, others are served."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ from ltcl.viewer import client, server
 from tests.viewer.page import Page, question
 
 GROWTH = 64 << 20  # bytes of memory that a suite of hostile requests may cost
-KEY = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {}==\r\n"
+KEY = (
+    "Upgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {}==\r\n"
+)
 UPGRADE = KEY.format("dGhlIHNhbXBsZSBub25jZQ")
 
 

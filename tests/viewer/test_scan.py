@@ -39,7 +39,10 @@ from tests.viewer.page import Page
 
 PATIENCE = 30.0  # seconds
 BY_HAND = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
-VIRTUAL = '[rig]\nkind = "virtual"\ntransport = "T.npz"\n[acquire]\ngeometry = "aligned"\nstrategy = "pixel"\n'
+VIRTUAL = (
+    '[rig]\nkind = "virtual"\ntransport = "T.npz"\n'
+    '[acquire]\ngeometry = "aligned"\nstrategy = "pixel"\n'
+)
 random = np.random.default_rng(0)
 
 
@@ -195,7 +198,7 @@ def test_batches_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
 
 @contextmanager
 def looking(url: str, slow: float = 0.0, keys: bool = False) -> Iterator[list[np.ndarray]]:
-    """A projector window, slow at drawing, in which somebody may press keys; the codes that it got."""
+    """Codes of a projector window that is slow at drawing, in which somebody may press keys."""
     shown: list[np.ndarray] = []
 
     def look() -> None:

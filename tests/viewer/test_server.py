@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The viewer against dense float64 results by its protocol; turns, projector windows, files, the command."""
+"""The viewer against dense float64 results by its protocol; turns, windows, files, command."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Exchange of light fields between patches: G of A = K G (eq. 4), found by rays, reciprocal and lossless.
+"""Exchange of light fields between patches by rays, G of A = K G (eq. 4): reciprocal, lossless.
 
 A beam is a patch and a bin of directions over it (`brdf`): beam i M + m is bin m of patch i, of N
-patches and M bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x
-projected solid angle) shared by two beams is the same from both ends:
+patches and M bins. All rays that leave beam a fall into beams b that point back, and the etendue E
+(area x projected solid angle) shared by two beams is the same from both ends:
 
     G = diag(1 / e) E,    E = E^T,    e_a = area pi / M    (here without the pi)
 
@@ -35,7 +35,8 @@ from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall
 
 RAYS_AT_ONCE = 1 << 19
-# A ray takes so many bytes at worst, with an entry of its own in E and in the matrices E is made of.
+# A ray takes so many bytes at worst, with an entry of its own in E and in the matrices that make
+# up E.
 BYTES_PER_RAY = 60
 MAX_SCALING_ROUNDS = 1000
 SCALING_TOLERANCE = 1e-9
@@ -44,7 +45,9 @@ SCALING_TOLERANCE = 1e-9
 def exchange(
     walls: Sequence[Wall], n: int, directions: int, rays: int, blocks: Any = (), seed: int = 0
 ) -> scipy.sparse.csr_array:
-    """Light that beams get from beams, (N M, N M), N = n * n * len(walls): incoming = G outgoing radiance.
+    """Light that beams get from beams, G (N M, N M), with N = n * n * len(walls).
+
+    Incoming radiance is G times outgoing radiance.
 
     M `directions` are a square number, `rays` are followed from each beam past boxes (B, 2, 3)
     along the axes, from places that `seed` decides. InputError if a number is out of range,
@@ -93,7 +96,7 @@ def _scaled_exchange(E: Any, etendue: np.ndarray) -> scipy.sparse.csr_array:
 
 
 def _places(patches: int, k: int, rays: int, generator: np.random.Generator) -> np.ndarray:
-    """Points of [0, 1)^4, (patches, k^2, rays, 4): u, v on the patch, then the square of directions.
+    """Points of [0, 1)^4, (patches, k^2, rays, 4): u, v on the patch, the square of directions.
 
     One set of low discrepancy, shifted for each beam (Cranley and Patterson 1976).
     """

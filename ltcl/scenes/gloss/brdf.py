@@ -76,7 +76,7 @@ def from_square(square: np.ndarray) -> np.ndarray:
 
 
 def bins(vectors: np.ndarray, k: int) -> np.ndarray:
-    """Numbers (...) of the bins, of k x k, that unit vectors (..., 3) fall into; undoes `from_square`."""
+    """Numbers (...) of the k x k bins that hold unit vectors (..., 3); undoes `from_square`."""
     x = vectors[..., 0]
     y = vectors[..., 1]
     is_steep = np.abs(x) <= np.abs(y)
@@ -97,7 +97,7 @@ def _cell(place: np.ndarray, k: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Lobe:
-    """The part s p s of a material, between k x k bins and any other directions; mean 1 over the bins.
+    """Part s p s of a material, between k x k bins and other directions; mean 1 over the bins.
 
     `places` (M, points, 3) are the directions over which means of bins are taken, `scale` (M,) is s
     in the bins, and `between` (M, M) is symmetric, with the mean 1 in every row and column.
@@ -109,7 +109,7 @@ class Lobe:
     between: np.ndarray
 
     def towards(self, vectors: np.ndarray) -> np.ndarray:
-        """The lobe between single directions (N, 3), z >= 0, and the bins: (N, M), rows of mean 1."""
+        """Lobe between single directions (N, 3), z >= 0, and the bins: (N, M), rows of mean 1."""
         values = _bin_means(vectors, self.places, self.exponent) * self.scale
         return values / values.mean(axis=1, keepdims=True)
 
@@ -124,7 +124,7 @@ class Lobe:
 
 
 def lobe(exponent: float, k: int) -> Lobe:
-    """The lobe of an exponent over k x k bins; InputError if that is not above 0, or too sharp for the bins.
+    """Lobe of an exponent over k x k bins; InputError if not above 0, or too sharp for the bins.
 
     >>> shine = lobe(20, k=4)
     >>> (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Glossy rooms seen by one camera and lit by one projector: T = P S F Q on the full light field (eq. 28).
+"""Glossy rooms, one camera, one projector: T = P S F Q on the full light field (eq. 28).
 
     S = (I - A)^-1,    A = K G (eq. 4),    T = P F Q + P A F Q + P A^2 F Q + ...    (eq. 29)
 
@@ -45,7 +45,7 @@ MAX_TAIL = 1e-8
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class GlossyScene(Scene):
-    """Patches that reflect into each other as their material, camera and projector say; made by `glossy`.
+    """Glossy patches that reflect into each other, with camera and projector; made by `glossy`.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class GlossyScene(Scene):
 
     @property
     def K(self) -> Any:
-        """Reflection from arriving to leaving light, and F: a bsr_array, or a tuple of three in colour."""
+        """Reflection from arriving to leaving light, and F: a bsr_array, or a tuple of three."""
         reflections = []
         for albedo in self.albedo:
             blocks = self.white.data * albedo[:, None, None]
@@ -100,7 +100,7 @@ class GlossyScene(Scene):
 
     @property
     def A(self) -> Any:
-        """One bounce of the light field, K G (eq. 4), a LinearOperator; a tuple of three in colour."""
+        """Bounce of the light field, K G (eq. 4), a LinearOperator; a tuple of three in colour."""
         G = scipy.sparse.linalg.aslinearoperator(self.G)
         reflections = self.K if self.channels == 3 else (self.K,)
         bounces = [scipy.sparse.linalg.aslinearoperator(K) @ G for K in reflections]
@@ -108,7 +108,10 @@ class GlossyScene(Scene):
 
     @property
     def first_bounce(self) -> np.ndarray:
-        """P F Q, which is diagonal: (N,), or (3, N) in colour. 0 where camera or projector see nothing."""
+        """P F Q, which is diagonal: (N,), or (3, N) in colour.
+
+        It is 0 where camera or projector see nothing.
+        """
         direct = self.P.sum(axis=1) * self.white.data[:, -1, -1] * self.Q.sum(axis=0)
         F = self.albedo * direct
         return F[0] if self.channels == 1 else F
@@ -175,7 +178,7 @@ class GlossyScene(Scene):
     def _pictures(
         self, albedo: np.ndarray, light: np.ndarray, count: int | None = None
     ) -> Iterator[np.ndarray]:
-        """P A^k F Q light (N, k) one after another: `count` indirect ones, or until little is left."""
+        """P A^k F Q light (N, k) in turn: `count` indirect ones, or until little is left."""
         largest_albedo = albedo.max()
         blocks = self.white.data
         arriving = self.Q @ light.astype(np.float64)
@@ -310,7 +313,10 @@ def _with_last_slots(exchange: scipy.sparse.csr_array, slots: int) -> scipy.spar
 
 
 def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, SceneCamera]:
-    """Walls, name and viewer of a room; the viewer of bare walls looks from the camera at their middle."""
+    """Walls, name and viewer of a room.
+
+    The viewer of bare walls looks from the camera at their middle.
+    """
     if isinstance(room, Scene):
         return room.walls, f"glossy {room.name}", room.viewer
     walls = tuple(room) if isinstance(room, Sequence) else ()

@@ -26,8 +26,8 @@ from ltcl.tasks.compensation.inputs import CompensationRequest, check_inputs
 from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
-    join_channels,
     multiply,
+    stack_channels,
     subtract,
 )
 from ltcl.tasks.compensation.result import Compensation, Evidence
@@ -258,7 +258,7 @@ def _solve_channels(request: CompensationRequest, targets: Columns) -> tuple[Sol
 def _projector_light(request: CompensationRequest, direct: Columns) -> Columns:
     """The projector light of each system from the direct light of each channel."""
     light = layout.to_light(direct, request.first_bounce, request.T.mixing)
-    return join_channels(light, len(request.problem.systems))
+    return stack_channels(light, len(request.problem.systems))
 
 
 def _solution_at_gain(solution: Solution, gain: float) -> Solution:
@@ -350,7 +350,7 @@ def _gather_evidence(
         appearance = _read_appearance(problem, queued)
         missing = subtract(target, appearance)
     else:
-        missing = join_channels(residuals, len(problem.systems))
+        missing = stack_channels(residuals, len(problem.systems))
     explained = None
     if bounded.clipped:
         explained = _explained_values(problem, target_norms)

@@ -52,7 +52,8 @@ class GainTrial:
     sine : float
         The error of this light at the gain that suits it best.
     is_settled : bool
-        No further step would improve the light.
+        Another trial at this gain gives nothing better: its error is zero, the steps allowed are
+        used up, or it was solved on the host.
     """
 
     gain: float

@@ -20,7 +20,7 @@ from ltcl.tasks.compensation.problem import (
     CompensationProblem,
     Limits,
     channel_systems,
-    join_channels,
+    stack_channels,
 )
 from ltcl.tasks.requirements import check_inverse, default_rtol, resolve_reference
 from ltcl.transport import frames as layout
@@ -111,7 +111,7 @@ def check_inputs(
     bounds = checks.interval("bounds", bounds)
     checked_gain = check_gain(gain, loss)
     system_count = 1 if T.couples else T.channels
-    masked = join_channels([T.masked] * T.channels, system_count)[0]
+    masked = stack_channels([T.masked] * T.channels, system_count)[0]
     limits = Limits.in_float32(bounds, masked)
     columns, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
     dark = check_background(background, T, shape, columns)
@@ -128,11 +128,11 @@ def check_inputs(
         )
     reference, judging_systems = resolve_reference(T, exact)
     if channel_weights is not None:
-        channel_weights = join_channels(channel_weights, system_count)
+        channel_weights = stack_channels(channel_weights, system_count)
     problem = CompensationProblem(
         systems=channel_systems(reference),
-        desired=join_channels(columns, system_count),
-        background=join_channels(dark, system_count),
+        desired=stack_channels(columns, system_count),
+        background=stack_channels(dark, system_count),
         weights=channel_weights,
         weight_unit=weight_unit,
         limits=limits,

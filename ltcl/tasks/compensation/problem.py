@@ -3,7 +3,7 @@
 
 Where T = S F, A is S and the scale F: columns near 1, so that few products are needed. Elsewhere
 the columns of T are brought to norm 1. Colour channels are one system each, or all of them one
-where T couples them: then (3 N, k) arrays hold channel below channel, as `join_channels` puts them.
+where T couples them: then (3 N, k) arrays hold channel below channel, as `stack_channels` puts them.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.device import Device
+from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
 from ltcl.operators import Operator, ScaledColumns, as_operator
 from ltcl.solvers import SolveSettings
-from ltcl.solvers.bounded import Bounded, minimise, round_inwards
+from ltcl.solvers.bounded import Bounded, minimise
 from ltcl.transport.transport import Transport
 
 # Pictures (M, k) or light (N, k), one array per system.
@@ -219,7 +220,7 @@ def inner_product(a: Columns, b: Columns) -> float:
     return total
 
 
-def join_channels(channels: Columns, systems: int) -> Columns:
+def stack_channels(channels: Columns, systems: int) -> Columns:
     """Arrays (N, k) of each channel as one per system: themselves, or channel below channel."""
     if len(channels) == systems:
         return channels

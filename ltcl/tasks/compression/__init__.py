@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compressed transports: R as few numbers between two bases, with a bound on the loss of a solution."""
+"""Compressed transports: R as few numbers between two bases, with a bound on solution errors."""
 
 from __future__ import annotations
 

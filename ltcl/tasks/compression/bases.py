@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Bases`: the two bases between which R is written, R = W_out^T C W_in, and the weights of columns.
+"""`Bases`: the two bases that R is written between, R = W_out^T C W_in, and weights of columns.
 
 A number c of column l that is dropped costs light of energies e about c^2 e_l. It is weighted by
 sqrt(1 + N e_l), for single pixels and for pictures.
@@ -53,8 +53,8 @@ def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
             filters(name.removesuffix(ROWS))
         except InputError as error:
             raise InputError(
-                f"basis is {name!r}; it must be pixels, or an orthonormal wavelet such as haar, db2 "
-                "or db4, with ' rows' for rows alone"
+                f"basis is {name!r}; it must be pixels, or an orthonormal wavelet "
+                "such as haar, db2 or db4, with ' rows' for rows alone"
             ) from error
     return list(names)
 
@@ -120,8 +120,8 @@ class Bases:
     def noise(self, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations of rows and columns of weighted numbers, each within 13 %.
 
-        `variances` (2, N) are of rows and columns of R; pictures of random signs show what the bases
-        make of them.
+        `variances` (2, N) are of rows and columns of R; pictures of random signs show what the
+        bases make of them.
         """
         generator = np.random.default_rng(0)
         signs = generator.choice([-1.0, 1.0], (variances.shape[1], SIGN_PICTURES))
@@ -132,7 +132,7 @@ class Bases:
 
 
 def energies(W: Basis | None, x: np.ndarray) -> np.ndarray:
-    """Mean squares of the coefficients of light x (N, k), k a multiple of `COLUMNS`; None is pixels."""
+    """Mean squares of coefficients of x (N, k), k a multiple of `COLUMNS`; None means pixels."""
     if W is not None:
         x = CoefficientAnalysis(W)(x.astype(np.float32))
     return np.mean(np.square(x, dtype=np.float64), axis=1)

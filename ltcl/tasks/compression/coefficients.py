@@ -2,9 +2,9 @@
 """C = W_out R W_in^T between two bases, without its small numbers.
 
 Where the host has room for all of C, one threshold is taken of it. Else blocks of rows stream
-through W_in, numbers below a first threshold are dropped, and blocks of columns stream through W_out.
-Both bases are orthonormal: the error of R in the Frobenius norm is at most the sum of what both
-passes drop.
+through W_in, numbers below a first threshold are dropped, and blocks of columns stream through
+W_out. Both bases are orthonormal: the error of R in the Frobenius norm is at most the sum of what
+both passes drop.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def quantize(C: scipy.sparse.csr_array, allowance: float) -> Packed:
 
 
 def drop_below(X: Any, threshold: float) -> tuple[scipy.sparse.csr_array, float]:
-    """The numbers of X, dense or CSR, of at least `threshold`, and the sum of squares of the others."""
+    """Numbers of X, dense or CSR, of at least `threshold`, and the sum of squares of the others."""
     if scipy.sparse.issparse(X):
         return _drop_below_sparse(X, threshold)
     counts = [np.zeros(1, np.int64)]
@@ -120,6 +120,8 @@ def threshold_within(frobenius: float, *arrays: np.ndarray, most: float = math.i
 @dataclass(frozen=True, kw_only=True)
 class Coefficients:
     """The numbers of R between two bases of at least `threshold`: R~ = W_out^T core W_in.
+
+    With weights of columns, this R~ is the weighted R; `Bases` takes the weights off again.
 
     `first` is the Frobenius norm of what was dropped between the passes, `second` of what was
     dropped at the end.

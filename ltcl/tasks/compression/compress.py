@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`compress`: a transport on compressed operators, with bounds on the loss of pictures, or of any light.
+"""`compress`: transports as compressed operators, with bounds on the loss of pictures or light.
 
 R of every channel is written between bases in which it is sparse, and small numbers are dropped:
 R~ = R + E.
@@ -69,7 +69,8 @@ def compress(
         see `norm`. "noise" keeps what stands out of `T.noise`, a Transport's, by 3 standard
         deviations; by 1.4 where pictures have most of their light, by 4 where they have none.
     budget : int, optional
-        Bytes that the cores of all channels may take together on the device.
+        Bytes that the cores of all channels may take together on the device. It limits nothing on
+        the way: compression runs to its end, and then raises an error if it needs more.
     norm : "pictures" or "worst"
         Light that the error bound covers, pictures or any; `rtol` limits this error, and the
         result's `error` states it. The error of pictures is the largest loss of 256 fresh random
@@ -163,7 +164,7 @@ def compress(
 
 
 def check_rtol(rtol: Any, least: float) -> float:
-    """Return `rtol`; refuse it before any work where a product in float32 already rounds by as much."""
+    """Return `rtol`; refuse, before any work, one that float32 products exceed by rounding."""
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     if rtol <= least:
         rounding = checks.upwards(least)

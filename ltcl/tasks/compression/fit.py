@@ -95,7 +95,7 @@ class ChannelCompression(Trial):
 
 @dataclass(frozen=True, repr=False)
 class Compression:
-    """How a compressed transport was made; its ``.compression``.
+    """Record of how a compressed transport was made; its ``.compression``.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ class Fit:
         return self.error_bound
 
     def system(self, problem: CompressionProblem) -> IdentityPlus:
-        """S~ as it is handed out, with its errors and the diagonal of R, on a core without a transpose."""
+        """S~ as it is handed out: its errors, the diagonal of R, and a core without a transpose."""
         try:
             diagonal = problem.operator.diagonal()
         except InputError:  # an operator of the user may have none

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Goals of a compression: an error within a tolerance (`ByTolerance`), or the noise of T (`ByNoise`).
+"""Goals of a compression: `ByTolerance` bounds the error, `ByNoise` follows the noise of T.
 
 The dropped numbers have a known Frobenius norm f. Their effect on pictures, or the 2-norm of E, is
-measured, rounding and all: how far below f it lies changes slowly, so that a few measurements find the
-f that is needed (`ThresholdSearch`). Bases are compared on a window.
+measured, rounding and all: how far below f it lies changes slowly, so that a few measurements find
+the f that is needed (`ThresholdSearch`). Bases are compared on a window.
 
-Noise gives coefficients variances (W^2 u)_k (W^2 v)_l. By SURE (squares lost, and twice the variance of
-what remains) c^2 above 2 variances is worth its bytes where the energy e_l of light is large; where
-it is average, N e_l = 1, above 9: 2 + 14 / (1 + N e_l) variances. The basis of least SURE is taken.
+Noise gives coefficients variances (W^2 u)_k (W^2 v)_l. By SURE (squares lost, and twice the
+variance of what remains) c^2 above 2 variances is worth its bytes where the energy e_l of light is
+large; where it is average, N e_l = 1, above 9: 2 + 14 / (1 + N e_l) variances. The basis of least
+SURE is taken.
 """
 
 from __future__ import annotations
@@ -52,8 +53,9 @@ GATHERED_SHARE = 0.7
 # Part of what is allowed that rounding the core may take.
 ROUNDING_SHARE = {"worst": 0.05, "pictures": 0.3}
 
-# On the window: numbers a row beyond which a basis is of no use unless all are kept; times what may
-# be dropped, by which bases are compared; times the numbers of the best basis beyond which one is left.
+# On the window: numbers a row beyond which a basis is of no use unless all are kept; times what
+# may be dropped, by which bases are compared; times the numbers of the best basis beyond which one
+# is left.
 MAX_NUMBERS_PER_ROW = 512
 TRIAL_DROP_FACTOR = 2.0
 MAX_SIZE_RATIO = 3
@@ -81,7 +83,7 @@ class Confirmation:
 
 
 class Goal(ABC):
-    """What a compression has to reach, by a `norm` "pictures" or "worst"."""
+    """Goal of a compression, by a `norm` "pictures" or "worst"."""
 
     norm: str
 
@@ -127,7 +129,7 @@ class ByTolerance(Goal):
         return self.norm == "pictures"
 
     def frobenius(self, inverse: float, pixels: int) -> float:
-        """About the Frobenius norm that may be dropped; for pictures, where all light loses alike."""
+        """Estimate the norm that may be dropped; for pictures, if all light loses alike."""
         allowed = self.rtol / inverse
         return allowed * math.sqrt(pixels) if self.is_of_pictures else allowed
 
@@ -269,7 +271,7 @@ class _Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class ToleranceFitting:
-    """The search for R~ of fewest bytes in some bases, with a solution error of at most `goal.rtol`."""
+    """Search for R~ of fewest bytes in some bases, with a solution error within `goal.rtol`."""
 
     goal: ByTolerance
     problem: CompressionProblem

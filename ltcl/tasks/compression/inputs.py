@@ -14,7 +14,7 @@ from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.operators import Dense, Host, Operator
-from ltcl.tasks.compression.sources import SourceRows, interreflection, source
+from ltcl.tasks.compression.sources import SourceRows, interreflection_rows, source
 from ltcl.transport import first_bounce as transport_first_bounce
 from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport, check_transport
@@ -93,7 +93,7 @@ def check_inputs(
     noise: Noise | None,
     **reading: Any,
 ) -> CompressionInputs:
-    """Check the input of `compress`: a Transport, operators, or rows; see `source` for `reading`."""
+    """Check the input of `compress`: a Transport, operators or rows; `reading` as in `source`."""
     if isinstance(T, Transport):
         for name, value in {"grid": grid, "first_bounce": first_bounce, "device": device}.items():
             if value is not None:
@@ -147,7 +147,7 @@ def _inputs_of_rows(
     F, *_ = transport_first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
     problems = []
     for channel, f in zip(rows, F, strict=True):
-        R = interreflection(channel, f)
+        R = interreflection_rows(channel, f)
         problems.append(CompressionProblem(R=R, operator=Host(device, R), grid=grid, F=f))
     float32_bytes = 4 * F.size * n
     return CompressionInputs(
@@ -165,7 +165,7 @@ def inputs_of_transport(
     else:
         rows = []
         for matrix, f in zip(T.matrices, F, strict=True):
-            rows.append(interreflection(source("T", matrix, **reading), f))
+            rows.append(interreflection_rows(source("T", matrix, **reading), f))
     nbytes = 4 * T.channels * T.shape[1] ** 2
     try:
         operators: list[Operator] = [S.R for S in T.systems]
@@ -190,7 +190,7 @@ def inputs_of_transport(
 
 
 def _noise_factors(problem: CompressionProblem, noise: Noise, channel: int) -> np.ndarray:
-    """Factors (2, N) of the variance of R = T F^-1 - I; photons count by the mean entry of a column."""
+    """Variance factors (2, N) of R = T F^-1 - I; photons count by the mean entry of a column."""
     F = problem.F
     ones = problem.operator.device.upload(np.ones(len(F), np.float32))
     column_sums = problem.operator.apply_transpose(ones).get().astype(np.float64)

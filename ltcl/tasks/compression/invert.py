@@ -2,8 +2,8 @@
 """`invert`: A = I - S^-1 of a transport, once, so that every further frame costs one product.
 
 R is taken in a basis that both sides share: as it is, or compressed. A is found from its
-coefficients, as coefficients again (`sparse_inverse`). With x_R of R~, e its error, and g that of an
-inverse of S~ = I + R~ or of a compression,
+coefficients, as coefficients again (`sparse_inverse`). With x_R of R~, e its error, and g that of
+an inverse of S~ = I + R~ or of a compression,
 
     ||x~ - x|| <= ||x~ - x_R|| + ||x_R - x|| <= g ||x_R|| + e ||x|| <= (g (1 + e) + e) ||x||,
 
@@ -126,7 +126,7 @@ def invert(
 
 
 class _Rewritten(NamedTuple):
-    """S of every channel, whose R are numbers in one basis, and the number of compressions behind them."""
+    """S of every channel, R as numbers in one basis, and the number of compressions before."""
 
     systems: tuple[Any, ...]
     compressions: int

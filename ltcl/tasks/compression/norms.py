@@ -3,8 +3,8 @@
 
 `ltcl.theory.two_norm` needs an operator that was made without knowledge of its random start. So
 every operator that may be handed out is measured with a start of its own, and bound k may fail with
-probability miss / (k (k + 1)), which add up to `miss`. Starts are pseudo-random and always the same,
-so that results have the same bits.
+probability miss / (k (k + 1)), which add up to `miss`. Starts are pseudo-random and always the
+same, so that results have the same bits.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ PURPOSES = ("compress", "rewrite", "sparse inverse", "invert", "pictures")
 SOLVE_RTOL = 1e-3
 SOLVE_MAXITER = 400
 POWER_STEPS = 8
-# Share of a random vector in the start of a power iteration, so that no invariant subspace keeps it.
+# Share of a random vector in the start of a power iteration, so that no invariant subspace keeps
+# it.
 START_NOISE = 0.1
 
 Starts = Iterator[dict[str, Any]]
@@ -101,15 +102,15 @@ def solve_columns(S: IdentityPlus, X: np.ndarray, rtol: float = SOLVE_RTOL) -> n
     except ConvergenceError as error:
         residual = f"{error.solution.residual:.2g}"
         raise ConvergenceError(
-            f"S is singular, or nearly so: a solve for the norm of its inverse left {residual} of a "
-            "light; check the first bounce",
+            f"S is singular, or nearly so: a solve for the norm of its inverse left {residual} "
+            "of a light; check the first bounce",
             error.solution,
         ) from None
     return np.asarray(solution.x, np.float64)
 
 
 def estimate_norm(A: Any, start: np.ndarray | None = None) -> tuple[float, np.ndarray]:
-    """||A||_2 from below, by power iteration on the host, and the vector, a start for similar matrices."""
+    """||A||_2 from below, by power iteration on the host, and the vector, to start others from."""
     A_transposed = A.T
     norm = 0.0
     v = np.random.default_rng(0).standard_normal(A.shape[1])

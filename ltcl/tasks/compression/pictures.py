@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Losses of pictures by a compression R~ = R + E, of random pictures of four kinds.
 
-Light x loses ||E x|| / ||S x|| of its appearance S x = T p, and ||S~^-1 E x|| / ||x|| as a solution
-of S x = b, direct light or a pattern before F^-1; the larger counts. In turn x = F p of a picture p,
-and x = S~^-1 b, the light that makes the scene look like b.
+Light x loses ||E x|| / ||S x|| of its appearance S x = T p, and ||S~^-1 E x|| / ||x|| as a
+solution of S x = b, direct light or a pattern before F^-1; the larger counts. In turn x = F p of a
+picture p, and x = S~^-1 b, the light that makes the scene look like b.
 
-If a share s of all pictures loses no more than u, n independent ones all do with probability s^n: at
-least the share (1 - confidence)^(1/n) loses no more than the largest of n losses, with this confidence
-and whatever the distribution of losses is; with equal numbers of each kind, too, as no product of
-shares is above the power of their mean.
+If a share s of all pictures loses no more than u, n independent ones all do with probability s^n:
+at least the share (1 - confidence)^(1/n) loses no more than the largest of n losses, with this
+confidence and whatever the distribution of losses is; with equal numbers of each kind, too, as no
+product of shares is above the power of their mean.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def draw(grid: tuple[int, int], count: int, random: np.random.Generator) -> np.n
 
 
 def _spectrum(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """A picture of amplitudes 1 / f^a, a = 0.8 to 1.4, and log-normal values as of natural light."""
+    """Picture of amplitudes 1 / f^a, a = 0.8 to 1.4, and log-normal values like natural light."""
     y = np.fft.fftfreq(grid[0])[:, None]
     x = np.fft.rfftfreq(grid[1])
     f = np.maximum(np.hypot(y, x), 0.5 / max(grid))
@@ -114,7 +114,7 @@ def _spectrum(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
 
 
 def _edges(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """Straight-edged surfaces of random grey and any direction, the later in front of the earlier."""
+    """Straight-edged surfaces of random grey and direction, later ones in front of earlier ones."""
     y, x = np.mgrid[: grid[0], : grid[1]]
     picture = np.full(grid, random.random())
     for _ in range(random.integers(1, 24)):
@@ -128,7 +128,7 @@ def _edges(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
 
 
 def _strokes(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """Lines of upright and level strokes, 1 or 2 pixels wide, as text: white on black, or dark on white."""
+    """Lines of upright and level strokes, 1 or 2 pixels wide, like text: white or dark."""
     letters = np.zeros(grid)
     step = int(random.integers(4, 9))
     for top in range(int(random.integers(step)), grid[0], step + 2):
@@ -144,7 +144,7 @@ def _strokes(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
 
 
 def _patch(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """One lit rectangle, of a single pixel in half of all pictures, and no other light."""
+    """Lit rectangle, a single pixel in half of all pictures, and no other light."""
     picture = np.zeros(grid)
     is_single_pixel = random.random() < 0.5
     if is_single_pixel:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`SourceRows`: a matrix by its rows, a block at a time, read here or on the workers of a cluster."""
+"""`SourceRows`: a matrix by its rows, in blocks that are read here or by workers of a cluster."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BlockWork = Callable[[slice, np.ndarray, Any], Any]
 
 
 class SourceRows(scipy.sparse.linalg.LinearOperator):
-    """A matrix (M, N) by its rows, of which memory holds a few; products read all of them, on the host.
+    """Matrix (M, N) by its rows, of which memory holds a few; products read all, on the host.
 
     Parameters
     ----------
@@ -81,7 +81,10 @@ class SourceRows(scipy.sparse.linalg.LinearOperator):
         value: Callable[[], Any] = lambda: None,
         dtype: Any = np.float32,
     ) -> Iterator[Any]:
-        """`work(place, rows, value())` of all blocks that fit into `memory`, in order, here or on workers."""
+        """Yield `work(place, rows, value())` of all blocks that fit into `memory`, in order.
+
+        It runs here or on workers.
+        """
         size = rows_at_once(self.shape[1], self.memory)
         is_fetched_there = self.workers_fetch or self.client is None
         task = _BlockTask(
@@ -115,7 +118,7 @@ class SourceRows(scipy.sparse.linalg.LinearOperator):
         return list(cut(self.shape[0], rows))
 
     def diagonal(self) -> np.ndarray:
-        """The main diagonal, (min(M, N),) float64, not rounded: a first bounce may be made of it."""
+        """Main diagonal, (min(M, N),) float64, not rounded: a first bounce may be made of it."""
 
         def work(place: slice, rows: np.ndarray, value: Any) -> np.ndarray:
             return rows.diagonal(place.start).copy()
@@ -246,8 +249,11 @@ def _can_workers_fetch(client: Any, matrix: Any) -> bool:
     return False
 
 
-def interreflection(T: SourceRows, F: np.ndarray) -> SourceRows:
-    """R = T F^-1 - I by rows, in float64 and rounded once; the column of a masked pixel, F = 0, is 0."""
+def interreflection_rows(T: SourceRows, F: np.ndarray) -> SourceRows:
+    """R = T F^-1 - I by rows, computed in float64 and rounded once.
+
+    The column of a masked pixel, F = 0, is 0.
+    """
     is_lit = F > 0
     divisor = np.where(is_lit, F, np.inf)
     make_T = T.make

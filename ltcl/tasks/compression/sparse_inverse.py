@@ -56,7 +56,8 @@ DENSE_MATRICES = 5
 # 2 N^3 multiplications of a dense inverse move 16 bytes for each 64; those of 6 sparse products 16
 # each. Elimination is faster where N^3 is below so many times the multiplications of one product.
 DENSE_ADVANTAGE = 192.0
-# Room on each side of the spectrum, as a part of it; smallest lower end, as a part of the upper one.
+# Room on each side of the spectrum, as a part of it; smallest lower end, as a part of the upper
+# one.
 SPECTRUM_MARGIN = 0.02
 MIN_LOWER_END = 1e-3
 BISECTION_STEPS = 6
@@ -328,8 +329,8 @@ def _spectral_interval(C: Any) -> tuple[float, float]:
     upper = 1.0 + _outermost(C, "LR")
     if not lower > 0.0:
         raise InputError(
-            f"S = I + C has an eigenvalue of real part {lower:.3g}; all must be above 0, as of every "
-            "scene, where memory is too small for elimination: check the first bounce"
+            f"S = I + C has an eigenvalue of real part {lower:.3g}; all must be above 0, "
+            "as of every scene, where memory is too small for elimination: check the first bounce"
         )
     margin = SPECTRUM_MARGIN * (upper - lower)
     widened_lower = max(lower - margin, lower / 2.0, MIN_LOWER_END * upper)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ThresholdSearch`: the search for the largest norm that may be dropped, apart from what it measures."""
+"""`ThresholdSearch` for the largest norm that may be dropped, apart from what it measures."""
 
 from __future__ import annotations
 

@@ -52,8 +52,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     Examples
     --------
     >>> import ltcl, numpy
-    >>> from ltcl.tasks.requirements import check_progress
-    from ltcl.transport.noise import Noise
+    >>> from ltcl.transport.noise import Noise
     >>> exact = ltcl.scenes.dihedral(8, albedo=0.6).transport().to_numpy()
     >>> error = 0.001 * numpy.random.default_rng(0).standard_normal(exact.shape)
     >>> T = ltcl.Transport(exact + error, (8, 16), noise=Noise.uniform(exact.shape, 0.001))

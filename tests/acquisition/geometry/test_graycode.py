@@ -52,7 +52,7 @@ def test_a_pixel_on_an_edge_lies_between_its_two_columns(n):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_rows_do_not_continue_in_the_next_row(turned):
-    """In two columns the last pixel of a row and the first of the next differ by one, too."""
+    """The last pixel of a row and the first of the next differ by one, too, in two columns."""
     code = GrayCode((6, 2))
     x, y = code.decode([p[:, ::-1] if turned else p for p in code.patterns()])
     np.testing.assert_array_equal(x.right, [[0.5, np.nan]] * 6)

@@ -230,7 +230,7 @@ def test_only_ratios_of_weights_count(T, scale):
 
 @pytest.mark.parametrize("scale", [1e-45, 1e-29, 1e29, 1e45])
 def test_light_is_right_in_any_unit_or_refused(device, scale):
-    """Pattern, error and certificate of a picture outside the numbers of float32 would be anything."""
+    """Pattern, error and certificate of a picture beyond float32 would be meaningless."""
     desired = picture(random.uniform(0.0, 1.6, GRID))
     root = np.sqrt(scale)
     arguments = {"bounds": (0.0, root), "rtol": 1e-4}

@@ -153,7 +153,7 @@ def test_weights_allow_a_larger_gain(T):
 @pytest.mark.parametrize("loss", [None, 1e-3, 0.05])
 @pytest.mark.parametrize("camera", [(2, 5), (5, 7), (6, 7)])
 def test_fewer_and_more_camera_than_projector_pixels(device, camera, loss):
-    """Many patterns make one picture, so that certificates take thousands of steps on the device."""
+    """Many patterns make one picture, so certificates take thousands of steps on the device."""
     rng = np.random.default_rng(119)
     rows, columns = camera
     matrix = rng.normal(size=(rows * columns, 36))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compression by the workers of a Dask cluster, two processes on loopback: the numbers of the serial one."""
+"""Compression by two workers of a Dask cluster on loopback: the numbers of the serial one."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def test_a_tolerance_below_float32_is_refused_with_what_it_does(rtol, basis):
     ],
 )
 def test_the_errors_of_a_pixel_whose_A_is_dropped(S, first, least, most):
-    """Solutions of T = S are said to be off by `first` before; A = 1 - 1 / S is below the threshold."""
+    """Solutions are said to be off by `first` before; A = 1 - 1 / S is below the threshold."""
     R = Dense(ltcl.open_device(), [[S - 1.0]])
     T = ltcl.Transport(
         ScaledColumns(IdentityPlus(R, solution_error=first), np.ones(1)), (1, 1), [1.0]
