@@ -66,7 +66,7 @@ def make_scenes(data: Path, options: Options) -> dict[str, Any]:
     """Make the scenes that `data` lacks, and return facts of all its scenes."""
     facts: dict[str, Any] = {}
     names = ("coloured",) if options.smoke else dataset.NAMES
-    present = dataset.found(data)
+    present = dataset.find_scenes(data)
     missing = [name for name in names if name not in present]
     why_not_traced = tracing.unavailable() if missing else ""
     if why_not_traced:
@@ -81,7 +81,7 @@ def make_scenes(data: Path, options: Options) -> dict[str, Any]:
             dataset.trace(data / name, name, size=12, paths=256, samples=256)
         else:
             dataset.trace(data / name, name, size=options.arguments.size)
-    scenes = dataset.found(data)
+    scenes = dataset.find_scenes(data)
     if not scenes:
         raise SystemExit(f"{data} has no scenes, and none can be traced: {why_not_traced}")
     for name, scene in scenes.items():
@@ -122,7 +122,7 @@ def main() -> None:
         if data is None:
             data = Path(scratch)
         facts = make_scenes(data, options)
-        for name, scene in dataset.found(data).items():
+        for name, scene in dataset.find_scenes(data).items():
             results[name] = score(scene, name, methods)
     table = Table("scene", "method", *scoring.COLUMNS, *scoring.OTHERS)
     for name, scores in results.items():

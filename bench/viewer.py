@@ -21,6 +21,9 @@ import sys
 import tempfile
 import time
 import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,237 +45,344 @@ from ltcl.show.player import Pace, play
 from ltcl.show.window import Window
 from ltcl.viewer.answers import ViewerScene
 
-FLAGS = ["--headless=new", "--remote-debugging-port=0", "--window-size=1280,900", "--no-sandbox"]
-FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
-FLAGS += ["--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"]
-PROBE_MS, PAINT, SLIDE, PLAY, FIRST = (
-    60.0,
-    25.0,
-    30.0,
-    24.0,
-    3.0,
-)  # targets; frames a second, seconds
-SMALL_MS, FPS, PATIENCE = 20.0, 30.0, 60.0
-MOVES, FRAMES, STARTS = 100, 150, 3
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = (
+    "--headless=new",
+    "--remote-debugging-port=0",
+    "--window-size=1280,900",
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-sync",
+    "--disable-component-update",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+)
+# Seconds that the browser may take to start, and a page to show an element.
+TIMEOUT = 60.0
+
+# Pixels along a wall of both transports.
+LARGE = 256
+SMALL = 48
+# Largest milliseconds of the probe, least frames a second, and largest seconds of the first picture.
+PROBE_MS = 60.0
+SMALL_PROBE_MS = 20.0
+PAINTING_RATE = 25.0
+SLIDER_RATE = 30.0
+FILM_RATE = 24.0
+SMALL_RATE = 1e3 / SMALL_PROBE_MS
+FIRST_PICTURE_SECONDS = 3.0
+
+# What is measured: movements of the probe, seconds of painting, frames of a film, starts.
+MOVES = 100
+TOUCH_SECONDS = 5.0
+FILM_FRAMES = 150
+FILM_FPS = 30.0
+STARTS = 3
+
+# Milliseconds from each of `count` movements over the projector's picture to a column of T.
 PROBE = """async (count) => {
-  const source = document.getElementById("probe-projector-canvas"), box = source.getBoundingClientRect();
-  const target = document.getElementById("probe-camera-canvas"), times = [];
+  const source = document.getElementById("probe-projector-canvas");
+  const box = source.getBoundingClientRect();
+  const target = document.getElementById("probe-camera-canvas");
+  const times = [];
   for (let i = 0; i < count; i++) {
     const begun = performance.now();
     const drawn = new Promise((end) => {
-      const observer = new MutationObserver(() => { observer.disconnect(); end(performance.now()); });
+      const observer = new MutationObserver(() => {
+        observer.disconnect();
+        end(performance.now());
+      });
       observer.observe(target, { attributes: true, attributeFilter: ["data-frame"] });
     });
     const [x, y] = [(i * 0.37) % 1, (i * 0.61) % 1];
-    const place = { clientX: box.left + box.width * x, clientY: box.top + box.height * y };
-    source.dispatchEvent(new PointerEvent("pointermove", { ...place, pointerId: 1, bubbles: true }));
+    source.dispatchEvent(new PointerEvent("pointermove", {
+      clientX: box.left + box.width * x,
+      clientY: box.top + box.height * y,
+      pointerId: 1,
+      bubbles: true,
+    }));
     times.push((await drawn) - begun);
     await new Promise((end) => setTimeout(end, 20));
   }
   return times;
 }"""
+# Frames a second while a pattern is painted.
 PAINTING = """async (seconds) => {
-  const pattern = document.getElementById("relight-pattern-canvas"), box = pattern.getBoundingClientRect();
+  const pattern = document.getElementById("relight-pattern-canvas");
+  const box = pattern.getBoundingClientRect();
   const seen = document.getElementById("relight-seen-canvas");
   pattern.setPointerCapture = () => {};
   const point = (kind, x, y) => pattern.dispatchEvent(new PointerEvent(kind, {
-    clientX: box.left + box.width * x, clientY: box.top + box.height * y,
-    pointerId: 1, button: 0, bubbles: true,
+    clientX: box.left + box.width * x,
+    clientY: box.top + box.height * y,
+    pointerId: 1,
+    button: 0,
+    bubbles: true,
   }));
-  const first = Number(seen.dataset.frame), begun = performance.now();
+  const first = Number(seen.dataset.frame);
+  const begun = performance.now();
   point("pointerdown", 0.5, 0.5);
   for (let i = 0; performance.now() - begun < 1000 * seconds; i++) {
     point("pointermove", 0.5 + 0.4 * Math.sin(0.11 * i), 0.5 + 0.4 * Math.sin(0.17 * i));
     await new Promise(requestAnimationFrame);
   }
   point("pointerup", 0.5, 0.5);
-  return (1000 * (Number(seen.dataset.frame) - first)) / (performance.now() - begun);
+  const frames = Number(seen.dataset.frame) - first;
+  return (1000 * frames) / (performance.now() - begun);
 }"""
+# Frames a second while a slider of bounces moves.
 SLIDING = """async (seconds) => {
-  const slider = document.getElementById("bounces-1"), mix = document.getElementById("bounces-mix-canvas");
-  const first = Number(mix.dataset.frame), begun = performance.now();
+  const slider = document.getElementById("bounces-1");
+  const mix = document.getElementById("bounces-mix-canvas");
+  const first = Number(mix.dataset.frame);
+  const begun = performance.now();
   for (let i = 0; performance.now() - begun < 1000 * seconds; i++) {
     slider.value = 1 + 2 * Math.sin(0.1 * i);
     slider.dispatchEvent(new Event("input", { bubbles: true }));
     await new Promise(requestAnimationFrame);
   }
-  return (1000 * (Number(mix.dataset.frame) - first)) / (performance.now() - begun);
+  const frames = Number(mix.dataset.frame) - first;
+  return (1000 * frames) / (performance.now() - begun);
 }"""
+OPEN_TAB = "(view) => document.getElementById(`tab-${view}`).click()"
+HAS_ELEMENT = "(selector) => Boolean(document.querySelector(selector))"
+
+
+def wait_until(condition: Callable[[], bool], message: str, pause: float) -> None:
+    """Check a condition until it holds, or raise TimeoutError."""
+    end = time.monotonic() + TIMEOUT
+    while not condition():
+        if time.monotonic() > end:
+            raise TimeoutError(message)
+        time.sleep(pause)
+
+
+def find_browser() -> str:
+    """The installed browser; if there is none, the name that the error then shows."""
+    for name in BROWSERS:
+        program = shutil.which(name)
+        if program is not None:
+            return program
+    return "chromium"
 
 
 class Chromium(contextlib.AbstractContextManager):
     """One page of a browser without a window."""
 
     def __init__(self) -> None:
-        names = ("chromium", "chromium-browser", "google-chrome")
-        program = next(filter(None, map(shutil.which, names)), "chromium")
-        self._closed = contextlib.ExitStack()
-        folder = Path(
-            self._closed.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
-        )
-        words = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
-        process = subprocess.Popen(words, stderr=subprocess.DEVNULL)  # noqa: S603 - ours
-        self._closed.callback(process.wait)
-        self._closed.callback(process.terminate)
-        end, port = time.monotonic() + PATIENCE, folder / "DevToolsActivePort"
-        while not (port.exists() and port.read_text().count("\n")):
-            if time.monotonic() > end:
-                raise TimeoutError(f"{program} does not start")
-            time.sleep(0.05)
-        with urllib.request.urlopen(
-            f"http://127.0.0.1:{port.read_text().split()[0]}/json/list"
-        ) as answer:
-            url = next(
-                page["webSocketDebuggerUrl"] for page in json.load(answer) if page["type"] == "page"
-            )
-        self._socket, self._asked = self._closed.enter_context(connect(url, max_size=None)), 0
+        self._resources = contextlib.ExitStack()
+        temporary = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        folder = Path(self._resources.enter_context(temporary))
+        self._start(folder)
+        url = self._page_url(folder)
+        self._socket = self._resources.enter_context(connect(url, max_size=None))
+        self._requests = 0
+
+    def _start(self, folder: Path) -> None:
+        """Start the browser, which is ended with the other resources."""
+        program = find_browser()
+        command = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)  # noqa: S603 - ours
+        self._resources.callback(process.wait)
+        self._resources.callback(process.terminate)
+        port = folder / "DevToolsActivePort"
+
+        def has_started() -> bool:
+            return port.exists() and "\n" in port.read_text()
+
+        wait_until(has_started, f"{program} does not start", 0.05)
+
+    def _page_url(self, folder: Path) -> str:
+        """The socket of the browser's page."""
+        port = (folder / "DevToolsActivePort").read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            targets = json.load(answer)
+        pages = [target for target in targets if target["type"] == "page"]
+        return pages[0]["webSocketDebuggerUrl"]
 
     def __exit__(self, *_: object) -> None:
-        self._closed.close()
+        self._resources.close()
 
-    def _ask(self, method: str, **asked: Any) -> dict[str, Any]:
-        self._asked += 1
-        self._socket.send(json.dumps({"id": self._asked, "method": method, "params": asked}))
-        while (found := json.loads(self._socket.recv())).get("id") != self._asked:
-            pass
-        return found["result"]
+    def _request(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a request of the protocol and wait for its answer; events between are dropped."""
+        self._requests += 1
+        number = self._requests
+        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv())
+            if answer.get("id") == number:
+                return answer["result"]
 
     def open(self, url: str) -> None:
         """Go to a page, and wait until it has drawn something and asks nothing any more."""
-        self._ask("Page.navigate", url=url)
+        self._request("Page.navigate", url=url)
         if "#" not in url:
             self.wait("#probe-camera-canvas[data-frame]")
 
     def evaluate(self, function: str, *arguments: Any) -> Any:
-        """What a JavaScript function of the page returns, awaited."""
-        call = f"({function})({', '.join(map(json.dumps, arguments))})"
-        found = self._ask(
+        """The awaited result of a JavaScript function in the page."""
+        values = ", ".join(map(json.dumps, arguments))
+        call = f"({function})({values})"
+        answer = self._request(
             "Runtime.evaluate", expression=call, awaitPromise=True, returnByValue=True
         )
-        if "exceptionDetails" in found:
-            raise RuntimeError(found["exceptionDetails"])
-        return found["result"].get("value")
+        if "exceptionDetails" in answer:
+            raise RuntimeError(answer["exceptionDetails"])
+        return answer["result"].get("value")
 
     def wait(self, *selectors: str) -> None:
-        """Until the page has these elements."""
-        end = time.monotonic() + PATIENCE
+        """Wait until the page has these elements."""
         for selector in selectors:
-            while not self.evaluate("(s) => Boolean(document.querySelector(s))", selector):
-                if time.monotonic() > end:
-                    raise TimeoutError(selector)
-                time.sleep(0.01)
+            has_element = partial(self.evaluate, HAS_ELEMENT, selector)
+            wait_until(has_element, selector, 0.01)
 
 
-def transport(given: Options, n: int) -> ltcl.Transport:
-    """T of a corner of n x 2 n pixels, made or kept."""
+def transport(options: Options, n: int) -> ltcl.Transport:
+    """T of a corner of n x 2 n pixels, made, or kept from an earlier run."""
+    if options.smoke:
+        return make_transport(options, n)
     file = tuning.make_folder() / f"bench-viewer-{n}.npz"
-    if not file.exists() or given.smoke:
-        T = resolution131k.build(given, Bounce(n, resolution131k.REFERENCE)).lighter
-        if given.smoke:
-            return T
-        ltcl.save(file, T)
+    if not file.exists():
+        ltcl.save(file, make_transport(options, n))
     return ltcl.load(file)
+
+
+def make_transport(options: Options, n: int) -> ltcl.Transport:
+    rows = Bounce(n, resolution131k.REFERENCE)
+    return resolution131k.build(options, rows).lighter
 
 
 def first_picture(page: Chromium, T: ltcl.Transport, folder: Path) -> float:
     """Seconds from the command until a column of T is drawn."""
-    ltcl.save(folder / "T.npz", T)
-    begun = time.perf_counter()
-    words = [sys.executable, "-m", "ltcl", "view", str(folder / "T.npz"), "--no-browser"]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:  # noqa: S603 - ours
-        page.open(next(line for line in process.stderr or [] if line.startswith("http")).split()[0])
-        spent = time.perf_counter() - begun
+    file = folder / "T.npz"
+    ltcl.save(file, T)
+    start = time.perf_counter()
+    command = [sys.executable, "-m", "ltcl", "view", str(file), "--no-browser"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:  # noqa: S603 - ours
+        page.open(printed_url(process))
+        spent = time.perf_counter() - start
         process.terminate()
     return spent
 
 
-def touch(page: Chromium, T: ltcl.Transport, given: Options) -> tuple[float, float, float, float]:
-    """The 95th percentile of ms from pointer to column; frames a second of painting and of sliders.
+def printed_url(process: subprocess.Popen[str]) -> str:
+    """The address that the viewer prints when it serves."""
+    for line in process.stderr or []:
+        if line.startswith("http"):
+            return line.split()[0]
+    raise SystemExit("the viewer ended without an address")
 
-    And the viewer's own ms of a processor for a column, which other work on the machine hardly
-    changes.
+
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """Answers of the viewer to a hand.
+
+    The 95th percentile of milliseconds from pointer to column; frames a second of painting and of
+    sliders; and the viewer's own milliseconds of a processor for a column, which other work on the
+    machine hardly changes.
     """
-    seconds, moves = (0.5, 5) if given.smoke else (5.0, MOVES)
+
+    probe_ms: float
+    painting_rate: float
+    slider_rate: float
+    column_cpu_ms: float
+
+
+def touch(page: Chromium, T: ltcl.Transport, options: Options) -> Touch:
+    """Move pointer and sliders in the viewer."""
+    duration = 0.5 if options.smoke else TOUCH_SECONDS
+    moves = 5 if options.smoke else MOVES
+
+    def measure_rate(view: str, drawn: str, script: str) -> float:
+        page.evaluate(OPEN_TAB, view)
+        page.wait(drawn, "body[data-state=ready]")
+        return page.evaluate(script, duration)
+
     with ltcl.view(T, {"landscape": landscape(*T.grid)}, open_browser=False) as viewer:
         page.open(viewer.url)
         page.wait("body[data-state=ready]")
+        # Warms up.
         page.evaluate(PROBE, 3)
-        begun = time.process_time()
+        start = time.process_time()
         times = page.evaluate(PROBE, moves)
-        busy = 1e3 * (time.process_time() - begun) / moves
-        rates = []
-        for view, drawn, script in (
-            ("relight", "#relight-seen-canvas[data-frame]", PAINTING),
-            ("bounces", "#bounces-1", SLIDING),
-        ):
-            page.evaluate("(view) => document.getElementById(`tab-${view}`).click()", view)
-            page.wait(drawn, "body[data-state=ready]")
-            rates.append(page.evaluate(script, seconds))
-    return float(np.percentile(times, 95)), *rates, busy
-
-
-def playing(page: Chromium, T: ltcl.Transport, folder: Path, given: Options) -> Pace:
-    """What is reached with a film and a kept inverse."""
-    frames = (video.TO_LINEAR[codes] for codes in video.film(T, 10 if given.smoke else FRAMES))
-    write_video(folder / "film.mkv", frames, FPS)
-    rules: Any = {"rtol": video.RTOL, "inverse": ltcl.invert(T, video.RTOL)}
-    with Window("film", open_browser=False) as window:
-        page.open(f"{window.url}#projector")
-        return play(
-            ViewerScene(T, "T", {}, None),
-            open_frames(folder / "film.mkv"),
-            window,
-            1.0,
-            nothing,
-            **rules,
+        cpu_ms = 1e3 * (time.process_time() - start) / moves
+        return Touch(
+            probe_ms=float(np.percentile(times, 95)),
+            painting_rate=measure_rate("relight", "#relight-seen-canvas[data-frame]", PAINTING),
+            slider_rate=measure_rate("bounces", "#bounces-1", SLIDING),
+            column_cpu_ms=cpu_ms,
         )
 
 
-def nothing(*_: Any, **__: Any) -> None:
-    """Progress that is not drawn."""
+def play_film(page: Chromium, T: ltcl.Transport, folder: Path, options: Options) -> Pace:
+    """The pace of a film with a kept inverse."""
+    film = folder / "film.mkv"
+    codes = video.film(T, 10 if options.smoke else FILM_FRAMES)
+    frames = (video.TO_LINEAR[frame] for frame in codes)
+    write_video(film, frames, FILM_FPS)
+    rules: Any = {"rtol": video.RTOL, "inverse": ltcl.invert(T, video.RTOL)}
+    scene = ViewerScene(T, "T", {}, None)
+    with Window("film", open_browser=False) as window:
+        page.open(f"{window.url}#projector")
+        return play(scene, open_frames(film), window, 1.0, ignore_progress, **rules)
 
 
-def below(text: str, value: float, most: float, unit: str) -> Claim:
-    """The less, the better."""
+def ignore_progress(*_: Any, **__: Any) -> None:
+    """Draw no progress."""
+
+
+def at_most(text: str, value: float, most: float, unit: str) -> Claim:
     return Claim(text, f"{value:.3g} {unit}", f"at most {most:g} {unit}", value <= most)
 
 
-def rate(text: str, value: float, least: float) -> Claim:
-    """Of frames a second: the more, the better."""
-    return Claim(text, f"{value:.3g} frames/s", f"at least {least:g} frames/s", value >= least)
+def at_least(text: str, rate: float, least: float) -> Claim:
+    return Claim(text, f"{rate:.3g} frames/s", f"at least {least:g} frames/s", rate >= least)
+
+
+def format_grid(T: ltcl.Transport) -> str:
+    h, w = T.grid
+    return f"{h} x {w}"
 
 
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    large, small = (transport(given, n) for n in ((8, 4) if given.smoke else (256, 48)))
+    options = parse_options(__doc__)
+    large = transport(options, 8 if options.smoke else LARGE)
+    small = transport(options, 4 if options.smoke else SMALL)
+    starts = 1 if options.smoke else STARTS
     with tempfile.TemporaryDirectory() as name, Chromium() as page:
-        probe, painting, sliding, busy = touch(page, large, given)
-        small_probe, small_painting, small_sliding, small_busy = touch(page, small, given)
-        starts = [
-            first_picture(page, large, Path(name)) for _ in range(1 if given.smoke else STARTS)
-        ]
-        film = playing(page, large, Path(name), given)
-    first, often = float(np.median(starts)), 1e3 / SMALL_MS
-    size, small_size = ("{} x {}".format(*T.grid) for T in (large, small))
+        folder = Path(name)
+        large_touch = touch(page, large, options)
+        small_touch = touch(page, small, options)
+        first = np.median([first_picture(page, large, folder) for _ in range(starts)])
+        film = play_film(page, large, folder, options)
+    size = format_grid(large)
+    small_size = format_grid(small)
+    film_text = f"a film of {FILM_FPS:g} frames/s, {size}"
+    first_text = f"first picture after the command, {size}"
+    percentile = "probe, 95th percentile"
     claims = [
-        below(f"probe, 95th percentile, {size}", probe, PROBE_MS, "ms"),
-        rate(f"painting, {size}", painting, PAINT),
-        rate(f"sliders of bounces, {size}", sliding, SLIDE),
-        rate(f"a film of {FPS:g} frames/s, {size}", film.frames_per_second, PLAY),
-        below(f"first picture after the command, {size}", first, FIRST, "s"),
-        below(f"probe, 95th percentile, {small_size}", small_probe, SMALL_MS, "ms"),
-        rate(f"painting, {small_size}", small_painting, often),
-        rate(f"sliders of bounces, {small_size}", small_sliding, often),
+        at_most(f"{percentile}, {size}", large_touch.probe_ms, PROBE_MS, "ms"),
+        at_least(f"painting, {size}", large_touch.painting_rate, PAINTING_RATE),
+        at_least(f"sliders of bounces, {size}", large_touch.slider_rate, SLIDER_RATE),
+        at_least(film_text, film.frames_per_second, FILM_RATE),
+        at_most(first_text, float(first), FIRST_PICTURE_SECONDS, "s"),
+        at_most(f"{percentile}, {small_size}", small_touch.probe_ms, SMALL_PROBE_MS, "ms"),
+        at_least(f"painting, {small_size}", small_touch.painting_rate, SMALL_RATE),
+        at_least(f"sliders of bounces, {small_size}", small_touch.slider_rate, SMALL_RATE),
     ]
+    cpu_text = "the viewer's ms of a processor for a column"
     facts = {
         "bytes of T": large.nbytes,
-        f"the viewer's ms of a processor for a column, {size}": busy,
-        f"the viewer's ms of a processor for a column, {small_size}": small_busy,
+        f"{cpu_text}, {size}": large_touch.column_cpu_ms,
+        f"{cpu_text}, {small_size}": small_touch.column_cpu_ms,
         "frames of the film dropped": film.dropped,
         "latency of the film, s": film.latency,
         "load of the machine": os.getloadavg()[0],
     }
-    figures.conclude(given, "The viewer in Chromium", [] if given.smoke else claims, facts, Figure)
+    listed = [] if options.smoke else claims
+    figures.conclude(options, "The viewer in Chromium", listed, facts, Figure)
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def frames_below_solver(frame: FrameType) -> int:
 
 
 class Length(NamedTuple):
-    """How long a way is, how long it may be, and how long the design wants it."""
+    """Length of a way: as it is, as it may be, and as the design wants it."""
 
     files: list[str]
     length: int

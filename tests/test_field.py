@@ -32,7 +32,7 @@ def scenes(modules: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     data = tmp_path_factory.mktemp("data")
     for name in ("corner", "coloured"):
         modules["dataset"].simulate(data / name, name, 4)
-    return modules["dataset"].found(data)
+    return modules["dataset"].find_scenes(data)
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A benchmark for inverse light transport: scenes of known bounces, and how a method is judged on them.
+"""A benchmark for inverse light transport: scenes of known bounces, and scores of methods on them.
 
 `tracing` traces T by bounces with Mitsuba 3, `dataset` makes the files of a scene, `scoring` runs
-anybody's method and judges what it writes, `baselines` are such methods. README.md tells the
+anybody's method and judges its results, `baselines` are such methods. README.md describes the
 formats.
 """

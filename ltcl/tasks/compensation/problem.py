@@ -3,7 +3,8 @@
 
 Where T = S F, A is S and the scale F: columns near 1, so that few products are needed. Elsewhere
 the columns of T are brought to norm 1. Colour channels are one system each, or all of them one
-where T couples them: then (3 N, k) arrays hold channel below channel, as `stack_channels` puts them.
+where T couples them: then (3 N, k) arrays hold channel below channel, as `stack_channels` puts
+them.
 """
 
 from __future__ import annotations
