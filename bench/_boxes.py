@@ -114,7 +114,7 @@ class Race:
 
     @property
     def outcome(self) -> str:
-        """How Jacobi ended."""
+        """End of Jacobi's iterations, in words."""
         end = f"1 % in {self.steps()} iterations"
         if self.diverged:
             end = "diverges"

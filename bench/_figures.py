@@ -34,7 +34,7 @@ SIZE = 400
 
 @dataclass(frozen=True)
 class Claim:
-    """One sentence about a figure, the measured value, and the value it had to have.
+    """A sentence about a figure, the measured value, and the value it had to have.
 
     `differs` says why exact measurement does not confirm a claim of the paper.
     """

@@ -46,7 +46,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: `ratio` says how many times better ours is, `target` is its minimum."""
+    """Comparison: `ratio` says how many times better ours is, `target` is its minimum."""
 
     question: str
     competitor: str

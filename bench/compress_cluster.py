@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compression by workers of one core each: the corner of `resolution131k.py`, by one of them and by two.
+"""Compression by workers of one core each: the corner of `resolution131k.py`, by one and by two.
 
-Dask workers make, transform and threshold blocks of rows, then of the columns that are left. Each
-is bound to a core, with one thread for OpenCL; one is timed after the other, and the numbers must
-have the same bits.
+Dask workers make, transform and threshold blocks of rows, then of the remaining columns. Each is
+bound to a core, with one thread for OpenCL; one is timed after the other, and the numbers must have
+the same bits.
 """
 
 from __future__ import annotations
@@ -24,18 +24,24 @@ from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source
 from resolution131k import MEMORY, REFERENCE, THRESHOLD
 
-SHARE = 0.6  # of the time of one worker, which two may take
+# Largest time of two workers over that of one.
+MAX_SHARE = 0.6
+HOST = "127.0.0.1"
 
 
-def compress(given: Options, rows: Bounce, workers: int) -> tuple[Coefficients, float]:
-    """The numbers of A, and seconds they took."""
-    W, host = CoefficientAnalysis(Wavelet(given.device, rows.grid, "db2")), "127.0.0.1"
-    sizes = {"n_workers": workers, "threads_per_worker": 1, "env": {"POCL_MAX_PTHREAD_COUNT": "1"}}
-    with (
-        LocalCluster(host=host, dashboard_address=f"{host}:0", **sizes) as cluster,
-        Client(cluster) as client,
-    ):
-        for core, address in zip(range(workers), client.scheduler_info()["workers"], strict=True):
+def compress(options: Options, rows: Bounce, workers: int) -> tuple[Coefficients, float]:
+    """Compute the coefficients of A, and the seconds this took."""
+    W = CoefficientAnalysis(Wavelet(options.device, rows.grid, "db2"))
+    cluster = LocalCluster(
+        host=HOST,
+        dashboard_address=f"{HOST}:0",
+        n_workers=workers,
+        threads_per_worker=1,
+        env={"POCL_MAX_PTHREAD_COUNT": "1"},
+    )
+    with cluster, Client(cluster) as client:
+        addresses = client.scheduler_info()["workers"]
+        for core, address in zip(range(workers), addresses, strict=True):
             client.run(os.sched_setaffinity, 0, {core}, workers=[address])
         start = time.perf_counter()
         blocks = source("A", rows, MEMORY, client)
@@ -46,21 +52,29 @@ def compress(given: Options, rows: Bounce, workers: int) -> tuple[Coefficients, 
 
 
 def main() -> None:
-    given = parse_options(__doc__ or "")
-    rows = Bounce(8 if given.smoke else 256, REFERENCE)
-    (one, slow), (two, fast) = (compress(given, rows, workers) for workers in (1, 2))
+    """Run the bench."""
+    options = parse_options(__doc__)
+    n = 256
+    target = 1 / MAX_SHARE
+    if options.smoke:
+        n = 8
+        target = None
+    rows = Bounce(n, REFERENCE)
+    by_one, seconds_of_one = compress(options, rows, workers=1)
+    by_two, seconds_of_two = compress(options, rows, workers=2)
     for name in ("indptr", "indices", "data"):
-        np.testing.assert_array_equal(getattr(one.core, name), getattr(two.core, name))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        first = getattr(by_one.core, name)
+        second = getattr(by_two.core, name)
+        np.testing.assert_array_equal(first, second)
     facts = {
         "pixels": rows.shape[0],
-        "share of the time": fast / slow,
-        "peak memory here, MB": peak,
+        "share of the time": seconds_of_two / seconds_of_one,
+        "peak memory here, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
     row = Row.from_times(
-        "numbers of A", "one worker", slow, fast, "s", None if given.smoke else 1 / SHARE
+        "numbers of A", "one worker", seconds_of_one, seconds_of_two, "s", target=target
     )
-    report(given, "compression by two workers of a core", [row], facts)
+    report(options, "compression by two workers of a core", [row], facts)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compression to what pictures need, judged by a second measurement and by pictures that it never saw.
+"""Compression as far as pictures allow, judged by a second measurement and by unseen pictures.
 
 The case: a box with two blocks, 64 x 64 pixels, path-traced (`scenes.tracing`), so that two
 measurements differ by 19 % in the Frobenius norm of R and by 0.31 % in T p; and a simulated one,
 four walls with a block, exact form factors, entries Poisson counts of as much noise. Then 200
 pictures (parts of a photograph, letters, checkerboards, single pixels) in each of six scenes: the
-largest loss of appearance, direct light and compensating pattern, over what is stated.
+largest loss of appearance, direct light and compensating pattern, over the stated error.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -25,14 +26,31 @@ from ltcl import scenes
 from ltcl.scenes.landscape import landscape
 from scenes import tracing
 
-FROBENIUS, HELD, ACCURATE = 0.19, 200, 1e-4
-PATHS = 10_240  # a camera pixel, for such differences
+# Difference of two measurements, in the Frobenius norm of R.
+FROBENIUS = 0.19
+# Tolerance of the solves of held pictures.
+ACCURATE = 1e-4
+# Paths a camera pixel, for such differences.
+PATHS = 10_240
+# Tolerance, norm, and most bytes a row.
 LIMITS = (
     (0.01, "pictures", 150),
     ("noise", "pictures", 700),
     (0.1, "worst", None),
-)  # bytes a row, at most
+)
 OVER = "worst held picture over stated, "
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """Pixels along a wall of the simulated box and of other scenes, and number of pictures."""
+
+    box: int = 32
+    others: int = 16
+    pictures: int = 200
+
+
+SMOKE_SIZES = Sizes(box=8, others=6, pictures=16)
 
 
 def box(n: int) -> np.ndarray:
@@ -40,111 +58,212 @@ def box(n: int) -> np.ndarray:
     walls = np.arange(4 * n * n).reshape(n, 4, n)
     order = np.block([[walls[:, 0], walls[:, 1]], [walls[:, 2], walls[:, 3]]]).ravel()
     block = scenes.Block((0.3, 0.3, 0.0), (0.3, 0.3, 0.5))
-    return (
-        scenes.box(n, 4, albedo=0.28, occluder=block).transport().to_numpy()[np.ix_(order, order)]
-    )
+    T = scenes.box(n, 4, albedo=0.28, occluder=block).transport()
+    return T.to_numpy()[np.ix_(order, order)]
 
 
 def measure(T: np.ndarray, grid: tuple[int, int]) -> list[ltcl.Transport]:
     """Two measurements with independent noise."""
-    F, T = np.diagonal(T).astype(np.float64), T.astype(np.float64)
-    R = np.maximum(T / F - np.eye(len(F)), 0.0)
+    F = np.diagonal(T).astype(np.float64)
+    identity = np.eye(len(F))
+    R = np.maximum(T.astype(np.float64) / F - identity, 0.0)
     counts = 2.0 * R.sum() / (FROBENIUS * np.linalg.norm(R)) ** 2
-    paths = (np.random.default_rng(seed).poisson(counts * R) / counts for seed in (1, 2))
-    return [
-        ltcl.Transport(((np.eye(len(F)) + each) * F).astype(np.float32), grid) for each in paths
-    ]
+    measurements = []
+    for seed in (1, 2):
+        noisy = np.random.default_rng(seed).poisson(counts * R) / counts
+        entries = ((identity + noisy) * F).astype(np.float32)
+        measurements.append(ltcl.Transport(entries, grid))
+    return measurements
 
 
-def held(grid: tuple[int, int], count: int) -> np.ndarray:
+def held_pictures(grid: tuple[int, int], count: int) -> np.ndarray:
     """Pictures (N, count), a quarter of each kind, none of which `compress` draws."""
-    random, pictures, whole = np.random.default_rng(5), [], landscape(320, 512).mean(axis=2)
-    h, w = grid
-    for k in range(count):
-        y, x, side = random.integers(0, 200), random.integers(0, 390), random.integers(40, 120)
-        board = np.add.outer(np.arange(h) // (k % 7 + 1), np.arange(w) // (k % 5 + 1)) % 2
-        page, word = np.zeros(grid, np.uint8), "".join(random.choice(list("abcdefgMNOPQ789"), 20))
-        for line in range(9, h, 10):
-            cv2.putText(
-                page, word, (-int(random.integers(20)), line), cv2.FONT_HERSHEY_PLAIN, 0.7, (255,)
-            )
-        part = cv2.resize(whole[y : y + side, x : x + side], (w, h), interpolation=cv2.INTER_AREA)
-        pixel = np.eye(1, h * w, int(random.integers(h * w))).reshape(grid)
-        pictures.append((part, page / 255.0 if page.any() else board, board, pixel)[k % 4].ravel())
+    random = np.random.default_rng(5)
+    photograph = landscape(320, 512).mean(axis=2)
+    pictures = []
+    for number in range(count):
+        # All kinds are drawn for each picture, so that its random numbers do not depend on others.
+        part = _part(photograph, grid, random)
+        board = _checkerboard(grid, number)
+        page = _page(grid, random)
+        if not page.any():
+            page = board
+        pixel = np.eye(1, page.size, int(random.integers(page.size))).reshape(grid)
+        kinds = (part, page, board, pixel)
+        pictures.append(kinds[number % 4].ravel())
     return np.stack(pictures, axis=1)
 
 
-def loss(T: ltcl.Transport, C: ltcl.Transport, count: int) -> float:
-    """The largest of any held picture: of its light on the scene, and of light that shows it."""
-    p = held(T.grid, count)
-    (S,), approximate, direct = T.systems, C.systems[0].as_it_stands(), T.first_bounce[:, None] * p
-    seen, b = S @ direct, p
-    light, ours = (ltcl.solve(each, b, rtol=ACCURATE).x for each in (S, approximate))
-    undone = ltcl.solve(approximate, seen, rtol=ACCURATE).x
-    pairs = ((approximate @ direct, seen), (undone, direct), (ours, light), (S @ ours, b))
-    return max(relative_error(*map(np.asarray, pair)) for pair in pairs)
+def _part(photograph: np.ndarray, grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+    """Cut a square of a photograph, resized."""
+    h, w = grid
+    y = random.integers(0, 200)
+    x = random.integers(0, 390)
+    side = random.integers(40, 120)
+    square = photograph[y : y + side, x : x + side]
+    return cv2.resize(square, (w, h), interpolation=cv2.INTER_AREA)
 
 
-def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, Any], list[Claim]]:
-    """What `compress` makes of the first of two measurements, judged by the second."""
-    (T, other), claims = pair, []
-    p = np.random.default_rng(3).random((len(T.first_bounce), 8)).astype(np.float32)
-    R = [each.to_numpy() / each.first_bounce for each in pair]
+def _checkerboard(grid: tuple[int, int], number: int) -> np.ndarray:
+    """Draw a board whose squares differ with its number."""
+    h, w = grid
+    rows = np.arange(h) // (number % 7 + 1)
+    columns = np.arange(w) // (number % 5 + 1)
+    return np.add.outer(rows, columns) % 2
 
-    def off(C: ltcl.Transport) -> float:
-        ours, exact = (np.asarray(A.operators[0] @ p).ravel() for A in (C, other))
+
+def _page(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+    """Draw a word of 20 letters on all lines that the grid has room for."""
+    page = np.zeros(grid, np.uint8)
+    word = "".join(random.choice(list("abcdefgMNOPQ789"), 20))
+    for line in range(9, grid[0], 10):
+        start = (-int(random.integers(20)), line)
+        cv2.putText(page, word, start, cv2.FONT_HERSHEY_PLAIN, 0.7, (255,))
+    return page / 255.0
+
+
+def picture_loss(T: ltcl.Transport, C: ltcl.Transport, count: int) -> float:
+    """Largest error of any held picture: of its light on the scene, and of light that shows it."""
+    (S,) = T.systems
+    approximate = C.systems[0].as_it_stands()
+    pictures = held_pictures(T.grid, count)
+    direct = T.first_bounce[:, None] * pictures
+    appearance = S @ direct
+    # Direct light that shows the pictures, by both systems.
+    needed = ltcl.solve(S, pictures, rtol=ACCURATE).x
+    approximately_needed = ltcl.solve(approximate, pictures, rtol=ACCURATE).x
+    undone = ltcl.solve(approximate, appearance, rtol=ACCURATE).x
+    errors = [
+        relative_error(np.asarray(approximate @ direct), np.asarray(appearance)),
+        relative_error(np.asarray(undone), np.asarray(direct)),
+        relative_error(np.asarray(approximately_needed), np.asarray(needed)),
+        relative_error(np.asarray(S @ approximately_needed), np.asarray(pictures)),
+    ]
+    return max(errors)
+
+
+class Case:
+    """Compression of the first of two measurements, judged by the second."""
+
+    def __init__(self, name: str, pair: list[ltcl.Transport], pictures: int) -> None:
+        self.name = name
+        self.T, self.second = pair
+        self.pictures = pictures
+        self.pixels = len(self.T.first_bounce)
+        random = np.random.default_rng(3)
+        self.patterns = random.random((self.pixels, 8)).astype(np.float32)
+        self.facts: dict[str, Any] = {}
+        self.claims: list[Claim] = []
+
+    def run(self) -> None:
+        """Compress by all limits, and collect facts and claims."""
+        exact_error = self.pattern_error(self.T)
+        first_R = self.T.to_numpy() / self.T.first_bounce
+        second_R = self.second.to_numpy() / self.second.first_bounce
+        bounces = np.linalg.norm(first_R - np.eye(self.pixels))
+        difference = np.linalg.norm(second_R - first_R) / bounces
+        text = f"T p {exact_error:.3%}, R {difference:.1%}"
+        self.facts[f"{self.name}: two measurements"] = text
+        for rtol, norm, most_bytes in LIMITS:
+            C = ltcl.compress(self.T, rtol, norm=norm)
+            bytes_a_row = C.compression.channels[0].nbytes / self.pixels
+            error = self.pattern_error(C)
+            self._add_facts(f"{rtol}, {norm}", C, bytes_a_row, error)
+            if most_bytes is not None:
+                self._claim_size(rtol, bytes_a_row, most_bytes)
+            if rtol == "noise":
+                self._claim_accuracy(error / exact_error)
+
+    def pattern_error(self, T: ltcl.Transport) -> float:
+        """Relative error of T p, beside the second measurement."""
+        ours = np.asarray(T.operators[0] @ self.patterns).ravel()
+        exact = np.asarray(self.second.operators[0] @ self.patterns).ravel()
         return relative_error(ours, exact)
 
-    exact = off(T)
-    differ = np.linalg.norm(R[1] - R[0]) / np.linalg.norm(R[0] - np.eye(len(p)))
-    facts: dict[str, Any] = {f"{name}: two measurements": f"T p {exact:.3%}, R {differ:.1%}"}
-    for rtol, norm, most in LIMITS:
-        C = ltcl.compress(T, rtol, norm=norm)
-        row, worst = C.compression.channels[0].nbytes / len(p), loss(T, C, count)
-        facts[f"{name}: {rtol}, {norm}"] = (
-            f"{row:.4g} bytes a row of {4 * len(p)}, stated {C.error:.3%}, bound {C.error_bound:.3%}, "
-            f"measured {off(C):.3%}, worst held picture {worst:.3%}, {C.compression.seconds:.3g} s"
+    def _add_facts(self, limit: str, C: ltcl.Transport, bytes_a_row: float, error: float) -> None:
+        worst = picture_loss(self.T, C, self.pictures)
+        self.facts[f"{self.name}: {limit}"] = (
+            f"{bytes_a_row:.4g} bytes a row of {4 * self.pixels}, stated {C.error:.3%}, "
+            f"bound {C.error_bound:.3%}, measured {error:.3%}, worst held picture {worst:.3%}, "
+            f"{C.compression.seconds:.3g} s"
         )
-        facts[f"{OVER}{name}, {rtol}, {norm}"] = worst / C.error
-        if most:
-            text = f"{name}: bytes a row at rtol {rtol}"
-            claims.append(Claim(text, f"{row:.4g}", f"at most {most}", row <= most))
-        if rtol == "noise":
-            text, ratio = (
-                f"{name}: appearance error over that of the exact T, noise",
-                off(C) / exact,
-            )
-            claims.append(Claim(text, f"{ratio:.3f}", "at most 1.1", ratio <= 1.1))
-    return facts, claims
+        self.facts[f"{OVER}{self.name}, {limit}"] = worst / C.error
+
+    def _claim_size(self, rtol: Any, bytes_a_row: float, most_bytes: int) -> None:
+        claim = Claim(
+            text=f"{self.name}: bytes a row at rtol {rtol}",
+            measured=f"{bytes_a_row:.4g}",
+            wanted=f"at most {most_bytes}",
+            holds=bytes_a_row <= most_bytes,
+        )
+        self.claims.append(claim)
+
+    def _claim_accuracy(self, ratio: float) -> None:
+        claim = Claim(
+            text=f"{self.name}: appearance error over that of the exact T, noise",
+            measured=f"{ratio:.3f}",
+            wanted="at most 1.1",
+            holds=ratio <= 1.1,
+        )
+        self.claims.append(claim)
+
+
+def measured_pairs(n: int, why_not_traced: str) -> dict[str, list[ltcl.Transport]]:
+    """Two measurements of a simulated box, and of a path-traced one if it can be traced."""
+    pairs = {"simulated": measure(box(n), (2 * n, 2 * n))}
+    if not why_not_traced:
+        grid = (64, 64)
+        traced = [tracing.trace("blocks", grid, PATHS, seed).sum(axis=0) for seed in (1, 2)]
+        pairs["path-traced"] = [ltcl.Transport(T, grid) for T in traced]
+    return pairs
+
+
+def other_scenes(n: int) -> dict[str, scenes.Scene]:
+    """Scenes whose pictures are judged as well."""
+    return {
+        "corner": scenes.dihedral(n, albedo=0.6),
+        "painted": scenes.trihedral(n, albedo=[[0.9], [0.3], [0.6]]),
+        "room": scenes.box(n, 3, albedo=0.7),
+        "closed": scenes.box(n // 2, 6, albedo=0.5),
+    }
 
 
 def main() -> None:
-    """Run it."""
-    given = parse_options(__doc__ or "")
-    n, small, count = (8, 6, 16) if given.smoke else (32, 16, HELD)
-    others = {
-        "corner": scenes.dihedral(small, albedo=0.6),
-        "painted": scenes.trihedral(small, albedo=[[0.9], [0.3], [0.6]]),
-        "room": scenes.box(small, 3, albedo=0.7),
-        "closed": scenes.box(small // 2, 6, albedo=0.5),
-    }
-    pairs, facts, claims = {"simulated": measure(box(n), (2 * n, 2 * n))}, {}, []
-    if why := "--smoke" if given.smoke else tracing.unavailable():
-        facts["path-traced"] = f"not measured: {why}"
+    """Run the bench."""
+    options = parse_options(__doc__)
+    if options.smoke:
+        sizes = SMOKE_SIZES
+        why_not_traced = "--smoke"
     else:
-        traced = (tracing.trace("blocks", (64, 64), PATHS, seed).sum(axis=0) for seed in (1, 2))
-        pairs["path-traced"] = [ltcl.Transport(T, (64, 64)) for T in traced]
+        sizes = Sizes()
+        why_not_traced = tracing.unavailable()
+    pairs = measured_pairs(sizes.box, why_not_traced)
+    others = other_scenes(sizes.others)
+    facts: dict[str, Any] = {}
+    claims: list[Claim] = []
+    if why_not_traced:
+        facts["path-traced"] = f"not measured: {why_not_traced}"
     for name, pair in pairs.items():
-        more, further = case(name, pair, count)
-        facts, claims = facts | more, claims + further * (not given.smoke)
+        case = Case(name, pair, sizes.pictures)
+        case.run()
+        facts |= case.facts
+        # Limits are those of the full size.
+        if not options.smoke:
+            claims += case.claims
     for name, scene in others.items():
         T, _ = measure(scene.transport().to_numpy(), scene.grid)
         C = ltcl.compress(T, 0.01)
-        facts[OVER + name] = loss(T, C, count) / C.error
+        facts[OVER + name] = picture_loss(T, C, sizes.pictures) / C.error
     largest = max(ratio for name, ratio in facts.items() if name.startswith(OVER))
-    text = f"held pictures over what is stated, {count} in {len(pairs) + len(others)} scenes"
-    claims.append(Claim(text, f"{largest:.3f}", "at most 1.5", largest <= 1.5))
-    figures.conclude(given, "Compression to what pictures need", claims, facts, Figure)
+    count = len(pairs) + len(others)
+    claim = Claim(
+        text=f"held pictures over what is stated, {sizes.pictures} in {count} scenes",
+        measured=f"{largest:.3f}",
+        wanted="at most 1.5",
+        holds=largest <= 1.5,
+    )
+    claims.append(claim)
+    figures.conclude(options, "Compression to what pictures need", claims, facts, Figure)
 
 
 if __name__ == "__main__":

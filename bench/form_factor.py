@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One bounce of light between 131424 patches of a closed box, with no stored matrix, beside NumPy.
+"""A bounce of light between 131424 patches of a closed box, with no stored matrix, beside NumPy.
 
 Form factors are computed on the way. NumPy computes the same sums in float32, a few rows at a time:
 centre to centre, the close pairs again at eight pairs of points, near pairs by SciPy from the same
