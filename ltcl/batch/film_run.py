@@ -98,15 +98,9 @@ class BatchSolver:
             if identity(self.T) != self.identity:
                 raise InputError("the file of T holds another T there; give all workers the same")
         for value in (self.T, *self.options.values()):
-            use_own_device(value)
-
-
-def use_own_device(value: Any) -> None:
-    """Let a transport or an inverse that was sent to a worker open the device of that worker."""
-    if isinstance(value, Transport):
-        value._requested_device = None
-    elif isinstance(value, Inverse):
-        value._index = None
+            # A worker opens its own device.
+            if isinstance(value, (Transport, Inverse)):
+                value.forget_device()
 
 
 @dataclass(eq=False, kw_only=True)

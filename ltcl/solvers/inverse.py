@@ -74,7 +74,7 @@ class Inverse:
         self.systems = tuple(IdentityPlus(A, sign=-1) for A in bounces)
         # The arrays and the device of an unpickled inverse.
         self._arrays = dict[str, np.ndarray]()
-        self._index = ""
+        self._index: str | None = ""
         n = bounces[0].shape[0]
         self.grid = checks.grid("grid", grid, n)
         self.errors = tuple(checks.number("error", error, least=0.0) for error in errors)
@@ -101,6 +101,10 @@ class Inverse:
             state["_arrays"] = stored.to_arrays(systems)
             state["_index"] = self.device.description.index
         return state
+
+    def forget_device(self) -> None:
+        """Let an unpickled inverse open the default device where it is, at its first use."""
+        self._index = None
 
     @cached_property
     def systems(self) -> tuple[IdentityPlus, ...]:

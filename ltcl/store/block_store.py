@@ -242,7 +242,7 @@ class BlockStore:
         if compressed is not None:
             layout, content = compressed_content(compressed)
             content = FinalContent(
-                extras=extras | content.extras, state=self.attributes | content.state
+                extras={**extras, **content.extras}, state={**self.attributes, **content.state}
             )
         else:
             missing = self.missing()

@@ -194,8 +194,7 @@ def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse
     """Load an inverse of `save_inverse` onto a device (see `open_device`); errors as of `load`."""
     record = read(path)
     with about(path):
-        is_inverse = isinstance(record, CompressedRecord) and record.format == INVERSE_FORMAT
-        if not is_inverse:
+        if not isinstance(record, CompressedRecord) or record.format != INVERSE_FORMAT:
             raise FileError("is no inverse, as ltcl.save_inverse writes it")
         return Inverse.from_arrays(record.arrays, device)
 

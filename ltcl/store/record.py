@@ -102,7 +102,7 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
     def _rmatmat(self, X: Any) -> np.ndarray:
         product = np.zeros((self.shape[1], X.shape[1]))
         for first, block in self.row_blocks():
-            rows = block.shape[0]
+            rows, _ = block.shape
             product += block.T @ X[first : first + rows]
         return product
 

@@ -328,6 +328,10 @@ class Transport:
             noise=noise,
         )
 
+    def forget_device(self) -> None:
+        """Let an unpickled transport open the default device where it is, at its first use."""
+        self._requested_device = None
+
     def __getstate__(self) -> dict[str, Any]:
         """State for `pickle` and `copy.deepcopy`, without the device, which is opened again."""
         state = {name: value for name, value in vars(self).items() if name not in NOT_PICKLED}

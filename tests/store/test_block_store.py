@@ -91,6 +91,7 @@ def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> N
         store.write(0, block, columns, np.ones(columns.nnz) if block == 2 else None)
     store.finalize()
     T, spread = store.block(0, 0)
+    assert spread is not None
     np.testing.assert_array_equal(np.isnan(spread), (T.indices < 6) | (T.indices >= 9))
 
 

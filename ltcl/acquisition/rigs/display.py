@@ -184,12 +184,12 @@ def show(
         checks.number("advance", advance, above=0.0)
     elif advance not in ("key", "arrival"):
         raise InputError(f"advance is {advance!r}; it must be 'key', 'arrival' or seconds")
-    is_picture = folder.is_file() and advance != "arrival"
-    if is_picture:
+    shots = None
+    if folder.is_file() and advance != "arrival":
         shots = [Shot(1, folder.name, 0.0, "")]
         folder = folder.parent
     rig = FolderRig(folder, (1, 1))  # any grid has the same list
-    if not is_picture:
+    if shots is None:
         shots = _shots_to_show(rig, advance)
     if not shots:
         return 0

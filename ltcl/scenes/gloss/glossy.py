@@ -308,7 +308,8 @@ def _with_last_slots(exchange: scipy.sparse.csr_array, slots: int) -> scipy.spar
     entries = exchange.tocoo()
     rows = entries.row + entries.row // bins
     columns = entries.col + entries.col // bins
-    size = exchange.shape[0] // bins * slots
+    n_bins, _ = exchange.shape
+    size = n_bins // bins * slots
     return scipy.sparse.csr_array((entries.data, (rows, columns)), (size, size))
 
 
