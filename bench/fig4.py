@@ -32,12 +32,12 @@ from ltcl.theory import bounce_coefficients
 TERMS = 30
 SIGN_TERMS = 11
 DRAWN_TERMS = (0, 1, 2, 3, 8)
-# The table of bounces has so many rows and columns.
+# Rows and columns of the table of bounces, without the first ones.
 ORDERS = 5
 BOUNCES = 8
 # Bounces that the float64 expansion in A goes to: later ones are below rounding.
 EXPANSION_BOUNCES = 99
-# Relative errors must fall at each of the first so many terms.
+# The relative error must fall at each of these first terms.
 FALLING_TERMS = 20
 
 

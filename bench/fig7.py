@@ -71,7 +71,7 @@ FINE_RTOL = 5e-4
 MAX_ROW_WAVELETS = 128
 BLOCK_BYTES = 1 << 28
 
-# A slope is fitted to times of at least so many launch floors, and to at least so many points.
+# A slope is fitted to times above this many launch floors, and to at least this many points.
 FLOOR_RATIO = 5.0
 MIN_SLOPE_POINTS = 3
 # Smaller pictures have too few wavelets for a claim about their number.

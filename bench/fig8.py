@@ -25,7 +25,7 @@ from ltcl.scenes import Scene, box
 
 ALBEDO = 0.4
 LAMP = (0.85, 0.75, 0.8)
-# Samples a pixel of the pictures, and of the curves, by so many seeds.
+# Samples a pixel of the pictures; samples and seeds of the curves.
 FEW = 30
 MANY = 1000
 COUNTS = np.array([8, 16, 32, 64, 128, 256, 512])

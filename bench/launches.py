@@ -143,7 +143,7 @@ def long_rules(method: str) -> dict[str, Any]:
 
 
 def step_medians(names: list[str], products: int) -> tuple[int, int]:
-    """Median launches and waits of steps that begin with a product, of so many products."""
+    """Median launches and waits of a step, which begins with a product and has `products`."""
     starts = [i for i, name in enumerate(names) if "matvec" in name]
     launches = []
     waits = []

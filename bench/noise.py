@@ -29,7 +29,7 @@ from tests.transport.noise.measured import SCENES, measure, noise_of, truth
 # Noise floors in median first bounces; variances of photon noise at the first bounce, in floors.
 LEVELS = (1e-5, 1e-4, 1e-3, 1e-2)
 PHOTONS = (0.0, 1.0, 300.0)
-# An estimate is good within this factor; a case, with so many good entries.
+# An estimate is good within this factor; a case is good with this share of good entries.
 MAX_FACTOR = 1.3
 MIN_SHARE = 0.95
 

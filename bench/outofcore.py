@@ -108,7 +108,7 @@ class Scene:
         return (direct + indirect).T.reshape(light.shape)
 
     def read(self, threads: int) -> None:
-        """Read all of the file by so many threads into buffers of their own."""
+        """Read all of the file by several threads, each into a buffer of its own."""
         size = self.file.stat().st_size
         edges = [size * k // threads for k in range(threads + 1)]
 

@@ -41,7 +41,7 @@ from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source
 
 ALBEDO = (0.8, 0.65, 0.5)
-# Albedo of the rows of A, of which those of the colours are multiples.
+# Albedo of the rows of A; the rows of the colours are multiples of them.
 REFERENCE = 0.5
 # Numbers of A below this are dropped.
 THRESHOLD = 2e-5
@@ -57,7 +57,7 @@ BOUNCES = 2
 # Pictures are in this range, which the projector reaches.
 PICTURE_BASE = 0.05
 PICTURE_RANGE = 0.4
-# Bounces are drawn so many times brighter.
+# Factor by which bounces are drawn brighter.
 BOUNCE_GAIN = 4.0
 MS_TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}
 

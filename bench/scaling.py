@@ -34,7 +34,7 @@ from ltcl.operators import CSR, Dense, Distributed, IdentityPlus
 # Pixels and entries a row; as many of both: a dense matrix.
 SIZES = ((1024, 16), (32_768, 256), (131_072, 256), (16_384, 16_384))
 SMOKE_SIZES = ((1024, 16), (4096, 16), (512, 512))
-# Entries from which on two ranks must be so many times as fast.
+# From this number of entries on, two ranks must be faster by this factor.
 MIN_LARGE_ENTRIES = 1 << 25
 LARGE_TARGET = 1.8
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "OMP_NUM_THREADS": "1"}
@@ -129,7 +129,7 @@ def run_rank(sizes: list[list[int]]) -> None:
 
 
 def rank_operators(comm: Any, alone: Any, n: int, entries: int, own_rows: Any) -> dict[str, Any]:
-    """R over 1, 2 and 4 ranks, and without MPI; a rank has those in which it takes part.
+    """R over 1, 2 and 4 ranks, and without MPI; a rank has the operators in which it takes part.
 
     A quarter of a sparse matrix on two ranks stands for four.
     """
@@ -181,7 +181,7 @@ def run_products(A: Any, x: Any) -> None:
 
 
 def operator_actions(operators: dict[str, Any], b: np.ndarray) -> Actions:
-    """Products and solves; a rank has None for those in which it takes no part.
+    """Products and solves; None for operators in which the rank takes no part.
 
     All ranks go through the same names in the same order.
     """

@@ -36,7 +36,7 @@ NAMES = ("pattern", "bounce 0", "bounce 1", "bounce 2", "bounce 3")
 # Shares of errors within one and two deviations, and by how much they may differ.
 SHARES = (0.68, 0.95)
 SHARE_TOLERANCES = (0.05, 0.03)
-# Seconds of `std`, at most so many times those of its task.
+# Largest ratio of the seconds of `std` to the seconds of its task.
 COST_TARGET = 5.0
 
 Shares = dict[tuple[str, float], np.ndarray]

@@ -144,7 +144,7 @@ HAS_ELEMENT = "(selector) => Boolean(document.querySelector(selector))"
 
 @dataclass(frozen=True, kw_only=True)
 class Workload:
-    """Patches along a wall of both transports, and amounts of what is measured with them."""
+    """Patches along a wall of both transports, and the amount of each measurement."""
 
     large: int = 256
     small: int = 48

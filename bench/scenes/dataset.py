@@ -33,7 +33,7 @@ PATTERN_MAX = 0.8
 SIZE = 64
 PATHS = 2560
 SAMPLES = 10_000
-# The second measurement, which judges, has so many times the paths.
+# Paths of the second measurement, which judges, over paths of the first.
 SECOND_PATH_RATIO = 4
 # Bounces of the files, direct light included; T has all.
 FILE_BOUNCES = 4
@@ -121,8 +121,8 @@ class Scene:
     def truth(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounces 0 to 3 of the photographs by the second measurement, and their variance.
 
-        The variance of the difference of both measurements is that of the first one and a fraction
-        of it.
+        The first measurement has SECOND_PATH_RATIO times the variance of the second, so that their
+        difference has 1 + SECOND_PATH_RATIO times it.
         """
         p = self.photographs["patterns"]
         true = self.bounces("second", p).astype(np.float64)

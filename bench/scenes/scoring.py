@@ -106,7 +106,7 @@ def run(command: str, scene: Scene, limit: float = 3600.0) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Results of a method and their cost; `nbytes` are of what it keeps of T."""
+    """Results of a method and their cost; `nbytes` is the size of its representation of T."""
 
     results: dict[str, np.ndarray]
     photographs: int

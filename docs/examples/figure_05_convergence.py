@@ -12,11 +12,11 @@ iteration, which ltcl uses, undoes the same boxes in about ten steps, whatever t
 import fig5
 import ltcl
 
-found = fig5.measure(6, ltcl.open_device())
-figure = fig5.draw(found)
+measured = fig5.measure(6, ltcl.open_device())
+figure = fig5.draw(measured)
 
 # %%
-# What became of each box (1 % by the paper's series; 1e-5 by Chebyshev's iteration):
+# The outcome of each box (1 % by the paper's series; 1e-5 by Chebyshev's iteration):
 
-for race in found.races:
-    print(f"{race.name}: {race.said}; Chebyshev {race.chebyshev.products} products")
+for race in measured.races:
+    print(f"{race.name}: {race.outcome}; Chebyshev {race.chebyshev.products} products")
