@@ -209,9 +209,12 @@ def publish(
     facts: dict[str, Any],
     table: Table,
     content: Any,
-    draw: Callable[[], Any],
+    draw: Callable[[], Any] | None = None,
 ) -> None:
-    """Print facts and table; write them with `content`, and draw, if the options ask for it."""
+    """Print facts and table; write them with `content`, and draw, if the options ask for it.
+
+    A bench without `draw` has no picture.
+    """
     console = Console(width=150)
     console.print(f"[bold]{title}[/]\n{options.device.name}, {options.device.driver}")
     for name, value in facts.items():
@@ -222,7 +225,7 @@ def publish(
     console.print(table)
     if options.json is not None:
         write_json(options.json, record(options, title, facts) | content)
-    if options.plot is not None:
+    if options.plot is not None and draw is not None:
         options.plot.parent.mkdir(parents=True, exist_ok=True)
         plots.save(draw(), options.plot)
 

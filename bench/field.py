@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from matplotlib.figure import Figure
 from rich.table import Table
 
 from _harness import Options, parse_options, publish
@@ -129,7 +128,7 @@ def main() -> None:
         for method, values in scores.items():
             table.add_row(name, method, *scoring.row(values))
     title = "Inverse light transport on known bounces"
-    publish(options, title, facts, table, {"results": results}, Figure)
+    publish(options, title, facts, table, {"results": results})
     failures = unexpected_failures(results)
     if failures:
         raise SystemExit("failed:\n" + "\n".join(failures))

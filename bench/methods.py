@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from rich.table import Table
 
 import ltcl
@@ -70,7 +69,7 @@ def main() -> None:
         counts[method] = {room.name: products(room, method) for room in problems}
         table.add_row(method, *map(str, counts[method].values()))
     pixels = {f"pixels, {room.name}": len(room.b) for room in problems}
-    publish(options, "Products to 1 %", pixels, table, {"products": counts}, Figure)
+    publish(options, "Products to 1 %", pixels, table, {"products": counts})
 
 
 if __name__ == "__main__":

@@ -125,4 +125,6 @@ def test_import_of_ltcl_is_light() -> None:
 
 def test_ways_of_data_stay_short() -> None:
     for name, way in house.ways().items():
-        assert way.length <= way.limit, (name, way.files)
+        assert way.length <= way.limit, (
+            f"{name}: {way.length} files, at most {way.limit}: {way.files}"
+        )

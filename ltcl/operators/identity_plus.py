@@ -46,6 +46,7 @@ class IdentityPlus(Operator):
     ) -> None:
         if R.shape[0] != R.shape[1]:
             raise InputError(f"R has shape {R.shape}; S = I + R needs a square one")
+        # Random walks take their moments from R itself, which only a sign leaves as they are.
         if sign not in (1.0, -1.0):
             raise InputError(f"sign is {sign!r}; it must be 1 for I + R or -1 for I - R")
         if not solution_error >= 0.0:

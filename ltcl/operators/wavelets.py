@@ -133,7 +133,12 @@ class Wavelet(Basis):
 
 
 def filters(name: Any) -> np.ndarray:
-    """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64."""
+    """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64.
+
+    They are those of reconstruction, `rec_lo` and `rec_hi` of PyWavelets: with low-pass h_0 ..
+    h_(t-1) the high-pass is g_i = (-1)^i h_(t-1-i). Both are orthonormal, to each other and to
+    themselves moved by pairs, and h sums to sqrt(2), so that a constant has one coefficient.
+    """
     offered = "an orthonormal wavelet of PyWavelets, such as haar, db2, sym8 or coif1"
     if name not in _pywt.wavelist(kind="discrete"):
         raise InputError(f"wavelet is {name!r}; it must be {offered}")

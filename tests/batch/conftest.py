@@ -28,9 +28,8 @@ def cluster(private_cache) -> Iterator[Client]:
     """A cluster of two workers, each with ltcl's default device and what tests remember."""
     from distributed import Client, LocalCluster  # imported here it mutes no handler of pytest
 
-    slowly = dask.config.set(
-        {"distributed.deploy.lost-worker-timeout": "120s"}
-    )  # on a busy machine
+    # On a busy machine workers take long to answer.
+    slowly = dask.config.set({"distributed.deploy.lost-worker-timeout": "120s"})
     environment = {"LTCL_CACHE": str(private_cache)}
     with slowly, LocalCluster(**WORKERS, env=environment) as cluster, Client(cluster) as client:
         yield client
@@ -38,7 +37,8 @@ def cluster(private_cache) -> Iterator[Client]:
 
 @pytest.fixture
 def client(cluster) -> Client:
-    """Both workers, those that an earlier test killed, too."""
-    cluster.wait_for_workers(2)
+    """Both workers, also where an earlier test killed them; an error if they do not come back."""
+    cluster.cluster.scale(2)
+    cluster.wait_for_workers(2, timeout=240)
     cluster.run(lambda: ltcl.open_device().name)
     return cluster
