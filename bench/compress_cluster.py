@@ -22,7 +22,7 @@ from ltcl.operators import Wavelet
 from ltcl.tasks.compression.bases import CoefficientAnalysis
 from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source
-from resolution131k import MEMORY, REFERENCE, THRESHOLD
+from resolution131k import BLOCK_BYTES, REFERENCE, THRESHOLD
 
 # Largest time of two workers over that of one.
 MAX_SHARE = 0.6
@@ -44,7 +44,7 @@ def compress(options: Options, rows: Bounce, workers: int) -> tuple[Coefficients
         for core, address in zip(range(workers), addresses, strict=True):
             client.run(os.sched_setaffinity, 0, {core}, workers=[address])
         start = time.perf_counter()
-        blocks = source("A", rows, MEMORY, client)
+        blocks = source("A", rows, BLOCK_BYTES, client)
         A = coefficients(blocks, W, W, THRESHOLD, first=THRESHOLD / 4)
         spent = time.perf_counter() - start
     note(f"{workers} workers: {spent:.3g} s")
