@@ -58,8 +58,8 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     core_basis : Basis or None
         The isometric basis W of an operator W^T C W.
     coefficient_basis : Basis or None
-        The isometric basis W of an operator I + W^T C W, which can be solved on coefficients. On the
-        coefficients that W leaves out it is the identity, as W^T C W itself is not.
+        The isometric basis W of an operator I + W^T C W, which can be solved on coefficients. On
+        the coefficients that W leaves out it is the identity, as W^T C W itself is not.
     known : Knowledge
         Facts that are found once in the life of the operator.
     """
@@ -273,7 +273,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
 
     @property
     def has_cheap_float64_product(self) -> bool:
-        """True if a float64 product on the host takes no longer than a few waits, if there is one."""
+        """Whether a float64 product on the host takes no longer than a few waits."""
         return self.nbytes + self.bytes_read() <= CHEAP_PRODUCT_BYTES
 
     def product_float64(self) -> Product | None:

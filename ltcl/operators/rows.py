@@ -39,7 +39,7 @@ MAX_SLAB_ELEMENTS = (1 << 31) - 4096
 
 @dataclass(frozen=True)
 class Slab:
-    """Rows first .. first + rows of the matrix; `arguments` of the kernels of its format by name."""
+    """Rows first .. first + rows of the matrix; `arguments` of kernels of its format by name."""
 
     first: int
     rows: int

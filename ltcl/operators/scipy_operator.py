@@ -34,7 +34,7 @@ class Host(Operator):
         return np.asarray(diagonal(), np.float64)
 
     def product(self, x: np.ndarray, transpose: bool = False) -> np.ndarray:
-        """A x or A^T x on the host, for x (N, k) float64; results that are not finite are refused."""
+        """A x or A^T x on the host, x (N, k) float64; results that are not finite are refused."""
         operator = self.operator.T if transpose else self.operator
         try:
             # `matvec` would drop masks.

@@ -229,7 +229,7 @@ def _unit(numbers: np.ndarray) -> float:
 
 
 def _scale_bits(numbers: np.ndarray) -> np.ndarray:
-    """The smallest scale of each tile, from 2^-14 on, that lets no code pass 127, (tiles,) uint8."""
+    """The smallest scale of each tile, from 2^-14, that lets no code pass 127, (tiles,) uint8."""
     largest = np.abs(numbers).max(axis=1, initial=0.0)
     fraction, exponent = np.frexp(largest / MAX_INT8_CODE)
     # Fractions are in 1/2 .. 1.
@@ -253,7 +253,7 @@ def _nonzeros(matrix: Any) -> scipy.sparse.csr_array:
 
 
 def check_packed(packed: Packed, width: int) -> None:
-    """Refuse arrays that a kernel could read beyond, of types that it does not read, or not finite."""
+    """Refuse arrays of wrong sizes, which a kernel would read beyond, or types, or not finite."""
     rows, columns = packed.shape
     tiles = len(packed.columns)
     scale_count = tiles if packed.precision == "int8" else 0

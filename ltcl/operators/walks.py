@@ -81,7 +81,7 @@ class Lengths:
         return cls(sign ** np.arange(1, longest + 1), q, from_b)
 
     def scores(self) -> tuple[np.ndarray, np.ndarray]:
-        """The factor of the score of each step, c_k over its chance, and the chance to go on, (L,)."""
+        """The factor of each step's score, c_k over its chance, and the chance to go on, (L,)."""
         chances = np.full(len(self.coefficients), self.go_on)
         # The table of steps ends here.
         chances[-1] = 0.0
@@ -178,7 +178,7 @@ class Walker:
         columns: slice,
         stream: int,
     ) -> np.ndarray:
-        """Sums of scores and of their squares by one launch, (pixels, chunks, columns, 2) float64."""
+        """Sums of scores and of squares by one launch, (pixels, chunks, columns, 2) float64."""
         tables = self.tables
         count = chunk_range.stop - chunk_range.start
         width = columns.stop - columns.start

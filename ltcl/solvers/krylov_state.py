@@ -28,8 +28,8 @@ BICGSTAB_ALPHA = 8
 BICGSTAB_SHADOW = 9
 BICGSTAB_AGAINST = 10
 
-# Phases of a column of BiCGStab: it moves; has restarted and made no step since; waits for a restart
-# by the host; has no step even after a restart; rests, since it is solved.
+# Phases of a column of BiCGStab: it moves; has restarted and made no step since; waits for a
+# restart by the host; has no step even after a restart; rests, since it is solved.
 PHASE_MOVES = 0.0
 PHASE_FRESH = 1.0
 PHASE_WAITS = 2.0

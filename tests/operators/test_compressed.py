@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Operators between bases: errors, diagonals, memory, threads (their products are in `test_base.py`)."""
+"""Operators between bases: errors, diagonals, memory, threads; products are in `test_base.py`."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables and walks: to the bit those of the twin, however launched; draws and lengths by eq. 24 and 25."""
+"""Tables and walks: to the bit those of the twin, however launched; lengths by eq. 24 and 25."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def drawn(made: Tables, row: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draws_like_twin(made: Tables, row: int, columns: np.ndarray, values: np.ndarray) -> None:
-    """Within 2^-19 of the row, in total variation: thresholds have 18 bits and are rounded to nearest."""
+    """Within 2^-19 of the row, in total variation: thresholds of 18 bits are rounded to nearest."""
     count, total, chances = reference.walk_tables(columns, values, made.shape[1])
     assert (made.records.get()[row, 2], made.sums()[row]) == (count, total)
     if count:
@@ -182,7 +182,7 @@ def same(found: Sums, total: np.ndarray, squared: np.ndarray) -> None:
 @pytest.mark.parametrize("k", [1, 5])
 @pytest.mark.parametrize("name", SCENES)
 def test_sums_are_those_of_the_twin_to_the_bit(shaped, name, k):
-    """k right-hand sides of each channel, one column a channel in turn; five of three take two launches."""
+    """k right-hand sides of each channel, one column a channel in turn; 5 of 3 take 2 launches."""
     made = tables_of(shaped, name)
     lengths = Lengths.geometric(0.6, -1.0)
     b = gallery.vectors(made.shape[0], k * made.channels)

@@ -145,8 +145,10 @@ ONE = np.ones(3)
 HOLE = np.diag([1.0, 1.0, 0.0])
 MC = "monte_carlo"
 Row = tuple[Any, Any, str, dict[str, Any], type[LtclError], str]
+TWO = {"block": 2}
+SINGULAR_BLOCK = "block_gauss.* 2 to 3 .*block"
 NO_STEPS: list[Row] = [
-    *((S, np.ones(5), "block_gauss_seidel", {"block": 2}, InputError, "block_gauss.* 2 to 3 .*block")
+    *((S, np.ones(5), "block_gauss_seidel", TWO, InputError, SINGULAR_BLOCK)
       for S in (PAIR, scipy.sparse.csr_array(PAIR))),
     *((form(HOLE), ONE, method, {}, InputError, rf"'{method}'.*diagonal.* 1 row.* row 2")
       for form in (np.asarray, scipy.sparse.csr_array) for method in ("gauss_seidel", "southwell")),
