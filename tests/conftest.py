@@ -21,6 +21,9 @@ from ltcl.device.kernels import Kernel
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SMALL = 4096  # bytes: a 53 x 53 matrix takes several slabs, its vectors still fit
 ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
+# A table of tests with so many cases is long; the default run takes one case in TABLE_STEP of it.
+LONG_TABLE = 8
+TABLE_STEP = 4
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -28,6 +31,26 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     names = vars(item.module) if isinstance(item, pytest.Function) else {}
     if isinstance(names.get("random"), np.random.Generator):
         names["random"] = np.random.default_rng(zlib.crc32(item.name.encode()))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Count most cases of a long table as slow: without `-m ''` every fourth is run.
+
+    Whoever chooses tests by ``-k`` or by the name of a case gets all of them.
+    """
+    if config.option.keyword:
+        return
+    tables: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        function, _, _ = item.nodeid.partition("[")
+        tables.setdefault(function, []).append(item)
+    for cases in tables.values():
+        if len(cases) < LONG_TABLE:
+            continue
+        for number, case in enumerate(cases):
+            if number % TABLE_STEP > 0:
+                case.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session", autouse=True)

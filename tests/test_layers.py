@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+
 from tests import house
 
 RANK = {unit: rank for rank, units in enumerate(house.LAYERS) for unit in units}
@@ -123,6 +125,7 @@ def test_import_of_ltcl_is_light() -> None:
     assert run.stdout.split() == []
 
 
+@pytest.mark.slow
 def test_ways_of_data_stay_short() -> None:
     for name, way in house.ways().items():
         assert way.length <= way.limit, (

@@ -38,6 +38,7 @@ def test_the_readme_is_short_and_its_links_lead_somewhere():
     assert [link for link in links if not (ROOT / link).is_file()] == []
 
 
+@pytest.mark.slow
 def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
@@ -67,6 +68,7 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     assert np.linalg.norm(scale * seen - target) < 0.02 * np.linalg.norm(target)
 
 
+@pytest.mark.slow
 def test_the_page_on_noise_runs(device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     page = (GUIDE / "noise.md").read_text(encoding="utf-8")

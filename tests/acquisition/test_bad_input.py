@@ -220,6 +220,7 @@ class Disk:
         return real(*arguments, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str) -> None:
     """It is full at random places of all stages; each time there is room again later."""

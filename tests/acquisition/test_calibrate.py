@@ -164,6 +164,7 @@ def test_a_lamp_in_black_or_uniform_codes_is_named(
     check_refused(coloured_calibration, images, f"^{text}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("a", "b"), [(46, 47), (48, 53), (50, 54)])
 def test_exchanged_uniform_codes_are_named(coloured_calibration: Replaying, a: int, b: int) -> None:
     """They decide on the curve of the projector."""
@@ -193,6 +194,7 @@ class Inverting(Unplugged):
         return super().photograph(codes, seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bit", range(7))
 def test_gray_code_that_is_exchanged_with_its_inverse_is_named(bit: int) -> None:
     """Their map is mirrored in part, and as smooth as the right one."""

@@ -39,6 +39,7 @@ def coloured_rig() -> VirtualRig:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_picture_is_transport_of_light_and_ambient(tmp_path: Path, channels: int) -> None:
     """Ambient light in the units of T is that of the projector's black and of the room."""

@@ -104,6 +104,7 @@ def flip(file: Path) -> bytes:
     return good
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FINAL + HALF)
 def test_any_flipped_bit_is_detected(stores: dict[str, Path], tmp_path: Path, kind: str) -> None:
     """`verify` notices one bit of each file, so does a report, or a run that goes on."""

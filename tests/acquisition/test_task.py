@@ -51,6 +51,7 @@ def test_patterns_that_no_scan_has_seen(scanned: Any) -> None:
         assert Report.of(path).patterns < 128
 
 
+@pytest.mark.slow
 def test_a_finished_store_needs_no_rig_any_more(scanned: Any) -> None:
     strategy, T, path = scanned
     again = acquire(camera(0), geometry="aligned", strategy=strategy, store=path)
@@ -76,6 +77,7 @@ class Steps:
         return [done for step, done, _ in self.steps if step == kind]
 
 
+@pytest.mark.slow
 def test_photographs_are_enough_for_the_transport(
     tmp_path: Path, scanned: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,6 +99,7 @@ def test_photographs_are_enough_for_the_transport(
     finalize(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_progress(tmp_path: Path, strategy: str) -> None:
     """The calibration and each pattern count, and at once those that an earlier run photographed.
@@ -184,6 +187,7 @@ def test_stores_of_others_are_refused(tmp_path: Path) -> None:
             read(tmp_path / "nowhere.zarr")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("by_hand", "response", "bits", "strategy", "largest_error"),
     [

@@ -47,6 +47,7 @@ def test_every_error_comes_back_from_a_worker(kind):
     assert (type(copy), str(copy), vars(copy)) == (kind, "a file", vars(kind("a file")))
 
 
+@pytest.mark.slow
 def test_a_scene_that_ends_its_workers_is_named_and_the_rest_goes_on(client):
     def end(scene: str) -> str:
         if scene in ("b", "c"):
@@ -72,6 +73,7 @@ def test_what_an_error_holds_stays_with_the_worker(client):
         ltcl.batch.map(fail, "a", client=client)
 
 
+@pytest.mark.slow
 def test_a_result_that_cannot_be_sent_is_the_error_of_its_scene(client):
     def lazily(scene: str) -> Any:
         return (letter for letter in scene) if scene == "b" else scene

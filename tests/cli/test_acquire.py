@@ -196,6 +196,7 @@ def photograph(truth: Path, folder: Path, missing: list[int], card: Path | None)
         cv2.imwrite(str(target), picture.astype(np.uint16) * 16)
 
 
+@pytest.mark.slow
 def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, tmp_path, simulated):
     """Pattern, exposure and name are on stdout, with an exit code of its own."""
     folder = tmp_path / "my scan"

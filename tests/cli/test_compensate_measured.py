@@ -109,6 +109,7 @@ def test_frames_and_videos_hold_codes(program, store, tmp_path, rig):
     np.testing.assert_allclose(shown, codes, atol=1.1 / 255)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["compress", "convert"])
 def test_a_copy_takes_the_calibration_of_its_store(program, store, waves, tmp_path, rig, name):
     copy = tmp_path / "copy.npz"

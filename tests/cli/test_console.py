@@ -198,6 +198,7 @@ def test_a_missing_driver_fails_a_check(program, monkeypatch):
     assert "OCL_ICD_VENDORS=/nowhere" in check["found"]
 
 
+@pytest.mark.slow
 def test_a_driver_that_crashes_or_hangs_is_named(program, monkeypatch, tmp_path):
     """The trial runs the file of a driver, as the loader would load it."""
     trial = "import os, time; exec(open(os.environ['OCL_ICD_VENDORS']).read())"

@@ -96,6 +96,7 @@ def test_the_papers_iteration_diverges_and_chebyshev_does_not(done):
     }
 
 
+@pytest.mark.slow
 def test_bounces_are_those_of_the_form_factors(done):
     _, report, _ = done
     errors = [bounce["error"] for bounce in report["bounces"]]

@@ -53,6 +53,7 @@ def test_text_is_one_line(results: dict[str, Any], tmp_path: Path) -> None:
         assert (name in text, "\n" in text, len(text) <= 110) == (True, False, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count"), [("Transport", 1), ("Compensation", 4), ("Separation", 4), ("Analysis", 3)]
 )

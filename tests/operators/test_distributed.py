@@ -49,6 +49,7 @@ def run_cases(folder: Path, *names: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_all_cases_in_one_run(tmp_path):
     """Starting takes longer than what they do."""
     run = run_cases(tmp_path, *CASES)

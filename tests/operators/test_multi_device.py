@@ -54,6 +54,7 @@ def test_methods_that_read_rows_say_where_these_are(two, method):
         ltcl.solve(S, np.ones(PIXELS), method)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["auto", "chebyshev", "cg", "gmres", "neumann", "bicgstab"])
 def test_methods_of_products_alone_solve_on_all_devices(two, method):
     S = ltcl.Transport(transport(), GRID, device="all").systems[0]
@@ -152,6 +153,7 @@ def test_the_command_line_takes_all_devices(two, tmp_path, capsys):
     np.testing.assert_allclose(patterns[1], patterns[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_page_on_scale_runs(two, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     root = Path(__file__).resolve().parents[2]

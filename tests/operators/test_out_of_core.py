@@ -126,6 +126,7 @@ def test_a_file_that_is_cut_before_its_first_use_is_refused(tmp_path, no_room):
             use()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", [".npy", ".zarr"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_file_without_room_is_solved_from_the_disk(tmp_path, request, extension, dtype):

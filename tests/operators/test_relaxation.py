@@ -64,6 +64,7 @@ def sweeps_of(relax: Relaxation, k: int | None) -> tuple[Sweeps, np.ndarray, np.
     return sweeps, x, b
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [None, 5])
 @pytest.mark.parametrize("name", MATRICES)
 @pytest.mark.parametrize("method", METHODS)

@@ -98,6 +98,7 @@ def test_products_are_those_of_the_exact_matrix(device, walls, n):
     assert not A.diagonal().any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "block",
     [

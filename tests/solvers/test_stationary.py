@@ -151,6 +151,7 @@ def pictures(n: int) -> list[np.ndarray]:
     return [np.ones(n), rng.normal(size=n), np.eye(n)[n // 3], columns]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("albedo", ALBEDOS)
 @pytest.mark.parametrize(("method", "dual", "sides", "bounds"), CASES)
 def test_every_method_passes_both_ways(device, method, dual, albedo, sides, bounds):

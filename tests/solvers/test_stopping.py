@@ -19,6 +19,7 @@ from tests.solvers.helpers import ITERATIVE, failed, slow_cases, small_blocks
 random = np.random.default_rng(10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ITERATIVE)
 @pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5, 1e-6, *slow_cases(1e-4, 3e-8, 1e-10)])
 @pytest.mark.parametrize("rho", [0.5, 0.97, *slow_cases(0.1, 0.9)])

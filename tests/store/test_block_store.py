@@ -33,6 +33,7 @@ def refused(path: Path, word: str = "") -> None:
         BlockStore.open(path).verify()
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=25)
 @given(
     st.integers(1, 9),

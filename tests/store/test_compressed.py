@@ -220,6 +220,7 @@ def mutants(array: np.ndarray) -> Any:
             yield changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("core", CORES)
 def test_whatever_arrays_say_there_is_a_transport_or_one_line(
     device: Any, tmp_path: Path, core: str

@@ -80,6 +80,7 @@ def check_committed(path: Path, reported: set[tuple[int, int]]) -> None:
         np.testing.assert_array_equal(store.block(channel, block).matrix.toarray(), columns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ENDS)
 def test_an_acquisition_that_ends_at_any_line(
     tmp_path: Path, finished: dict[str, str], end: str
@@ -91,6 +92,7 @@ def test_an_acquisition_that_ends_at_any_line(
         assert stores.contents(path) == finished
 
 
+@pytest.mark.slow
 def test_killed_from_outside(tmp_path: Path, finished: dict[str, str]) -> None:
     path = tmp_path / "T.zarr"
     seconds = 0.0
@@ -119,6 +121,7 @@ REPLACING: dict[str, Callable[..., object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ENDS)
 @pytest.mark.parametrize("name", REPLACING)
 def test_one_store_is_there_at_every_line_of_replacing_it(

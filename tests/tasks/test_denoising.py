@@ -106,6 +106,7 @@ def test_reciprocity_is_restored_where_the_scene_has_it_and_left_out_where_not(s
         assert D.reciprocity_defect < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_few_photons_an_entry_do_not_move_light_between_reciprocal_pairs(seed: int) -> None:
     """Columns of a path tracer have few paths: logarithms of dim entries would have a bias."""
@@ -146,6 +147,7 @@ def test_the_noise_of_the_result_is_that_of_its_pictures(scene: str) -> None:
     assert D.noise.floor < T.noise.floor
 
 
+@pytest.mark.slow
 def test_without_noise_nothing_changes() -> None:
     exact = truth("painted", 8)
     noise = Noise.uniform(exact.shape, 0.0)

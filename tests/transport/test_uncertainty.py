@@ -46,6 +46,7 @@ def calibrated(ratios: Any, rtol: float = 1.0) -> bool:
     return bool((np.abs(within(ratios) - (0.68, 0.95)) < rtol * np.array([0.07, 0.04])).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "level"), [(scene, (1e-4, 1e-3, 1e-2)[k % 3]) for k, scene in enumerate(SCENES)]
 )
@@ -95,6 +96,7 @@ def colours(mixing: Any, noise: Noise | None, error: np.ndarray | float = 0.0) -
     return ltcl.Transport(matrices + error, truth("corner", 8).grid, mixing=mixing, noise=noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mixing", [None, [[0.9, 0.1, 0.0], [0.1, 0.8, 0.1], [0.0, 0.2, 0.9]]])
 def test_frames_and_colours(mixing: Any) -> None:
     """Each frame and colour as errors of it; channels have noise of their own."""

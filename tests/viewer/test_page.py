@@ -240,6 +240,7 @@ def test_bounces_are_mixed_by_sliders(page: Page, T: ltcl.Transport, picture: np
     shows(page, "bounces-mix", T @ np.ones(T.grid, np.float32))
 
 
+@pytest.mark.slow
 def test_film_builds_the_picture_bounce_by_bounce(
     page: Page, T: ltcl.Transport, picture: np.ndarray
 ) -> None:
@@ -354,6 +355,7 @@ def test_pictures_and_spots_relight(
     shows(page, "relight-seen", T @ painted(page))
 
 
+@pytest.mark.slow
 def test_a_video_relights_as_it_plays(page: Page, T: ltcl.Transport, tmp_path: Path) -> None:
     film = cv2.VideoWriter(str(tmp_path / "v.webm"), cv2.VideoWriter.fourcc(*"VP80"), 10, (96, 48))
     for k in range(20):  # red moves to the right
@@ -402,6 +404,7 @@ def settle(page: Page) -> None:
     page.wait_for_selector("body[data-state=ready]")
 
 
+@pytest.mark.slow
 def test_a_late_pattern_of_the_server_replaces_nothing(
     page: Page,
     scene: ViewerScene,
@@ -579,6 +582,7 @@ def test_reload_and_resize_keep_the_view(
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
+@pytest.mark.slow
 def test_server_is_killed_and_started_again(
     browser: Browser, T: ltcl.Transport, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -614,6 +618,7 @@ def test_a_page_too_many_is_told_so_and_comes_in_later(
     assert other.locator("#banner").is_hidden()
 
 
+@pytest.mark.slow
 def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
     text = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
     (tmp_path / "acquisition.toml").write_text(text)
@@ -729,6 +734,7 @@ def test_tabs_by_keys(page: Page) -> None:
         assert page.locator("[role=tab][aria-selected=true]").get_attribute("id") == f"tab-{view}"
 
 
+@pytest.mark.slow
 def test_phone(browser: Browser, viewer: Any) -> None:
     with browser.new_context(
         viewport={"width": 360, "height": 740}, has_touch=True, is_mobile=True
@@ -748,6 +754,7 @@ def test_phone(browser: Browser, viewer: Any) -> None:
         page.get_by_text("row 0, column 0").first.wait_for()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 360])
 def test_nothing_serious_stands_in_the_way_of_access(
     browser: Browser, viewer: Any, width: int

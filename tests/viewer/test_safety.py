@@ -231,6 +231,7 @@ def test_wrong_tokens_hosts_and_origins(running):
     assert status(running.request(f"/{token}/", "evil.example", two)) == 400
 
 
+@pytest.mark.slow
 def test_wrong_methods_and_what_is_no_request(running):
     page = f"/{running.token}/"
     origin = f"Origin: http://{running.host}\r\nContent-Length: 0\r\n"
@@ -410,6 +411,7 @@ def frames() -> list[str | bytes]:
     return [*texts, question({"id": 1, "do": "relight"}, {"pattern": bad}), bytes(1 << 17)]
 
 
+@pytest.mark.slow
 def test_frames(running):
     passed = 0
     for frame in frames():

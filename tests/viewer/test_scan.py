@@ -251,6 +251,7 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
         np.testing.assert_array_equal(found[..., 0], np.rint(255 * pattern))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slow", [0.0, 0.15])
 def test_a_film_is_compensated_frame_by_frame_and_never_late(
     device, tmp_path: Path, slow: float
@@ -295,6 +296,7 @@ def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) 
     np.testing.assert_allclose(shown[0].astype(int), exact.astype(int), atol=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_grey", [False, True])
 def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey: bool) -> None:
     T = ltcl.scenes.dihedral(4, albedo=0.6 if is_grey else (0.7, 0.5, 0.3)).transport()

@@ -15,6 +15,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,7 @@ def test_columns_and_rows_are_those_of_T(shown):
             near(page.ask(ask, pixel=pixel)[name], matrix @ unit.ravel())
 
 
+@pytest.mark.slow
 def test_relighting_with_codes(shown):
     T, page = shown
     for c in (1, 3):
@@ -405,7 +407,9 @@ def test_a_viewer_in_a_notebook_is_a_frame(colour):
             assert f'src="{viewer.url}"' in viewer._repr_html_()
             assert viewer.url in repr(viewer)
 
-    asyncio.run(cell())
+    # A browser of another test may have left an event loop in this thread.
+    with ThreadPoolExecutor(1) as other_thread:
+        other_thread.submit(lambda: asyncio.run(cell())).result()
 
 
 def test_an_address_that_cannot_be_had_is_refused(colour):

@@ -349,6 +349,7 @@ def stop(step: str, done: int, total: int) -> None:
         raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("swaps", "text"),
     [

@@ -144,6 +144,7 @@ def oblique_rig(shift: float) -> Unplugged:
     return Unplugged(corner(), (8, 16), camera_grid=size, camera_map=view)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("strategy", "after"), [("pixel", 9), ("hadamard", 9), ("adaptive", 10)])
 def test_a_camera_that_moved(strategy: str, after: int) -> None:
     """It moves half a pixel between patterns: each agrees by itself, blocks do not."""

@@ -135,6 +135,7 @@ def test_a_limit_of_steps_raises_or_leaves_a_gap(device):
     assert not c.limited[0].converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bounds", "gain"), [((0.1, 0.6), 1.0), ((0.0, 1.0), 2.0), ((0.0, 1.0), 1.0)]
 )

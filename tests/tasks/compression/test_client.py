@@ -133,6 +133,7 @@ def test_numbers_of_rows_larger_than_memory_are_those_of_the_serial_ones(
     assert (C.threshold, C.dropped) == (serial.threshold, pytest.approx(serial.dropped, rel=1e-12))
 
 
+@pytest.mark.slow
 def test_a_transport_in_memory(client):
     T = ltcl.scenes.dihedral(4, albedo=0.8).transport()
     serial, C = (ltcl.compress(T, 0.05, basis="haar", client=each) for each in (None, client))

@@ -87,6 +87,7 @@ def corner() -> tuple[ltcl.Transport, ltcl.Transport]:
     return T, ltcl.compress(T, 0.05, basis="db2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [0.1, 1e-2])
 @pytest.mark.parametrize("scene", SCENES)
 def test_solutions_are_within_the_bound_and_the_bound_within_the_tolerance(scene, rtol):
@@ -106,6 +107,7 @@ def test_solutions_are_within_the_bound_and_the_bound_within_the_tolerance(scene
         np.testing.assert_allclose(compressed.R.diagonal(), np.diagonal(S) - 1, atol=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=16, deadline=None)
 @given(
     basis=st.sampled_from(["db2", "haar", "db4 rows", "pixels", "sym4"]),
@@ -125,6 +127,7 @@ def test_the_bound_holds_for_random_matrices(basis, h, w, rtol, noise, strength,
     assert worst_error(S, C.systems[0].to_dense()) <= C.error <= rtol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tuned", ["0", "1"])
 @pytest.mark.parametrize("basis", [None, "db2 rows"])
 def test_the_same_transport_gives_the_same_bits(basis, tuned, monkeypatch):
@@ -170,6 +173,7 @@ def test_solves_run_on_coefficients_and_refuse_what_is_not_in_them(corner):
     assert np.linalg.norm(refined - x) <= 1e-4 * np.linalg.norm(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["dihedral", "colour"])
 def test_a_budget_is_kept_or_refused_with_what_it_takes(scene):
     T = SCENES[scene]()
@@ -184,6 +188,7 @@ def test_a_budget_is_kept_or_refused_with_what_it_takes(scene):
     assert core_bytes(ltcl.compress(T, 0.9, 1000, basis="db2")) <= 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "bases"), [("open box", ("db2", "haar", "db4")), ("sparse", ("pixels",))]
 )
@@ -194,6 +199,7 @@ def test_smooth_light_is_written_in_wavelets_and_sharp_light_in_pixels(scene, ba
     assert report.nbytes <= 1.3 * min(trial.nbytes for trial in report.trials if not trial.left)
 
 
+@pytest.mark.slow
 def test_masked_pixels_stay_masked_and_mixed_colours_mixed():
     F = np.ones(64)
     F[[3, 40]] = 0.0
@@ -311,6 +317,7 @@ def test_refusals(corner, T, options, kind, words):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["sparse", "open box"])
 @pytest.mark.parametrize("basis", ["db2", "pixels"])
 def test_what_float32_does_not_keep_is_refused_with_what_it_does(scene, basis):
@@ -353,6 +360,7 @@ def room() -> ltcl.Transport:
 CHUNKED = functools.partial(zarr.array, chunks=(30, 50))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holder", [np.asarray, CHUNKED, scipy.sparse.csc_matrix, Rows])
 def test_rows_from_elsewhere_give_the_same_bits(holder, room):
     matrix = holder(room.matrices[0])
@@ -375,6 +383,7 @@ def test_operators_give_their_rows_by_products(form, room, device):
     assert worst_error(dense_systems(room)[0], C.systems[0].to_dense()) <= C.error <= 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basis", ["db2", "db2 rows", "pixels"])
 def test_rows_may_be_dropped_where_no_memory_holds_them(basis, monkeypatch):
     T = ltcl.scenes.dihedral(16, albedo=0.8).transport()

@@ -65,6 +65,7 @@ def test_the_error_is_a_bound_and_within_the_tolerance(name, rtol, basis):
     assert np.linalg.norm(A.to_dense() - scene.A, 2) <= A.error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forms", [(None,) * 3, ("db2", "db2 rows", "haar")])
 def test_colours_have_their_own(forms):
     """Channels that were compressed in several forms are written in one basis."""
@@ -129,6 +130,7 @@ def test_a_compressed_transport_is_inverted_as_it_is(device, form):
         ltcl.invert(T, 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basis", ["haar", "pixels"])
 @pytest.mark.parametrize("form", ["db2 rows", "db2", "pixels"])
 def test_a_transport_of_any_form_is_inverted(form, basis):
@@ -227,6 +229,7 @@ def error_of_coefficients(C, D):
     return relative_error(D.toarray(), np.eye(C.shape[0]) + C.toarray().astype(np.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("undo", [True, False])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("rtol", [0.1, 1e-4])

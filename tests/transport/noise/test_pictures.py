@@ -82,6 +82,7 @@ def losses(T: ltcl.Transport, C: ltcl.Transport, picture: np.ndarray) -> list[fl
     return [float(np.linalg.norm(a - exact) / np.linalg.norm(exact)) for a, exact in pairs]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", measured.SCENES)
 def test_pictures_that_were_not_drawn_lose_no_more_than_is_stated(name: str) -> None:
     T, C = compressed(name, 0.02)
