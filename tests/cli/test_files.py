@@ -159,6 +159,7 @@ def test_analysis_shows_divergence_and_draws(program, transport, tmp_path):
 COMPRESSION = ["--rtol", "0.05", "--basis", "haar", "--basis", "pixels"]
 
 
+@pytest.mark.slow
 def test_a_compressed_file_is_smaller_and_solves(program, colour_transport, tmp_path):
     out = tmp_path / "C.npz"
     arguments = [*COMPRESSION, "--budget", "1.5GiB", "--out", out, "--json"]

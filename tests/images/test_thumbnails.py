@@ -17,6 +17,8 @@ from ltcl.acquisition import Report, VirtualRig
 from ltcl.acquisition.scanning import plans
 from ltcl.images.thumbnails import thumbnails
 
+pytestmark = pytest.mark.slow
+
 
 def decoded(html: str) -> list[np.ndarray]:
     pictures = []
@@ -53,7 +55,6 @@ def test_text_is_one_line(results: dict[str, Any], tmp_path: Path) -> None:
         assert (name in text, "\n" in text, len(text) <= 110) == (True, False, True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count"), [("Transport", 1), ("Compensation", 4), ("Separation", 4), ("Analysis", 3)]
 )

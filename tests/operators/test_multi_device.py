@@ -139,6 +139,7 @@ def test_all_devices_are_opened_once(two, monkeypatch):
     assert ltcl.open_device("all") is ltcl.open_device("7:0")
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_all_devices(two, tmp_path, capsys):
     matrix = str(tmp_path / "T.npz")
     picture = str(tmp_path / "picture.exr")

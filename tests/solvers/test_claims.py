@@ -130,6 +130,7 @@ def test_T_in_float64_is_judged_in_float64(device, method):
         assert true_residual(matrix / np.diag(matrix), s.x, b) <= 1.01e-12
 
 
+@pytest.mark.slow
 def test_threads_share_one_factorization(device):
     S = IdentityPlus(Dense(device, np.random.default_rng(0).uniform(0.0, 1.0 / 128, (128, 128))))
     with ThreadPoolExecutor(4) as pool:

@@ -117,6 +117,7 @@ def test_it_is_stored_and_reported(tmp_path: Path) -> None:
     assert error > 0.05
 
 
+@pytest.mark.slow
 def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_path: Path) -> None:
     """Few camera pixels there are decoded: pixels at its rim would show the bright walls."""
     albedo = np.full(GRID, 0.8)

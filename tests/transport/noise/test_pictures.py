@@ -99,6 +99,7 @@ def test_pictures_that_were_not_drawn_lose_no_more_than_is_stated(name: str) -> 
     assert C.error < worst <= C.error_bound == report.error_bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", measured.SCENES)
 def test_noise_is_dropped_and_no_more(name: str) -> None:
     T, C = compressed(name, "noise")
