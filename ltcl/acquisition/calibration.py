@@ -142,6 +142,14 @@ class Calibration:
             store.extra(PREFIX + name, array)
 
 
+def is_calibrated(store: BlockStore) -> bool:
+    """True if a whole calibration is in the store.
+
+    The strategy of the scan, which the calibration decides, is written last: that commits it.
+    """
+    return "strategy" in store.attributes
+
+
 def _stored_arrays(store: BlockStore) -> dict[str, np.ndarray]:
     """The arrays of a calibration, by their names without `PREFIX`."""
     arrays = {}

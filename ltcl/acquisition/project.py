@@ -29,7 +29,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import rigs
 from ltcl.acquisition.calibrate import expected_photographs
-from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.calibration import Calibration, is_calibrated
 from ltcl.acquisition.metering import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
@@ -152,7 +152,7 @@ class Project:
         store = BlockStore.open(self.store)
         if store.final:
             return "final"
-        return "begun" if "strategy" in store.attributes else "new"
+        return "begun" if is_calibrated(store) else "new"
 
     @contextlib.contextmanager
     def rig(self, *, closed: bool = False, aligned: bool = False) -> Iterator[Any]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
-from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.calibration import Calibration, is_calibrated
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, Shots
@@ -192,7 +192,7 @@ def finalize(store: str | os.PathLike[str], progress: Progress | None = None) ->
     if progress is None:
         progress = ignore_progress
     opened = BlockStore.open(store)
-    if "strategy" not in opened.attributes:
+    if not is_calibrated(opened):
         raise FileError(
             f"{opened.path}: holds no whole calibration of ltcl.acquire, so no transport either"
         )
@@ -257,7 +257,7 @@ def _open_calibrated(path: Path, resume: bool) -> BlockStore | None:
     store = BlockStore.open(path)
     if "acquisition" not in store.provenance:
         raise InputError(f"store is {path}, which ltcl.acquire did not make; give another one")
-    return store if "strategy" in store.attributes else None
+    return store if is_calibrated(store) else None
 
 
 def _is_empty_folder(path: Path) -> bool:

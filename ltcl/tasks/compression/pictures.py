@@ -22,7 +22,10 @@ from ltcl.operators import IdentityPlus, Operator
 from ltcl.tasks.compression.inputs import CompressionProblem
 from ltcl.tasks.compression.norms import solve_columns
 
-# Pictures that confirm an error, and the confidence of what is said of them.
+# Pictures that confirm an error, and the confidence of what is said of them. One draw of so many
+# speaks of 0.01^(1/256) = 98.2 % of all pictures. Draw k has the confidence 1 - 0.01 / (k (k + 1)),
+# so that all together keep 99 %; the 24th, the last of three channels and eight thresholds each,
+# still speaks of 95.8 %.
 PICTURE_COUNT = 256
 PICTURE_CONFIDENCE = 0.99
 PICTURES_AT_ONCE = 64
