@@ -182,7 +182,7 @@ def resize(image: ArrayLike, grid: tuple[int, int]) -> np.ndarray:
     Returns
     -------
     ndarray
-        float32, `grid` or (*grid, 3).
+        float32, (h, w) or (h, w, 3) of that grid.
 
     Raises
     ------

@@ -103,7 +103,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
         )
 
     def norm_bound(self) -> NormBound:
-        """A bound on the 2-norm of |A|, entry by entry, or else an estimate.
+        """A bound on the 2-norm of A without its signs, entry by entry, or else an estimate.
 
         Without entries it is the largest row sum: a bound if A is symmetric and nonnegative.
         """

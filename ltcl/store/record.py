@@ -102,7 +102,7 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
     def _rmatmat(self, X: Any) -> np.ndarray:
         product = np.zeros((self.shape[1], X.shape[1]))
         for first, block in self.row_blocks():
-            rows, _ = block.shape
+            rows = len(block.indptr) - 1
             product += block.T @ X[first : first + rows]
         return product
 

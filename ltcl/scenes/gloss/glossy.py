@@ -308,8 +308,8 @@ def _with_last_slots(exchange: scipy.sparse.csr_array, slots: int) -> scipy.spar
     entries = exchange.tocoo()
     rows = entries.row + entries.row // bins
     columns = entries.col + entries.col // bins
-    n_bins, _ = exchange.shape
-    size = n_bins // bins * slots
+    patches = (len(exchange.indptr) - 1) // bins
+    size = patches * slots
     return scipy.sparse.csr_array((entries.data, (rows, columns)), (size, size))
 
 
