@@ -17,10 +17,11 @@ from sphinx.application import Sphinx
 import ltcl
 
 DOCS = Path(__file__).resolve().parent
+# Gallery_figures; what the paper's figures share with it.
 sys.path += [
     str(DOCS),
     str(DOCS.parent / "bench"),
-]  # gallery_figures; what the paper's figures share with it
+]
 
 project = "ltcl"
 author = "ltcl developers"

@@ -95,9 +95,8 @@ def relax_windows(M: np.ndarray, block: int, panel: int, *, inverses: bool) -> n
     """First entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
     i = np.arange(len(M))
     edges = np.stack([i - i % panel, i - i % block if inverses else i], axis=1)
-    before = np.cumsum(
-        np.pad(M != 0, ((0, 0), (1, 0))), axis=1
-    )  # entries of a row, left of each column
+    # Entries of a row, left of each column.
+    before = np.cumsum(np.pad(M != 0, ((0, 0), (1, 0))), axis=1)
     starts = np.cumsum(before[:, -1]) - before[:, -1]
     return starts[:, None] + np.take_along_axis(before, edges, axis=1)
 
@@ -264,9 +263,8 @@ def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) 
         geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4)
     )
     angle = np.arange(8) * np.pi / 4
-    place = (
-        np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    )  # on a circle, in edges
+    # On a circle, in edges.
+    place = np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = [centre + u * right + v * down for u, v in place]
 
     def between(p: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -150,9 +150,8 @@ def test_every_sparse_format_becomes_a_canonical_csr_array(form, dtype):
     assert type(result) is scipy.sparse.csr_array
     np.testing.assert_array_equal(result.toarray(), dense)
     row = np.repeat(np.arange(5), np.diff(result.indptr))
-    assert np.all(
-        np.diff(row * 7 + result.indices) > 0
-    )  # by hand: SciPy remembers what it once saw
+    # By hand: SciPy remembers what it once saw.
+    assert np.all(np.diff(row * 7 + result.indices) > 0)
 
 
 def test_disorder_is_seen_even_where_scipy_remembers_order():

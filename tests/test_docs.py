@@ -12,10 +12,11 @@ import pytest
 import ltcl
 
 NAMES = [module.name for module in pkgutil.walk_packages(ltcl.__path__, "ltcl.")]
+# That runs the program.
 MODULES = [
     "ltcl",
     *sorted(name for name in NAMES if not name.endswith(".__main__")),
-]  # that runs the program
+]
 
 
 @pytest.mark.parametrize("name", MODULES)

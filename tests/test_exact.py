@@ -100,9 +100,8 @@ def test_tasks_beside_the_exact_one(device, channels, rtol, close):
     desired = T @ rng.uniform(0.2, 0.8, GRID)  # within the bounds
     ours = ltcl.compensate(C, desired, exact=T, rtol=rtol)
     theirs = ltcl.compensate(T, desired, method="direct")
-    np.testing.assert_allclose(
-        ours.pattern, theirs.pattern, rtol=0, atol=close
-    )  # rtol is of the norm
+    # Rtol is of the norm.
+    np.testing.assert_allclose(ours.pattern, theirs.pattern, rtol=0, atol=close)
     image = T @ rng.uniform(0.2, 0.8, GRID)
     ours = ltcl.separate(C, image, 2, exact=T, rtol=rtol)
     theirs = ltcl.separate(T, image, 2, method="direct")

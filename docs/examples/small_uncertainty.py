@@ -17,9 +17,8 @@ corner = ltcl.scenes.dihedral(14, albedo=0.75)
 true = corner.transport().to_numpy()
 random = np.random.default_rng(0)
 measured, again = (true + 3e-4 * random.normal(size=true.shape) for _ in range(2))
-T = ltcl.Transport(
-    measured, corner.grid, noise=ltcl.Transport(again, corner.grid)
-)  # two measurements tell
+# Two measurements tell.
+T = ltcl.Transport(measured, corner.grid, noise=ltcl.Transport(again, corner.grid))
 
 white = (true @ np.ones(len(true))).reshape(corner.grid)
 parts = ltcl.separate(T, white, bounces=2)

@@ -105,9 +105,8 @@ from ltcl.errors import LtclError, PhotographMissing
 from ltcl.plots import pictures
 
 corner = ltcl.scenes.dihedral(4, albedo=0.7)
-place = camera_map(
-    lambda x, y: ((x - 4) / 4, (y - 3) / 4), (22, 38), corner.grid
-)  # 4 of its pixels to one
+# 4 of its pixels to one.
+place = camera_map(lambda x, y: ((x - 4) / 4, (y - 3) / 4), (22, 38), corner.grid)
 camera = VirtualRig(
     corner.transport(), corner.grid, camera_grid=(22, 38), camera_map=place, ambient=0.01
 )

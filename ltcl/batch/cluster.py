@@ -276,9 +276,8 @@ class _Crew:
     share_gpu: bool
     yields_errors: bool
     tasks: deque[_Task] = field(default_factory=deque)  # in order, until their results are yielded
-    ready: dict[str, str | None] = field(
-        default_factory=dict
-    )  # addresses of workers, and their GPUs
+    # Addresses of workers, and their GPUs.
+    ready: dict[str, str | None] = field(default_factory=dict)
     excluded: set[str] = field(default_factory=set)
     token: str = field(default_factory=lambda: secrets.token_hex(8))
     has_lost_workers: bool = False  # they may be started again
@@ -363,9 +362,8 @@ class _Crew:
         from distributed import KilledWorker, wait
 
         with self.client.as_current():
-            wait(
-                task.future, timeout=PERIOD
-            )  # `result` that waits in vain leaves tracebacks behind
+            # `result` that waits in vain leaves tracebacks behind.
+            wait(task.future, timeout=PERIOD)
         if task.future.status == "error":
             error = task.future.exception()
             if isinstance(error, KilledWorker):

@@ -75,9 +75,8 @@ def test_items_that_are_done_leave_memory(client):
             sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert sizes[-1] - sizes[9] < 5 << 20, (
-        sizes
-    )  # here and on the scheduler, which is in this process
+    # Here and on the scheduler, which is in this process.
+    assert sizes[-1] - sizes[9] < 5 << 20, sizes
 
 
 def test_a_function_is_sent_once_to_each_worker(client, monkeypatch):

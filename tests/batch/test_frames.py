@@ -107,9 +107,8 @@ def test_grey_coloured_black_and_bright_frames_are_what_each_is_alone(T, tmp_pat
     )
     for record, picture, pattern in zip(done.records, pictures, patterns(done), strict=True):
         alone = ltcl.compensate(T, picture, rtol=1e-4)
-        shown = (
-            pattern[..., 0] if picture.ndim == 2 else pattern
-        )  # a batch with one in colour is in colour
+        # A batch with one in colour is in colour.
+        shown = pattern[..., 0] if picture.ndim == 2 else pattern
         np.testing.assert_allclose(shown, alone.pattern, atol=2e-3)
         assert record.error == pytest.approx(alone.error, abs=1e-3)
         assert record.clipped == pytest.approx(alone.clipped, abs=0.05)
@@ -150,9 +149,8 @@ def test_videos_in_and_out_also_where_sound_outlasts_the_picture(T, tmp_path, ca
     out = tmp_path / "out.avi"
     write_video(film, seen(LIGHT), fps=30.0)
     data = film.read_bytes()
-    place = (
-        data.index(b"\x44\x89\x88") + 3
-    )  # its duration, of which the number of frames is estimated
+    # Its duration, of which the number of frames is estimated.
+    place = data.index(b"\x44\x89\x88") + 3
     (duration,) = struct.unpack_from(">d", data, place)
     film.write_bytes(data[:place] + struct.pack(">d", 1.2 * duration) + data[place + 8 :])
     common: dict[str, Any] = {"out": tmp_path / "patterns", "video": out, "rtol": 1e-4, "batch": 4}
@@ -186,9 +184,8 @@ def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, 
         common["T"] = ltcl.load(tmp_path / "T.npz", first_bounce=SCENE.F)
     (out / "pattern_000006.png").unlink()
     assert compensate_frames(**common, resume=True).solved == 1
-    np.testing.assert_allclose(
-        patterns(done), patterns(whole), atol=1e-3
-    )  # 5 to 8 were not one batch
+    # 5 to 8 were not one batch.
+    np.testing.assert_allclose(patterns(done), patterns(whole), atol=1e-3)
 
 
 class Projector:

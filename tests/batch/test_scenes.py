@@ -65,9 +65,8 @@ def test_a_scene_that_ends_its_workers_is_named_and_the_rest_goes_on(client):
 
 def test_what_an_error_holds_stays_with_the_worker(client):
     def fail(scene: str) -> None:
-        raise errors.ConvergenceError(
-            f"{scene} is none", threading.Lock()
-        )  # a lock cannot be pickled
+        # A lock cannot be pickled.
+        raise errors.ConvergenceError(f"{scene} is none", threading.Lock())
 
     with pytest.raises(BatchError, match=r"1 of 1 scenes failed: a: a is none"):
         ltcl.batch.map(fail, "a", client=client)

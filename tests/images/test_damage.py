@@ -84,9 +84,8 @@ def test_a_mutant_gives_a_picture_or_one_line_that_names_it(tmp_path, capfd, suf
     assert refused > MUTANTS / 10
     out, err = capfd.readouterr()
     assert out == ""
-    assert (
-        suffix == ".exr" or err == ""
-    )  # OpenEXR itself writes of damaged pixels, and cannot be told not to
+    # OpenEXR itself writes of damaged pixels, and cannot be told not to.
+    assert suffix == ".exr" or err == ""
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -167,9 +167,8 @@ def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-7), (np.float32, 1e-6)])
 def test_the_srgb_curve_is_the_closed_form_and_undone_also_outside_0_to_1(dtype, rtol):
     for code in np.linspace(0, 1, 257):
-        exact = (
-            code / 12.92 if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4
-        )  # IEC 61966-2-1
+        # IEC 61966-2-1.
+        exact = code / 12.92 if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4
         assert images.from_srgb(np.float64(code)) == pytest.approx(exact, rel=1e-14)
     values = np.concatenate([[0, 0.04045], np.linspace(-2, 3, 501)]).astype(dtype)
     assert images.from_srgb(values).dtype == dtype

@@ -103,9 +103,8 @@ def test_products_are_those_of_the_exact_matrix(device, walls, n):
     "block",
     [
         Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), albedo=0.5),  # on the floor, faces cut patches
-        Block(
-            (0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=(0.5, 0.3, 0.2)
-        ),  # faces between patches
+        # Faces between patches.
+        Block((0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=(0.5, 0.3, 0.2)),
         Block((0, 0.4, 0), (0.3, 0.6, 0.7), albedo=0.5),  # in a corner
         None,
     ],

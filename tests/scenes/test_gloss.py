@@ -159,11 +159,12 @@ def test_a_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
     direct = room.picture(room.first_bounce).reshape(5, len(cube.walls), 5)
     names = [wall.name for wall in cube.walls]
     floor, top, side = (direct[:, names.index(name)] for name in ("floor", "block top", "block -x"))
+    # The first is below it.
     assert (floor[2, 2], floor[4, 4], side.max()) == (
         0,
         pytest.approx(0.5),
         0,
-    )  # the first is below it
+    )
     assert top.max() > 20 * 0.5 * (1 - 0.8)  # of the matte part
     # Halfway between projector and camera, which are as high above it.
     assert np.unravel_index(np.argmax(top), top.shape) == (3, 2)

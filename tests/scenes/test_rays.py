@@ -68,9 +68,8 @@ def test_a_pinhole_shows_a_screen_as_it_is() -> None:
     assert not np.concatenate([image[:3].ravel(), image[:, -3:].ravel()]).any()
     fine = np.tile(np.array([[0, 1], [1, 0]], np.float32), (200, 200))
     assert draw(EYE, [SCREEN], fine, 53, supersample=8)[4:-4, 4:-4] == pytest.approx(0.5, abs=0.02)
-    wide = np.broadcast_to(
-        np.linspace(-1, 1, 300, dtype=np.float32), (100, 300)
-    )  # read: its sides are lost
+    # Read: its sides are lost.
+    wide = np.broadcast_to(np.linspace(-1, 1, 300, dtype=np.float32), (100, 300))
     inside = np.array([-0.75, -0.25, 0.25, 0.75]) / 3 / 1.06
     assert read(EYE, [SCREEN], wide, grid=(4, 4))[0] == pytest.approx(inside, abs=0.005)
     assert read(EYE, [SCREEN], wide.T, grid=(4, 4))[:, 0] == pytest.approx(inside, abs=0.005)

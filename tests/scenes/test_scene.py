@@ -134,9 +134,8 @@ def test_faces_of_a_block_look_outwards_and_close_it() -> None:
     ],
 )
 def test_albedo_is_spread_over_walls_and_colours(albedo: Any, expected: Any) -> None:
-    pictures = spread_albedo(albedo, walls=2, n=3).reshape(
-        -1, 3, 2, 3
-    )  # (channels, row, wall, column)
+    # (channels, row, wall, column).
+    pictures = spread_albedo(albedo, walls=2, n=3).reshape(-1, 3, 2, 3)
     assert (
         pictures.tolist()
         == np.broadcast_to(np.array(expected)[:, None, :, None], pictures.shape).tolist()
@@ -184,9 +183,8 @@ def test_closed_box_of_uniform_albedo_reaches_the_bound_of_equation_14(albedo: f
     assert max(abs(np.linalg.eigvalsh((R + R.T) / 2))) == pytest.approx(
         albedo / (1 - albedo), rel=1e-9
     )
-    assert T.sum(axis=1) == pytest.approx(
-        albedo / (1 - albedo), rel=1e-9
-    )  # uniform light glows uniformly
+    # Uniform light glows uniformly.
+    assert T.sum(axis=1) == pytest.approx(albedo / (1 - albedo), rel=1e-9)
 
 
 def test_bounces_of_a_dihedral_alternate() -> None:

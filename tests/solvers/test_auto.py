@@ -105,9 +105,8 @@ def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device)
     first, second, third = (ltcl.solve(S, pictures()) for _ in range(3))
     assert (first.method, first.products) == ("gmres", ltcl.solve(S, pictures(), "gmres").products)
     assert "eigenvalues" not in first.reason
-    assert (
-        "eigenvalues" in ltcl.solve(system(device, ring(0.5)), pictures(20)).reason
-    )  # worth it at once
+    # Worth it at once.
+    assert "eigenvalues" in ltcl.solve(system(device, ring(0.5)), pictures(20)).reason
     assert second.products == third.products + auto.STEPS
     np.testing.assert_array_equal(second.x, third.x)
     ltcl.solve(S, pictures(), "direct")
@@ -129,9 +128,8 @@ def test_where_a_method_has_no_room_the_next_is_tried(device, monkeypatch):
     S = system(device, ring(0.7, 1.0))
     b = pictures()
     assert ltcl.solve(S, b).method == "gmres"
-    monkeypatch.setattr(
-        device, "memory", 40_000
-    )  # bytes: three directions of the survey, not twenty
+    # Bytes: three directions of the survey, not twenty.
+    monkeypatch.setattr(device, "memory", 40_000)
     s = ltcl.solve(S, b)
     assert (s.method, "gmres failed" in s.reason) == ("direct", True)
     assert residual(np.eye(N) + ring(0.7, 1.0), s.x, b) <= 1e-2

@@ -135,9 +135,8 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
 @pytest.mark.parametrize("rho", [0.8, 4.0])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("bright", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize(
-    "seed", [0, 79]
-)  # of the second, lengths and steps once took turns for ever
+# Of the second, lengths and steps once took turns for ever.
+@pytest.mark.parametrize("seed", [0, 79])
 def test_it_finds_the_least_squares(rho, weighted, bright, seed):
     S = lambertian(60, rho, seed=3).S.astype(np.float32)
     random = np.random.default_rng(seed)

@@ -105,9 +105,8 @@ TEXTBOOKS: dict[str, tuple[Callable[..., np.ndarray], int]] = {  # products of a
     ("bicgstab", 4.0, 0.0), ("bicgstab", 4.0, 0.1),
 ])  # fmt: skip
 def test_iterates_are_those_of_the_textbook(device, method, rho, skew, steps):
-    random = np.random.default_rng(
-        1
-    )  # residuals fall at every step: the best iterate is the last one
+    # Residuals fall at every step: the best iterate is the last one.
+    random = np.random.default_rng(1)
     scene = lambertian(40, rho, 29)
     S = scene.S + skew * random.normal(size=(40, 40))
     b = random.normal(size=(40, 2))
@@ -148,9 +147,8 @@ def test_the_residual_of_gmres_never_grows(device, restart):
     s = ltcl.solve(as_operator(scene.S, device), b, "gmres", restart=restart, rtol=1e-4)
     assert residual(scene.S, s.x, b) <= 1e-4 * (1 + 1e-2)
     assert all(after <= before * (1 + 1e-4) for before, after in itertools.pairwise(s.residuals))
-    assert (
-        s.products <= s.iterations + 1
-    )  # the end is confirmed, where the recursion does not prove it
+    # The end is confirmed, where the recursion does not prove it.
+    assert s.products <= s.iterations + 1
 
 
 @pytest.mark.parametrize(
@@ -213,9 +211,8 @@ def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k
     made, waits_made, allocated = ((last - first) / 12 for first, last in zip(*counts, strict=True))
     assert made <= launches + products * (pieces - 1)
     assert waits_made <= waits
-    assert (
-        allocated <= 0.5
-    )  # what reading residuals and keeping the best iterate take, once in some steps
+    # What reading residuals and keeping the best iterate take, once in some steps.
+    assert allocated <= 0.5
 
 
 SIZES = pytest.mark.parametrize(("rows", "k"), [(1, 1), (53, 5), (257, 3), (40, 70), (5001, 1)])
@@ -340,9 +337,8 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     alpha, *wanted = reference.krylov_cg(sums, 2.0 * ones, 0.7 * ones, ~rest, *vectors[:5])
     for array, new in zip(arrays[1:], wanted, strict=True):
         np.testing.assert_allclose(array.get(), new, **close)
-    np.testing.assert_allclose(
-        numbers.get()[5], np.where(rest, 0.7, alpha), rtol=1e-5
-    )  # read by odd steps
+    # Read by odd steps.
+    np.testing.assert_allclose(numbers.get()[5], np.where(rest, 0.7, alpha), rtol=1e-5)
     np.testing.assert_allclose(squares(numbers), np.sum(wanted[-1] ** 2, axis=0), rtol=1e-4)
 
     r, v, half, t, p, x, g = vectors

@@ -23,9 +23,8 @@ from tests.problems import lambertian, residual
 from tests.solvers.helpers import SAMPLED, refused
 
 N = 43
-SCENES = [
-    lambertian(N, rho, density=0.7) for rho in (0.6, 0.3, 0.5)
-]  # as the albedos of a wall differ
+# As the albedos of a wall differ.
+SCENES = [lambertian(N, rho, density=0.7) for rho in (0.6, 0.3, 0.5)]
 SCENE = SCENES[0]
 CORNER = ltcl.scenes.box(10, sides=3, albedo=0.4).transport().systems[0]
 ROOM = CORNER.to_dense().astype(float)

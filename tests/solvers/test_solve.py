@@ -94,9 +94,8 @@ def test_every_method_on_every_operator(device, method, name, columns):
         exact
     )
     assert len(s.residuals) == s.iterations + 1
-    assert (
-        s.residuals[0] == pytest.approx(1.0, rel=1e-5) or "some" in name
-    )  # a part is solved at once
+    # A part is solved at once.
+    assert s.residuals[0] == pytest.approx(1.0, rel=1e-5) or "some" in name
 
 
 @pytest.mark.parametrize("method", METHODS)

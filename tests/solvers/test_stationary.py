@@ -118,13 +118,14 @@ def test_a_few_arnoldi_steps_lose_no_products(device, arnoldi, rho, rtol):
 ALBEDOS = (0.5, 0.8, 0.92, 0.95, 0.99)
 DUALS = ("forward", "inverse")
 ONE_WAY = {("jacobi", "inverse"), ("neumann", "inverse")}  # below an albedo of 1/2 only (eq. 14)
+# Either end may leave out eigenvalues.
 WRONG = [
     (0.5, 2.0),
     (0.3, 1.2),
     (0.9, 1.1),
     (0.04, 0.9),
     (1.5, 4.0),
-]  # either end may leave out eigenvalues
+]
 CASES = [
     *(
         (*case, 6, None)
@@ -160,9 +161,8 @@ def test_every_method_passes_both_ways(device, method, dual, albedo, sides, boun
     S, (least, most) = room(albedo, dual, sides)
     options = {} if bounds is None else {"spectrum": bounds}
     A = as_operator(S, device)
-    budget = (
-        theory.richardson_products(least, 2.0 * most, 1e-3) + 3
-    )  # the slowest, to a tenth of rtol
+    # The slowest, to a tenth of rtol.
+    budget = theory.richardson_products(least, 2.0 * most, 1e-3) + 3
     if bounds is not None:
         budget = 2 * theory.chebyshev_products(*theory.free_bounds(A), 1e-4) + 30
     elif method == "chebyshev":

@@ -76,19 +76,16 @@ def test_below_the_floor_of_float32_it_stagnates(device, method):
 # <b, S b> = 0 for b = (1, 1)
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 SIGNS = np.diag([1.0, -1.0])
-whole = (
-    np.random.default_rng(0).integers(-9, 9, (6, 6)).astype(float)
-)  # float32 holds these to the bit
+# Float32 holds these to the bit.
+whole = np.random.default_rng(0).integers(-9, 9, (6, 6)).astype(float)
 SINGULAR = {
     "to the bit": np.array([[1.0, 2.0], [2.0, 4.0]]),
     "a zero row": np.diag([1.0, 0.0, 1.0]),
-    "to rounding": np.vstack(
-        [whole[:5], whole[0] + whole[1] - whole[2]]
-    ),  # the last pivot is 1e-15, not 0
+    # The last pivot is 1e-15, not 0.
+    "to rounding": np.vstack([whole[:5], whole[0] + whole[1] - whole[2]]),
 }
-LARGE = np.full((6, 6), 9.0) - 8.0 * np.eye(
-    6
-)  # far beyond what any splitting takes, not self-adjoint
+# Far beyond what any splitting takes, not self-adjoint.
+LARGE = np.full((6, 6), 9.0) - 8.0 * np.eye(6)
 LARGE[0] *= (1, -1, -1, -1, -1, -1)
 # I - S S~^-1 is 1 - 6 / 2 at one pixel
 FAR = np.diag([6.0, 0.8, 0.8])
@@ -109,13 +106,14 @@ ENDS: dict[str, tuple[Any, Any, str, Status, dict[str, Any]]] = {  # S, b, metho
         {},
     ),
     "large": (LARGE, np.ones(6), "gauss_seidel", Status.DIVERGED, {}),
+    # fig. 5c.
     "neither falls nor grows": (
         enclosure(30, 0.5).S,
         np.ones(30),
         "jacobi",
         Status.STAGNATED,
         {},
-    ),  # fig. 5c
+    ),
     "start beyond float32": (
         *(np.eye(6) + np.triu(np.full((6, 6), 10.0)), np.ones(6), "neumann", Status.DIVERGED),
         {"x0": np.full(6, 1e6)},

@@ -101,9 +101,8 @@ def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -
         if "response" not in store.extras:
             store.extra("response", np.arange(5.0))
         store.update(finished=True)
-    store.finalize(
-        memory=64 * 40
-    )  # or remove what a process that was killed at the very end has left
+    # Or remove what a process that was killed at the very end has left.
+    store.finalize(memory=64 * 40)
 
 
 def in_child(work: Callable[[], None]) -> int:

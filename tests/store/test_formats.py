@@ -27,6 +27,7 @@ from .stores import dense, sparse
 random = np.random.default_rng()
 read: Any = formats.read
 COORDINATE = b"%%MatrixMarket matrix coordinate real general\n"
+# SciPy reads 1 of 1..2.
 NO_NUMBERS = (
     b"x",
     b"1.5E",
@@ -36,7 +37,7 @@ NO_NUMBERS = (
     b"1\0",
     b"+-1",
     b"nan",
-)  # SciPy reads 1 of 1..2
+)
 ARRAY = b"%%MatrixMarket matrix array real general\n"
 
 
@@ -358,9 +359,8 @@ def test_a_small_archive_cannot_declare_terabytes(tmp_path: Path, claims: tuple[
     assert "TiB" in refusal(tmp_path / "T.npz", FileError)
 
 
-@pytest.mark.parametrize(
-    "extension", [".npz", ".mtx", ".h5", "5.mat", ".zarr"]
-)  # .npy stays on the disk
+# .npy stays on the disk.
+@pytest.mark.parametrize("extension", [".npz", ".mtx", ".h5", "5.mat", ".zarr"])
 def test_an_honest_giant_is_a_matter_of_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extension: str
 ) -> None:

@@ -126,9 +126,8 @@ def test_damaged_files_of_every_format(tmp_path: Path, device: Device) -> None:
     assert done.returncode == 0, done.stderr[-2000:]  # a crash ends with a negative one
     outcome = json.loads(done.stdout)
     assert outcome["raw"] == []
-    assert (
-        0.5 * COUNT < outcome["refused"] < 0.95 * COUNT
-    )  # other numbers in .mtx or HDF5 are as valid
+    # Other numbers in .mtx or HDF5 are as valid.
+    assert 0.5 * COUNT < outcome["refused"] < 0.95 * COUNT
     assert outcome["grown"] < 64 << 20
 
 

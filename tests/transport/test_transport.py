@@ -163,11 +163,12 @@ def test_a_camera_of_another_grid_relights_and_has_no_S(device, form, camera):
 # Bad input: matrix, other arguments, error, and the argument and value that its message names.
 
 
+# No diagonal.
 KNOWN: dict[str, Any] = {
     "shape": (35, 35),
     "matvec": SCENE.T.dot,
     "dtype": np.float64,
-}  # no diagonal
+}
 T35 = SCENE.T
 BARE = LinearOperator(**KNOWN)
 DARK = np.isin(np.arange(35), [2, 9, 23])

@@ -224,9 +224,8 @@ def test_wrong_tokens_hosts_and_origins(running):
         ("picture", "POST", "Content-Length: 0\r\n"),
         ("socket", "GET", UPGRADE),
     ):
-        assert (
-            status(running.request(f"/{token}/{end}", more=more, method=method)) == 403
-        )  # without an origin
+        # Without an origin.
+        assert status(running.request(f"/{token}/{end}", more=more, method=method)) == 403
     two = f"Host: {own}\r\nOrigin: http://{own}\r\n"
     assert status(running.request(f"/{token}/", "evil.example", two)) == 400
 
@@ -428,9 +427,8 @@ def test_frames(running):
         b"\x89\xfe\xff\xff",
     ):
         with Page(running.url) as page:
-            page.socket.socket.sendall(
-                data
-            )  # a frame of 2^63 bytes, reserved bits, an unknown kind, no mask, a long ping
+            # A frame of 2^63 bytes, reserved bits, an unknown kind, no mask, a long ping.
+            page.socket.socket.sendall(data)
             with pytest.raises((ConnectionClosed, TimeoutError)):
                 page.socket.recv(timeout=2)
 

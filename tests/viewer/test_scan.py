@@ -275,9 +275,8 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(
     assert numbers == sorted({*numbers})
     for found, number in zip(shown, numbers, strict=True):
         np.testing.assert_allclose(found.astype(int), expected[number].astype(int), atol=1)
-    assert (
-        pace.latency < slow + 1.0
-    )  # on a busy machine; were nothing dropped, it would add up to 2 s
+    # On a busy machine; were nothing dropped, it would add up to 2 s.
+    assert pace.latency < slow + 1.0
     assert pace.dropped > 5 or not slow
     assert "dropped" in window.title
 

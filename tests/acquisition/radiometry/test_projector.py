@@ -82,9 +82,8 @@ def test_pictures_without_a_response_are_refused(codes, pictures, message):
 
 
 M = np.array([[1.0, 0.3, 0.02], [0.1, 1.0, 0.2], [0.01, 0.15, 1.0]])
-WALL = np.stack(
-    [corner(64), 0.5 * corner(64)[::-1], 0.8 * corner(64).T], axis=-1
-)  # T in each channel
+# T in each channel.
+WALL = np.stack([corner(64), 0.5 * corner(64)[::-1], 0.8 * corner(64).T], axis=-1)
 BLACK = Radiance(np.zeros(WALL.shape), np.zeros(WALL.shape), np.full(WALL.shape, True))
 
 

@@ -47,11 +47,12 @@ def write_dng(path: Path, raw: np.ndarray, seconds: float, **sides: int) -> None
         50708: "ltcl test",
         50714: 256,
         50717: 4095,
+        # White balance, must not be applied.
         50728: (
             IFDRational(1, 2),
             IFDRational(1),
             IFDRational(1, 3),
-        ),  # white balance, must not be applied
+        ),
     }
     directory = ImageFileDirectory_v2()
     for tag, value in tags.items():

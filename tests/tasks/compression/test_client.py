@@ -120,9 +120,8 @@ def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
 def test_numbers_of_rows_larger_than_memory_are_those_of_the_serial_ones(
     limits, sides, client, matrix, device, monkeypatch
 ):
-    monkeypatch.setattr(
-        checks, "host_memory", lambda: 4 * N * N
-    )  # half of it is too little for all
+    # Half of it is too little for all.
+    monkeypatch.setattr(checks, "host_memory", lambda: 4 * N * N)
     monkeypatch.setattr("ltcl.tasks.compression.sources.MAX_ITEMS", 3)  # several blocks in each
     W = CoefficientAnalysis(Wavelet(device, GRID, "db2"))
     out = W if sides == 2 else None

@@ -242,9 +242,8 @@ def test_the_error_of_coefficients_is_a_bound_and_within_the_tolerance(name, und
 
 
 def test_thresholds_leave_few_numbers_of_what_is_smooth(monkeypatch):
-    W = scipy.linalg.hadamard(512) / np.sqrt(
-        512
-    )  # orthonormal; smooth pictures have few coefficients
+    # Orthonormal; smooth pictures have few coefficients.
+    W = scipy.linalg.hadamard(512) / np.sqrt(512)
     C: Any = scipy.sparse.csr_array(-W @ ltcl.scenes.dihedral(16, albedo=0.8).A @ W.T)
     monkeypatch.setattr(checks, "host_memory", lambda: 0)  # no room for elimination
     loose, tight = (invert_coefficients(C, rtol=rtol) for rtol in (3e-2, 3e-3))
