@@ -134,7 +134,7 @@ def ways() -> dict[str, Length]:
     there = compensation.before_kernel
     back = compensation.after_kernel
     return {
-        "compensate to the first kernel": Length(there, len(there), limit=16, aim=12),
+        "compensate to the first kernel": Length(there, len(there), limit=15, aim=12),
         "compensate back": Length(back, len(back), limit=20, aim=16),
         "compress, in its own package": Length(own_files, len(own_files), limit=10, aim=10),
         "acquire run, around the core": Length(scan, len(scan), limit=45, aim=30),

@@ -32,7 +32,7 @@ from ltcl.images.frames import Source, check_video, open_frames, write_video
 from ltcl.tasks.compensation import compensate
 from ltcl.tasks.compensation.inputs import check_gain
 from ltcl.tasks.report import versions
-from ltcl.tasks.requirements import error_note, resolve_reference
+from ltcl.tasks.requirements import check_exact, error_note
 from ltcl.transport import frames as picture_frames
 from ltcl.transport.transport import Transport, check_transport
 
@@ -190,7 +190,8 @@ def compensate_frames(
     if frames is not None:
         frames = checks.count("frames", frames)
     check_transport(T, square=False)
-    resolve_reference(T, options.get("exact"))
+    if options.get("exact") is not None:
+        check_exact(T, options["exact"])
     check_gain(gain, loss)
     _check_functions(codes=codes, progress=progress)
     _check_pictures(T, options)
