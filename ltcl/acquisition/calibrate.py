@@ -45,7 +45,7 @@ from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
     CaptureSession,
     Photograph,
-    Progress,
+    ProgressFunction,
     Request,
     acquisition_error,
     ignore_progress,
@@ -207,7 +207,7 @@ def measure(
     exposures: Sequence[float] | None = None,
     frames: int = 16,
     side: int = 1,
-    progress: Progress = ignore_progress,
+    progress: ProgressFunction = ignore_progress,
     log: ArrayLog | None = None,
 ) -> Calibration:
     """Measure a set-up, with as many photographs as `expected_photographs` says.
