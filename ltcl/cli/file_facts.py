@@ -44,8 +44,8 @@ def describe(
         channels=_channels(len(matrices)),
         stored=stored,
         dtype=str(matrices[0].dtype),
-        entries=sum(_count_entries(record, matrix) for matrix in matrices),
-        nbytes=sum(_count_bytes(matrix) for matrix in matrices),
+        entries=sum(map(_count_entries, matrices)),
+        nbytes=sum(map(_count_bytes, matrices)),
         first_bounce_from="diagonal" if record.first_bounce is None else "file",
         solution_error=0.0,
         first_bounce=_interval(F),
@@ -87,11 +87,15 @@ def _channels(count: int) -> Any:
 
 
 def _mixing(record: StoreRecord | CompressedRecord) -> Any:
-    return None if record.mixing is None else np.asarray(record.mixing).tolist()
+    if record.mixing is None:
+        return None
+    return np.asarray(record.mixing).tolist()
 
 
-def _count_entries(record: StoreRecord, matrix: Any) -> int:
-    return int(np.count_nonzero(matrix)) if record.dense else int(matrix.nnz)
+def _count_entries(matrix: Any) -> int:
+    if isinstance(matrix, np.ndarray):
+        return int(np.count_nonzero(matrix))
+    return int(matrix.nnz)
 
 
 def _count_bytes(matrix: Any) -> int:
@@ -101,11 +105,16 @@ def _count_bytes(matrix: Any) -> int:
 
 
 def _interval(F: np.ndarray | None) -> tuple[float, float] | None:
-    return None if F is None else (float(F.min()), float(F.max()))
+    if F is None:
+        return None
+    return float(F.min()), float(F.max())
 
 
 def _count_dark(F: np.ndarray | None) -> int | None:
-    return None if F is None else int(np.count_nonzero((F <= 0).any(axis=0)))
+    if F is None:
+        return None
+    is_dark = (F <= 0).any(axis=0)
+    return int(np.count_nonzero(is_dark))
 
 
 def _first_bounce(record: StoreRecord) -> np.ndarray | None:
@@ -128,9 +137,8 @@ def _first_bounce(record: StoreRecord) -> np.ndarray | None:
         """Return the measured noise, or estimate it, which takes a while."""
         if record.noise is not None:
             return record.noise
-        grid = (1, columns) if record.grid is None else record.grid
-        camera_grid = grid if record.camera_grid is None else record.camera_grid
-        return estimate(matrices, grid, camera_grid)
+        grid = record.grid or (1, columns)
+        return estimate(matrices, grid, record.camera_grid or grid)
 
     rule = first_bounce.DarkRule(
         matrices=matrices,
@@ -167,10 +175,13 @@ def judge(record: StoreRecord | CompressedRecord, facts: FileFacts) -> Verdict:
         missing += " --grid HxW"
     if not is_square and not record.camera_grid:
         missing += " --camera-grid HxW"
-    is_large = is_square and facts.nbytes > MAX_JUDGED_BYTES
-    if missing or is_large:
-        reason = "the file does not contain the grid" if missing else "T takes more than 256 MiB"
-        tool = f"analyze {facts.file}" if is_square else f"convert {facts.file} OUT.npz"
+    tool = f"analyze {facts.file}" if is_square else f"convert {facts.file} OUT.npz"
+    reason = ""
+    if missing:
+        reason = "the file does not contain the grid"
+    elif is_square and facts.nbytes > MAX_JUDGED_BYTES:
+        reason = "T takes more than 256 MiB"
+    if reason:
         return Verdict(f"Unknown: {reason}: run 'ltcl {tool}{missing}'.")
     arguments = {name: value for name, value in vars(record).items() if value is not None}
     matrices = arguments.pop("matrices")

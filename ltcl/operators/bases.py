@@ -21,6 +21,8 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import PLAIN, Epilogue, widest_launch
 
+# The name of no basis.
+PIXELS = "pixels"
 # Work-items side by side on a GPU.
 GROUP_ITEMS = 64
 # Items along the second and third dimension, in which kernels stride: GPUs take 65535 groups.
@@ -146,7 +148,7 @@ class SubsetBasis(Basis):
         inverse[self.places] = np.arange(len(self.places))
         self._order = device.upload(self.places, np.int32)
         self._inverse_order = device.upload(inverse, np.int32)
-        name = "pixels" if of is None else of.name
+        name = PIXELS if of is None else of.name
         super().__init__(
             device, (h, w), name, len(self.places), self._order, self._inverse_order, of
         )

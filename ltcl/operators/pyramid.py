@@ -8,6 +8,7 @@ from ltcl.device import Array, Device
 from ltcl.operators.bases import Basis, launch_grid, launch_group
 
 # Cells of a level up to which one launch does all the levels from it on.
+PYRAMID = "pyramid"
 SMALL_LEVEL_PIXELS = 4096
 
 
@@ -50,7 +51,7 @@ class Pyramid(Basis):
             size = 2**level
             cells.append((-(-h // size), -(-w // size)))
         self.cells = tuple(cells)
-        super().__init__(device, grid, "pyramid", sum(rows * columns for rows, columns in cells))
+        super().__init__(device, grid, PYRAMID, sum(rows * columns for rows, columns in cells))
 
     def _transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool

@@ -89,6 +89,24 @@ class EntrySums:
     squares: float
     lowest: float
 
+    def norms(self) -> Norms:
+        """Norms of the matrix."""
+        return Norms(
+            one=float(self.columns.max(initial=0.0)),
+            inf=self.largest_row,
+            frobenius=self.squares**0.5,
+            lowest=self.lowest,
+        )
+
+    def joined(self, other_rows: EntrySums) -> EntrySums:
+        """Sums over these rows and others of the same matrix."""
+        return EntrySums(
+            columns=self.columns + other_rows.columns,
+            largest_row=max(self.largest_row, other_rows.largest_row),
+            squares=self.squares + other_rows.squares,
+            lowest=min(self.lowest, other_rows.lowest),
+        )
+
 
 class ReadableRows(Operator):
     """An operator whose entries the host can read; subclasses write `blocks`.
@@ -115,13 +133,7 @@ class ReadableRows(Operator):
 
     def norms(self) -> Norms:
         """Norms of the matrix, in float64."""
-        sums = self.sums()
-        return Norms(
-            one=float(sums.columns.max(initial=0.0)),
-            inf=sums.largest_row,
-            frobenius=sums.squares**0.5,
-            lowest=sums.lowest,
-        )
+        return self.sums().norms()
 
     def sums(self) -> EntrySums:
         """Sums over all entries."""

@@ -18,7 +18,7 @@ from ltcl.batch import cluster
 from ltcl.device import Device
 from ltcl.errors import InputError, ToleranceError
 from ltcl.operators import ScaledColumns
-from ltcl.tasks.compression.bases import INVERSE_NAMES, basis_names
+from ltcl.tasks.compression.basis_pairs import INVERSE_NAMES, basis_names
 from ltcl.tasks.compression.fit import ChannelCompression, Compression
 from ltcl.tasks.compression.goals import (
     ROUNDING_SHARE,

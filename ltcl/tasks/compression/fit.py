@@ -13,7 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import InputError
 from ltcl.operators import Compressed, IdentityPlus, Tiles
-from ltcl.tasks.compression.bases import Bases
+from ltcl.tasks.compression.basis_pairs import Bases
 from ltcl.tasks.compression.coefficients import Coefficients
 from ltcl.tasks.compression.inputs import CompressionProblem
 from ltcl.tasks.compression.norms import MISS

@@ -24,7 +24,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import ConvergenceError, ToleranceError
 from ltcl.operators import IdentityPlus
-from ltcl.tasks.compression.bases import Bases
+from ltcl.tasks.compression.basis_pairs import Bases
 from ltcl.tasks.compression.coefficients import Coefficients
 from ltcl.tasks.compression.fit import Fit, Trial, error_norm
 from ltcl.tasks.compression.inputs import CompressionProblem

@@ -24,7 +24,7 @@ from ltcl.errors import ConvergenceError, InputError, ToleranceError
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles
 from ltcl.solvers import Inverse
 from ltcl.solvers.result import Status
-from ltcl.tasks.compression.bases import INVERSE_NAMES, basis_names
+from ltcl.tasks.compression.basis_pairs import INVERSE_NAMES, basis_names
 from ltcl.tasks.compression.coefficients import quantize
 from ltcl.tasks.compression.compress import check_rtol, compress_inputs
 from ltcl.tasks.compression.goals import ByTolerance, Note

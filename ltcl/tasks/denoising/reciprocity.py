@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ltcl.tasks.denoising.bases import Grid, SeparableBasis, multiwavelets
+from ltcl.tasks.denoising.multiwavelets import Grid, SeparableBasis, multiwavelets
 
 # Linear steps: the first ones move the weights, the last one hardly moves d.
 FIT_STEPS = 3

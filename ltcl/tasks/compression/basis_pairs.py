@@ -18,17 +18,16 @@ import scipy.sparse
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Basis, Compressed, SubsetBasis, Tiles, Wavelet, basis
-from ltcl.operators.bases import multiresolution_order, restrict_to_support
+from ltcl.operators.bases import PIXELS, multiresolution_order, restrict_to_support
 from ltcl.operators.stored import basis_of
-from ltcl.operators.wavelets import filters
+from ltcl.operators.wavelets import COMPARED_WAVELETS, WAVELET_NAME, filters
 from ltcl.tasks.compression.coefficients import Coefficients, Progress, coefficients, quantize
 from ltcl.tasks.compression.sources import SourceRows
 
-PIXELS = "pixels"
 # Ending of the name of a basis for rows alone.
 ROWS = " rows"
 # Bases that are compared where none is named, in this order.
-INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)
+INVERSE_NAMES = (*COMPARED_WAVELETS, PIXELS)
 # Pictures of random signs, by which noise is estimated.
 SIGN_PICTURES = 32
 
@@ -53,8 +52,8 @@ def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
             filters(name.removesuffix(ROWS))
         except InputError as error:
             raise InputError(
-                f"basis is {name!r}; it must be pixels, or an orthonormal wavelet "
-                "such as haar, db2 or db4, with ' rows' for rows alone"
+                f"basis is {name!r}; it must be {PIXELS}, or {WAVELET_NAME}, "
+                f"with {ROWS!r} after its name for rows alone"
             ) from error
     return list(names)
 
