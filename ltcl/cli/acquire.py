@@ -184,7 +184,7 @@ def _check_card(project: Any, take: Path | None) -> None:
             f"--take is given, but the rig of {project.folder} is {project.kind}, not folder"
         )
     if not take.is_dir():
-        raise FileError(f"{take}: is no folder; --take needs the one with the camera's files")
+        raise FileError(f"{take}: is not a folder; --take needs the one with the camera's files")
 
 
 def _has_all_photographs(project: Any) -> bool:

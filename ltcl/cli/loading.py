@@ -17,7 +17,7 @@ from ltcl.errors import InputError
 from ltcl.operators import rank_device
 from ltcl.solvers.solve import SAMPLED
 from ltcl.tasks import report
-from ltcl.tasks.requirements import default_rtol, resolve_reference
+from ltcl.tasks.requirements import check_exact, default_rtol
 from ltcl.transport.transport import Transport
 
 # Relative error of a float32 picture by rounding.
@@ -145,7 +145,7 @@ def _load_original(context: Context, T: Transport) -> Transport:
         device=T.device,
     )
     # It refuses other colours.
-    resolve_reference(T, exact)
+    check_exact(T, exact)
     channels = (3,) if T.channels == 3 else ()
     pattern = np.random.default_rng(0).random((*T.grid, *channels))
     picture = T @ pattern

@@ -85,7 +85,9 @@ class PartsWriter:
     ) -> SeparatedPicture:
         """Write all parts of a picture, and return its report."""
         light = _parts(result)
-        deviations = _deviations(result) if self.has_std else {}
+        deviations: dict[str, np.ndarray] = {}
+        if self.has_std:
+            deviations = _deviations(result)
         solved = dict(zip(_solved_names(result), result.solutions, strict=True))
         whole = _mean(photograph)
         parts = []
@@ -101,18 +103,21 @@ class PartsWriter:
                 exr=files.exr,
                 png=files.png,
                 lowest=float(picture.min()),
-                share=_mean(picture) / whole if whole else None,
-                channels=solves(solved[part]) if part in solved else [],
+                share=None,
+                channels=[],
             )
+            if whole:
+                entry.share = _mean(picture) / whole
+            if part in solved:
+                entry.channels = solves(solved[part])
             if part in deviations:
                 entry.std, panel = panels.write_std(folder, place, deviations[part], self.factor)
                 shown_std.append(panel)
             parts.append(entry)
-        self._add_rows([shown[:3], shown[3:], self._amplified_panels(light), shown_std])
+        for row in (shown[:3], shown[3:], self._amplified_panels(light), shown_std):
+            if row:
+                self.sheet.append(row)
         return SeparatedPicture(file=path, transport_error=result.transport_error, parts=parts)
-
-    def _add_rows(self, rows: list[list[Image.Image]]) -> None:
-        self.sheet += [row for row in rows if row]
 
     def _amplified_panels(self, light: dict[str, np.ndarray]) -> list[Image.Image]:
         """Draw dim parts once more, amplified."""

@@ -65,7 +65,8 @@ class Cells:
         """Each level as blocks of pixels."""
         longest = max(self.grid)
         count = (longest - 1).bit_length() + 1
-        return tuple(Blocks(self.grid, min(1 << level, longest)) for level in range(count))
+        sides = [min(1 << level, longest) for level in range(count)]
+        return tuple(Blocks(self.grid, side) for side in sides)
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
@@ -91,7 +92,8 @@ class Cells:
         for blocks, level in zip(self.levels, numbers, strict=True):
             cells.append(blocks.enlarged(level.reshape(blocks.grid)))
         pixels = np.tile(np.arange(self.pixels), len(cells))
-        return scipy.sparse.csr_array((np.ones(len(pixels)), (np.ravel(cells), pixels)))
+        places = np.ravel(cells), pixels
+        return scipy.sparse.csr_array((np.ones(len(pixels)), places))
 
     @cached_property
     def areas(self) -> np.ndarray:
@@ -261,16 +263,17 @@ class _Division:
     def run(self, grid: ScanGrid, log: PictureLog) -> Entries:
         """Photograph the children, and return their entries, by cell."""
         groups = self._groups(len(grid.seen))
-        log.announce(self._pattern(child, members) for child, members in groups)
+        log.announce(self._pattern(*group) for group in groups)
         cell = self.children[:, self.parent]
         energy = np.zeros((4, *self.parents.energy.shape))
         # The light is unknown unless a photograph follows.
         variance = energy + np.where(cell >= 0, UNKNOWN, 0.0)[:, None]
         for first in range(0, len(groups), BATCH_SIZE):
             batch = groups[first : first + BATCH_SIZE]
-            patterns = [self._pattern(child, members) for child, members in batch]
+            patterns = [self._pattern(*group) for group in batch]
             pictures = log.take(patterns)
-            for (child, members), pattern, picture in zip(batch, patterns, pictures, strict=True):
+            for group, pattern, picture in zip(batch, patterns, pictures, strict=True):
+                child, members = group
                 entries = np.flatnonzero(np.isin(self.parent, members))
                 pixels = self.parents.pixel[entries]
                 known = self._known_light(pattern, pixels)
