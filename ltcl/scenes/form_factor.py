@@ -135,7 +135,7 @@ class FormFactor(Operator):
         self._area = device.upload(placed.area)
         correction = self._correction(patches, blocks, shares, placed.area)
         self._near = CSR(device, correction)
-        self._parts = (self._geometry, self._blocks, self._albedo, self._area, self._near)
+        self._components = (self._geometry, self._blocks, self._albedo, self._area, self._near)
 
     @classmethod
     def of(cls, scene: Scene, device: Device | str | None = None) -> tuple[FormFactor, ...]:
