@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,11 @@ def analysis(W: Wavelet) -> Callable[[np.ndarray], np.ndarray]:
         return W.apply(W.device.upload(x)).get()
 
     return analyze
+
+
+def norms(arrays: Iterable[np.ndarray]) -> np.ndarray:
+    """The norm of each array."""
+    return np.array([np.linalg.norm(array) for array in arrays])
 
 
 def relative_error(approximation: np.ndarray, exact: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +81,11 @@ def conclude(
         raise SystemExit(1)
 
 
+def values(rows: Iterable[Any], attribute: str) -> np.ndarray:
+    """One attribute of all rows, stacked."""
+    return np.array([getattr(row, attribute) for row in rows])
+
+
 def page(height: int, title: str, *subtitle: str) -> Figure:
     """Make a page with a title and lines below it: 80 pixels, and 22 more for each further line."""
     figure = figure_of(WIDTH, height)
@@ -136,6 +141,11 @@ def graph(
     axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
     return axes
+
+
+def legend(axes: Axes, size: float = 10, labelcolor: str = "linecolor", **place: Any) -> None:
+    """Name the curves, each in its own colour by default."""
+    axes.legend(frameon=False, fontsize=size, labelcolor=labelcolor, **place)
 
 
 def light(scene: Scene, values: np.ndarray, gain: float = 1.0) -> np.ndarray:

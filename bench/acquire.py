@@ -294,7 +294,8 @@ def claims(scans: list[Scan], costs: list[Scan], largest: int) -> list[Claim]:
         wanted="at most 1 / 5",
         holds=5 * adaptive <= by_pixel,
     )
-    over_plan = max(cost.photographs / cost.planned for cost in costs)
+    photographs_over_plan = figures.values(costs, "photographs") / figures.values(costs, "planned")
+    over_plan = photographs_over_plan.max()
     planned = Claim(
         text="photographs over what the plan said, at most",
         measured=f"{over_plan:.3f}",
@@ -309,24 +310,6 @@ def claims(scans: list[Scan], costs: list[Scan], largest: int) -> list[Claim]:
 
 def scan_claims(scan: Scan) -> list[Claim]:
     """Check the errors of one scan."""
-    patterns = Claim(
-        text=f"{scan.name}: T p of held patterns",
-        measured=f"{scan.pattern_error:.2%}",
-        wanted="at most 2 %",
-        holds=scan.pattern_error <= MAX_ERROR,
-    )
-    row_sums = Claim(
-        text=f"{scan.name}: row sum furthest off",
-        measured=f"{scan.row_sum_error:.2%}",
-        wanted="at most 2 %",
-        holds=scan.row_sum_error <= MAX_ERROR,
-    )
-    far_light = Claim(
-        text=f"{scan.name}: far light, all",
-        measured=f"{scan.far_total_error:.2%} off",
-        wanted="at most 2 %",
-        holds=scan.far_total_error <= MAX_ERROR,
-    )
     compensated = Claim(
         text=f"{scan.name}: compensated",
         measured=f"{scan.decibels:.1f} dB",
@@ -341,7 +324,17 @@ def scan_claims(scan: Scan) -> list[Claim]:
         wanted="at most 2",
         holds=max(later) <= MAX_DEVIATIONS,
     )
-    return [patterns, row_sums, far_light, compensated, bounces]
+    return [
+        error_claim(f"{scan.name}: T p of held patterns", scan.pattern_error),
+        error_claim(f"{scan.name}: row sum furthest off", scan.row_sum_error),
+        error_claim(f"{scan.name}: far light, all", scan.far_total_error, " off"),
+        compensated,
+        bounces,
+    ]
+
+
+def error_claim(text: str, error: float, suffix: str = "") -> Claim:
+    return Claim(text, f"{error:.2%}{suffix}", "at most 2 %", error <= MAX_ERROR)
 
 
 def collect_facts(scans: list[Scan], costs: list[Scan], pixels: int) -> dict[str, Any]:
@@ -370,7 +363,7 @@ def draw(costs: list[Scan]) -> Figure:
     )
     photographs = figures.graph(figure, (70, 140, 260, 230), "photographs", "pixels", "")
     plot_costs(photographs, costs, "photographs", "planned")
-    photographs.legend(frameon=False, labelcolor=figures.FAINT, fontsize=9.5)
+    figures.legend(photographs, 9.5, figures.FAINT)
     exposure = figures.graph(figure, (390, 140, 260, 230), "hours of exposure", "pixels", "")
     plot_costs(exposure, costs, "exposure", "planned_exposure", unit=3600)
     seconds = figures.graph(figure, (710, 140, 260, 230), "seconds of computing", "pixels", "")

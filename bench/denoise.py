@@ -26,6 +26,7 @@ from rich.table import Table
 
 import _figures as figures
 import ltcl
+from _coefficients import norms
 from _figures import Claim
 from _harness import parse_options
 from ltcl.plots.page import OTHERS
@@ -116,17 +117,15 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
     entries = exact.to_numpy()
 
     def errors(approximation: ltcl.Transport) -> np.ndarray:
-        pairs = zip(quantities(approximation), true, strict=True)
-        return np.array([np.linalg.norm(light - exact_light) for light, exact_light in pairs])
+        return norms(map(np.subtract, quantities(approximation), true))
 
     raw = errors(T)
-    true_norms = [np.linalg.norm(light) for light in true]
     return Case(
         scene=scene,
         pixels=n,
         level=level,
         photons=photons,
-        raw=raw / true_norms,
+        raw=raw / norms(true),
         left=errors(ltcl.denoise(T)) / raw,
         bound=errors(oracle(T, entries)) / raw,
         first=errors(truth_with_measured_first_bounce(T, entries)) / raw,
@@ -135,9 +134,9 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
 
 def claims(cases: Sequence[Case]) -> list[Claim]:
     """Never worse; at most half if the bound allows it, else near the bound."""
-    left = np.stack([case.left for case in cases])
-    bound = np.stack([case.bound for case in cases])
-    first = np.stack([case.first for case in cases])
+    left = figures.values(cases, "left")
+    bound = figures.values(cases, "bound")
+    first = figures.values(cases, "first")
     is_reachable = bound <= REACHABLE
     reached = left[is_reachable]
     ratios = (left / bound)[left > GOAL]
@@ -169,8 +168,8 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
     )
     result = [never_worse, half, near_bound, no_limit]
     for level in LEVELS:
-        is_level = [case.level == level for case in cases]
-        result.append(claim_of_level(level, left[is_level], bound[is_level]))
+        rows = figures.values(cases, "level") == level
+        result.append(claim_of_level(level, left[rows], bound[rows]))
     return result
 
 
@@ -205,10 +204,10 @@ def tables(cases: Sequence[Case]) -> list[Table]:
 
 def cells(case: Case) -> list[str]:
     """Errors of a case as text, one a quantity."""
-    errors = zip(case.raw, case.left, case.bound, case.first, strict=True)
-    return [
-        f"{raw:.2g}, {left:.2f} ({bound:.2f}; {first:.2f})" for raw, left, bound, first in errors
-    ]
+    texts = []
+    for raw, left, *bounds in zip(case.raw, case.left, case.bound, case.first, strict=True):
+        texts.append(f"{raw:.2g}, {left:.2f} ({bounds[0]:.2f}; {bounds[1]:.2f})")
+    return texts
 
 
 def draw(cases: Sequence[Case]) -> Any:
@@ -222,11 +221,11 @@ def draw(cases: Sequence[Case]) -> Any:
     for name, colour in zip(names, OTHERS, strict=False):
         cases_of_scene = [case for case in cases if case.scene == name]
         largest = cases_of_scene[-len(LEVELS) :]
-        left = [case.left.mean() for case in largest]
-        bound = [case.bound.mean() for case in largest]
+        left = figures.values(largest, "left").mean(axis=1)
+        bound = figures.values(largest, "bound").mean(axis=1)
         axes.plot(LEVELS, left, color=colour, label=name)
         axes.plot(LEVELS, bound, "--", color=colour)
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=9)
+    figures.legend(axes, 9)
     return page
 
 

@@ -242,7 +242,7 @@ def draw_errors(figure: Figure, series: Series) -> None:
     draw_channel_error(axes, series, 1, "green", color="#8bd17c", ls="-")
     draw_channel_error(axes, series, 0, "red", color="#ff5d5d", ls="--")
     draw_channel_error(axes, series, 2, "blue", color="#5c9cff", ls="-")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
     axes.set_xlim(0, TERMS)
 
 

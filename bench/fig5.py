@@ -254,7 +254,7 @@ def draw_swings(figure: Figure, box: figures.Box, swings: Mapping[str, np.ndarra
     axes.axhline(1, color=FAINT, lw=1, ls=":")
     for (name, swing), shade in zip(swings.items(), SHADES, strict=False):
         axes.plot(swing, "o-", color=shade, lw=2, ms=5, label=f"{name} of the floor")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
 
 
 def draw_norms(figure: Figure, box: figures.Box, norms: Mapping[float, np.ndarray]) -> None:
@@ -267,7 +267,7 @@ def draw_norms(figure: Figure, box: figures.Box, norms: Mapping[float, np.ndarra
         visible = np.where(norm > MIN_NORM, norm, np.nan)
         axes.plot(n, visible, "o", color=shade, ms=5, label=f"albedo {albedo:g}")
     axes.plot([], [], color=INK, lw=1.5, ls=":", label="bound, eq. 16")
-    axes.legend(frameon=False, labelcolor=INK, fontsize=10)
+    figures.legend(axes, labelcolor=INK)
 
 
 def draw_races(figure: Figure, box: figures.Box, title: str, races: Mapping[float, Race]) -> None:
@@ -281,7 +281,7 @@ def draw_races(figure: Figure, box: figures.Box, title: str, races: Mapping[floa
         draw_jacobi(axes, f"{name:g}", box_race, shade)
     axes.plot([], [], color=FAINT, lw=2, label="the paper's iteration")
     axes.plot([], [], color=INK, lw=1.2, ls=(0, (3, 2)), label="Chebyshev's, all six")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10, loc="upper right")
+    figures.legend(axes, loc="upper right")
 
 
 def draw_jacobi(axes: Axes, name: str, box_race: Race, shade: str) -> None:

@@ -244,7 +244,7 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
         axes.plot(recovery.errors, color=colour, lw=2, label=label)
     axes.axhline(RTOL, color=FAINT, lw=1, ls=":")
     axes.set_xlim(0, ITERATIONS)
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
     return figure
 
 

@@ -471,7 +471,7 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
         label_end(axes, method, (pixels[-1], times[-1]), LABEL_OFFSETS.get(name, 0))
     axes.minorticks_off()
     axes.margins(x=0.1)
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10.5, loc="upper left")
+    figures.legend(axes, 10.5, loc="upper left")
     return figure
 
 

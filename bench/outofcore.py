@@ -20,9 +20,9 @@ import dataclasses
 import os
 import resource
 import shutil
-import statistics
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -35,7 +35,7 @@ import scipy.sparse
 
 import ltcl
 from _coefficients import note
-from _harness import Options, Row, parse_options, product, report, seconds
+from _harness import Options, Row, medians, parse_options, product, report, seconds
 from ltcl.device import Device
 from ltcl.operators import Dense, MultiDevice, Streamed
 
@@ -124,7 +124,7 @@ class Scene:
 
     def speeds(self, actions: dict[str, Callable[[], object]]) -> dict[str, float]:
         """Median GB a second that each action reads, in turn, the file not cached."""
-        rates: dict[str, list[float]] = {name: [] for name in actions}
+        rates = defaultdict(list)
         gigabytes = self.file.stat().st_size / 1e9
         for _ in range(REPEATS):
             for name, action in actions.items():
@@ -134,7 +134,7 @@ class Scene:
                 rate = gigabytes / (time.perf_counter() - start)
                 rates[name].append(rate)
                 note(f"{name}: {rate:.3g} GB/s")
-        return {name: statistics.median(values) for name, values in rates.items()}
+        return medians(rates)
 
 
 def compare_speeds(scene: Scene, A: Streamed) -> tuple[list[Row], dict[str, Any]]:

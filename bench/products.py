@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 from _coefficients import ROWS, analysis, keep_largest, note, relative_error
 from _corner import interreflection
-from _harness import Options, Row, parse_options, product, report, seconds, triad
+from _harness import Options, Row, milliseconds, parse_options, product, report, triad
 from _peers import missing, sparse_products
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
@@ -151,7 +151,7 @@ def measure(
         core_x = np.resize(scene.x, core.shape[1])
         actions[f"ours, {name}"] = product(A, scene.x)
         actions[f"core, {name}"] = product(core, core_x)
-    ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
+    ms = milliseconds(actions)
     points = []
     for name, (_, A) in operators.items():
         point = Point(

@@ -31,7 +31,7 @@ import ltcl
 from _coefficients import analysis, keep_fewest, note, relative_error, transport
 from _corner import Bounce
 from _figures import Claim
-from _harness import Options, parse_options, product, seconds
+from _harness import Options, milliseconds, parse_options, product
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import dihedral, landscape
@@ -199,7 +199,7 @@ def measure_ms(built: Built, picture: np.ndarray) -> dict[str, float]:
         "solve in colour": solve,
         "compensate in colour": lambda: built.compensate(picture),
     }
-    return {name: 1e3 * spent for name, spent in seconds(actions).items()}
+    return milliseconds(actions)
 
 
 def build_facts(options: Options, built: Built, n: int, ms: dict[str, float]) -> dict[str, Any]:

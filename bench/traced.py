@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
+from _coefficients import norms
 from _figures import Claim
 from _harness import parse_options
 from denoise import QUANTITIES, patterns
@@ -104,11 +105,6 @@ def separation_light(separation: Any) -> np.ndarray:
     return np.stack([separation.direct, *separation.bounces])
 
 
-def norms(arrays: Iterable[np.ndarray]) -> np.ndarray:
-    """The norm of each array."""
-    return np.array([np.linalg.norm(array) for array in arrays])
-
-
 def deviation_ratios(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     """`.std` over errors of `PARTS`, under white."""
     white = true @ np.ones(true.grid)
@@ -133,9 +129,7 @@ def relative_errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     """Relative errors of `QUANTITIES`; bounces are of pictures of one pattern of each kind."""
     images = true @ np.stack([kind[0] for kind in patterns(T.grid)])
     exact = quantities(true, images)
-    deviations = []
-    for value, exact_value in zip(quantities(T, images), exact, strict=True):
-        deviations.append(value - exact_value)
+    deviations = map(np.subtract, quantities(T, images), exact)
     return norms(deviations) / norms(exact)
 
 
@@ -173,25 +167,20 @@ def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
 
 
 def way_claims(name: str, judgements: list[Judgement]) -> list[Claim]:
-    deviations = []
-    denoised = []
-    compressed = []
-    for judgement in judgements:
-        deviations.append(judgement.deviations)
-        denoised.append(judgement.denoised)
-        compressed.append(judgement.compressed)
+    deviations = figures.values(judgements, "deviations")
+    denoised = figures.values(judgements, "denoised")
+    compressed = figures.values(judgements, "compressed")
     return [
-        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", np.array(deviations)),
-        DENOISED_LIMITS.claim(f"{name}: denoised", np.array(denoised)),
-        COMPRESSED_LIMITS.claim(f"{name}: compressed", np.array(compressed)),
+        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", deviations),
+        DENOISED_LIMITS.claim(f"{name}: denoised", denoised),
+        COMPRESSED_LIMITS.claim(f"{name}: compressed", compressed),
     ]
 
 
 def list_errors(judgements: list[Judgement]) -> str:
     """Largest relative errors of T, by the quantity."""
-    largest = np.max([judgement.errors for judgement in judgements], axis=0)
-    cells = [f"{name} {error:.2%}" for name, error in zip(QUANTITIES, largest, strict=True)]
-    return ", ".join(cells)
+    largest = figures.values(judgements, "errors").max(axis=0)
+    return ", ".join(map("{} {:.2%}".format, QUANTITIES, largest))
 
 
 def main() -> None:
@@ -218,12 +207,14 @@ def main() -> None:
         for way, judgements in judge_scene(measured).items():
             name = f"{scene}, {way}"
             facts[f"{scene}: relative errors"] = list_errors(judgements)
-            facts[f"{name}: bytes a row"] = max(judgement.row_nbytes for judgement in judgements)
+            row_nbytes = figures.values(judgements, "row_nbytes")
+            facts[f"{name}: bytes a row"] = float(row_nbytes.max())
             for judgement in judgements:
-                is_halved += [bool(ratio <= 0.5) for ratio in judgement.denoised]
+                is_halved.extend(judgement.denoised <= 0.5)
             claims += way_claims(name, judgements)
     halved = f"{sum(is_halved)} of {len(is_halved)}"
-    claims.append(Claim("denoised: at most half is left", halved, "all", all(is_halved)))
+    text = "denoised: at most half is left"
+    claims.append(Claim(text, halved, "all", all(is_halved)))
     if options.smoke:
         claims = []
     figures.conclude(options, "Path-traced transports", claims, facts, Figure)
