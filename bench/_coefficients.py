@@ -63,8 +63,8 @@ def keep_largest(matrix: Any, x: np.ndarray, y: np.ndarray, error: float) -> sci
 
     largest = float(max(matrix.max(), -matrix.min()))
     threshold = bisect(product_error, error, largest)
-    remaining = [drop_below(matrix[rows], threshold)[0] for rows in blocks]
-    return scipy.sparse.csr_array(scipy.sparse.vstack(remaining, format="csr"))
+    rest = [drop_below(matrix[rows], threshold)[0] for rows in blocks]
+    return scipy.sparse.csr_array(scipy.sparse.vstack(rest, "csr"))
 
 
 def bisect(error: Callable[[float], float], max_error: float, high: float) -> float:

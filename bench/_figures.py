@@ -111,11 +111,13 @@ def picture(
     """
     left, top, width = place
     height = width * image.shape[0] / image.shape[1]
-    label_at(figure, left, top - 6, label, size=10.5, fontweight="bold", va="bottom")
+    style = {"size": 10.5, "fontweight": "bold", "va": "bottom"}
+    label_at(figure, left, top - 6, label, **style)
     axes = axes_at(figure, (left, top, width, height))
     axes.imshow(image, interpolation="antialiased", aspect="auto")
     axes.axis("off")
-    label_at(figure, left, top + height + 5, note, size=9.5, color=FAINT, linespacing=1.35)
+    below = top + height + 5
+    label_at(figure, left, below, note, size=9.5, color=FAINT, linespacing=1.35)
 
 
 def pictures(figure: Figure, top: float, images: Sequence[tuple[Any, ...]], gap: int = 14) -> None:
@@ -145,7 +147,8 @@ def graph(
 
 def legend(axes: Axes, size: float = 10, labelcolor: str = "linecolor", **place: Any) -> None:
     """Name the curves, each in its own colour by default."""
-    axes.legend(frameon=False, fontsize=size, labelcolor=labelcolor, **place)
+    style = {"frameon": False, "fontsize": size, "labelcolor": labelcolor}
+    axes.legend(**style, **place)
 
 
 def light(scene: Scene, values: np.ndarray, gain: float = 1.0) -> np.ndarray:

@@ -277,7 +277,8 @@ def _bars(title: str, rows: list[Row]) -> Any:
     axes.barh(heights, ratios, color="#3b6ea5", label="measured")
     for height, row in zip(heights, rows, strict=True):
         if row.target is not None:
-            axes.plot([row.target] * 2, [height - 0.4, height + 0.4], color="#c0392b", lw=2)
+            ends = [height - 0.4, height + 0.4]
+            axes.plot([row.target] * 2, ends, color="#c0392b", lw=2)
     labels = [f"{row.question}\nagainst {row.competitor}" for row in rows]
     axes.set_yticks(heights, labels, fontsize=7)
     axes.set_xscale("log")
