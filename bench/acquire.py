@@ -40,6 +40,7 @@ import ltcl
 from _coefficients import relative_error
 from _figures import Claim
 from _harness import parse_options
+from ltcl import Transport
 from ltcl.acquisition import Report, VirtualRig, acquire
 from ltcl.device import Device
 from ltcl.store import BlockStore
@@ -151,7 +152,7 @@ class Truth:
         return np.moveaxis(np.array(channels), 0, -1)
 
 
-def measured_pictures(T: ltcl.Transport, patterns: np.ndarray) -> np.ndarray:
+def measured_pictures(T: Transport, patterns: np.ndarray) -> np.ndarray:
     """Pictures (N, k, channels) of a measured T."""
     N, k, channels = patterns.shape
     frames = np.moveaxis(patterns, 1, 0).astype(np.float32)
@@ -210,7 +211,7 @@ def run_scan(truth: Truth, camera: str, strategy: str, device: Device, name: str
 class Judge:
     """Errors of a measured T in the camera's unit of light, `unit` in each channel."""
 
-    def __init__(self, T: ltcl.Transport, truth: Truth) -> None:
+    def __init__(self, T: Transport, truth: Truth) -> None:
         self.T = T
         self.truth = truth
         self.channels = truth.channels

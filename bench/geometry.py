@@ -171,7 +171,8 @@ def run_scan(device: Device, truth: np.ndarray, view: View, camera: str, noise: 
     )
     patterns = held_patterns(N)
     with TemporaryDirectory() as folder:
-        T = acquire(rig, strategy="pixel", store=Path(folder) / "T.zarr", device=device)
+        path = Path(folder) / "T.zarr"
+        T = acquire(rig, strategy="pixel", store=path, device=device)
         is_seen = ~T.masked
         pictures = np.asarray(T @ patterns.T.reshape(-1, N, N), np.float64)
         ours = pictures.reshape(patterns.shape[1], -1).T[is_seen]
@@ -242,7 +243,8 @@ class RenderedCorner:
         # Pixels all neighbours of which are well seen.
         is_covered = calibration.resampling.coverage > 0.8
         self.inner: Any = scipy.ndimage.binary_erosion(is_covered, np.ones((3, 3)))
-        self.white = np.asarray(self.T @ np.ones(grid, np.float32), np.float64)[self.inner]
+        white = np.asarray(self.T @ np.ones(grid, np.float32), np.float64)
+        self.white = white[self.inner]
 
     def true_picture(self, pattern: np.ndarray) -> np.ndarray:
         """Light on the inner pixels, rendered from the projector's place."""
@@ -275,7 +277,8 @@ class RenderedCorner:
         picture = self.true_picture(pattern)
         inner = desired[self.inner]
         scaled = picture * (picture @ inner) / (picture @ picture)
-        return float(10 * np.log10(inner.max() ** 2 / np.mean((scaled - inner) ** 2)))
+        squared_error = np.mean((scaled - inner) ** 2)
+        return float(10 * np.log10(inner.max() ** 2 / squared_error))
 
 
 def rendered_loop(n: int, samples: int, patterns: np.ndarray, device: Device) -> RenderedLoop:
@@ -313,7 +316,8 @@ def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
     is_lit = white.astype(np.float32) - black > LIT_DIFFERENCE
     on_board = decoded.valid & _board(white)
     camera = np.stack(np.nonzero(on_board)[::-1], axis=1).astype(np.float64)
-    projector = np.stack([decoded.x[on_board], decoded.y[on_board]], axis=1).astype(np.float64)
+    places = [decoded.x[on_board], decoded.y[on_board]]
+    projector = np.stack(places, axis=1).astype(np.float64)
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
     mapped = cv2.perspectiveTransform(camera[:, None], H)[:, 0]
     distance = np.linalg.norm(mapped - projector, axis=1)
@@ -337,7 +341,8 @@ def _board(white: np.ndarray) -> np.ndarray:
 
 def _reprojected(camera: np.ndarray, projector: np.ndarray, folder: Path) -> tuple[float, float]:
     """Triangulate points by the calibration; rms distances in the projector and in the camera."""
-    file = cv2.FileStorage(str(folder / "calibration_result.xml"), cv2.FILE_STORAGE_READ)
+    path = str(folder / "calibration_result.xml")
+    file = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
     camera_matrix = file.getNode("cam_int").mat()
     camera_distortion = file.getNode("cam_dist").mat()
     projector_matrix = file.getNode("proj_int").mat()
@@ -452,11 +457,13 @@ def draw(results: Results) -> Figure:
         "seen askance. Below: a rendered corner, by a camera half a wall beside the projector.",
     )
     xlabel = "camera pixels to a projector pixel's side"
-    by_size = figures.graph(figure, (80, 140, 400, 220), "By size", xlabel, "")
+    box = (80, 140, 400, 220)
+    by_size = figures.graph(figure, box, "By size", xlabel, "")
     plot_sizes(by_size, results)
     xlabel = "electrons at full scale"
     title = "By noise, 3 camera pixels"
-    by_noise = figures.graph(figure, (580, 140, 380, 220), title, xlabel, "")
+    box = (580, 140, 380, 220)
+    by_noise = figures.graph(figure, box, title, xlabel, "")
     plot_noises(by_noise, results.scans)
     if results.loop is not None:
         figures.pictures(figure, 480, loop_pictures(results.loop))
@@ -544,8 +551,11 @@ def main() -> None:
     scans = []
     for camera, size in itertools.product(cameras, sizes):
         scans.append(run(askance(size), camera, QUIET))
-    scans += [run(askance(NOISE_SIZE), last_camera, noise) for noise in louder]
-    at_random = [run(random_view(seed), last_camera, QUIET) for seed in range(random_cameras)]
+    for noise in louder:
+        scans.append(run(askance(NOISE_SIZE), last_camera, noise))
+    at_random = []
+    for seed in range(random_cameras):
+        at_random.append(run(random_view(seed), last_camera, QUIET))
     loop = None
     if importlib.util.find_spec("mitsuba") is not None:
         squares = held_patterns(n).T.reshape(-1, n, n)
@@ -553,7 +563,8 @@ def main() -> None:
         loop = rendered_loop(n, samples, patterns, options.device)
     results = Results(scans=scans, at_random=at_random, loop=loop)
     title = "A camera that is not aligned with the projector"
-    figures.conclude(options, title, results.claims(), results.facts(), partial(draw, results))
+    draw_results = partial(draw, results)
+    figures.conclude(options, title, results.claims(), results.facts(), draw_results)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ import _figures as figures
 import ltcl
 from _figures import Claim
 from _harness import Options, parse_options
+from ltcl import Transport
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.tasks.plausibility import LARGEST_NEGATIVE
@@ -92,7 +93,7 @@ def norms(light: np.ndarray) -> np.ndarray:
     return np.linalg.norm(light.reshape(len(light), -1), axis=1)
 
 
-def separate_light(T: ltcl.Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]:
+def separate_light(T: Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]:
     """Direct light and bounces, (BOUNCES + 1, h, w), and whether section 8.4 was warned of."""
     separation = ltcl.separate(T, picture, BOUNCES, method="direct")
     light = np.concatenate([separation.direct[None], separation.bounces])
@@ -121,12 +122,12 @@ def measure(
     truth_norms = norms(truth)
 
     (matrix,) = scene.matrices()
-    T = ltcl.Transport(matrix, scene.grid, F, device=device)
+    T = Transport(matrix, scene.grid, F, device=device)
     picture = T @ pattern
     light, warned = separate_light(T, picture)
     deviations = norms(light - truth)
     negative = -np.minimum(light, 0).sum(axis=(1, 2))
-    diagonal_T = ltcl.Transport(matrix, scene.grid, device=device)
+    diagonal_T = Transport(matrix, scene.grid, device=device)
     diagonal_light, _ = separate_light(diagonal_T, picture)
 
     l_in = pattern.ravel()

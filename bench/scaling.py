@@ -154,7 +154,8 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
     b = np.random.default_rng(1).random(n, np.float32)
     own_rows = matrix(comm.rank * half, (comm.rank + 1) * half, n, entries)
     operators = rank_operators(comm, alone, n, entries, own_rows)
-    triad_of_half, _ = triad(operators["2 ranks"].device, n * entries < 1 << 20, 2)
+    is_small = n * entries < 1 << 20
+    triad_of_half, _ = triad(operators["2 ranks"].device, is_small, 2)
     actions: Actions = {"exchange": exchange_halves(comm, n)}
     actions |= operator_actions(operators, b)
     actions |= memory_actions(comm, "reading the same", partial(read_numbers, own_rows))

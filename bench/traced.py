@@ -27,6 +27,7 @@ from _coefficients import norms
 from _figures import Claim
 from _harness import parse_options
 from denoise import QUANTITIES, patterns
+from ltcl import Transport
 from scenes import tracing
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -78,22 +79,22 @@ class Judgement:
     row_nbytes: float
 
 
-def traced_measurements(scene: str) -> tuple[list[ltcl.Transport], dict[str, float]]:
+def traced_measurements(scene: str) -> tuple[list[Transport], dict[str, float]]:
     """All measurements, and how far the bounces of their mean are from those traced."""
     traced = [tracing.trace(scene, GRID, PATHS, seed) for seed in range(1, SEEDS + 1)]
     mean = np.mean(traced, axis=0, dtype=np.float64)
     bounces = mean.sum(axis=2).reshape(-1, *GRID)[:4]
     deviations = {}
     for first_bounce in ("diagonal", "exact"):
-        T = ltcl.Transport(mean.sum(axis=0), GRID, first_bounce=first_bounce)
+        T = Transport(mean.sum(axis=0), GRID, first_bounce=first_bounce)
         separation = ltcl.separate(T, T @ np.ones(GRID), 3, rtol=1e-5)
         off = norms(separation_light(separation) - bounces) / norms(bounces[:1])
         deviations[first_bounce] = float(off.max())
-    transports = [ltcl.Transport(T.sum(axis=0), GRID) for T in traced]
+    transports = [Transport(T.sum(axis=0), GRID) for T in traced]
     return transports, deviations
 
 
-def simulated_measurements() -> list[ltcl.Transport]:
+def simulated_measurements() -> list[Transport]:
     """Measurements for --smoke, which need no Mitsuba."""
     T = truth("corner", 6)
     noise = noise_of(T, 1e-3)
@@ -105,7 +106,7 @@ def separation_light(separation: Any) -> np.ndarray:
     return np.stack([separation.direct, *separation.bounces])
 
 
-def deviation_ratios(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
+def deviation_ratios(T: Transport, true: Transport) -> np.ndarray:
     """`.std` over errors of `PARTS`, under white."""
     white = true @ np.ones(true.grid)
     separation = ltcl.separate(T, white, 3, rtol=1e-5)
@@ -119,13 +120,13 @@ def deviation_ratios(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     return norms(deviations) / norms([*light_errors, pattern_error, appearance_error])
 
 
-def quantities(T: ltcl.Transport, images: np.ndarray) -> list[np.ndarray]:
+def quantities(T: Transport, images: np.ndarray) -> list[np.ndarray]:
     """`QUANTITIES` of T: T p of ten patterns of each kind; bounces of `images`."""
     relit = [T @ kind for kind in patterns(T.grid)]
     return [*relit, *ltcl.separate(T, images, 3).bounces]
 
 
-def relative_errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
+def relative_errors(T: Transport, true: Transport) -> np.ndarray:
     """Relative errors of `QUANTITIES`; bounces are of pictures of one pattern of each kind."""
     images = true @ np.stack([kind[0] for kind in patterns(T.grid)])
     exact = quantities(true, images)
@@ -133,13 +134,14 @@ def relative_errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     return norms(deviations) / norms(exact)
 
 
-def judge(T: ltcl.Transport, true: ltcl.Transport) -> Judgement:
+def judge(T: Transport, true: Transport) -> Judgement:
     compressed = ltcl.compress(T, "noise")
     errors = relative_errors(T, true)
 
-    def error_ratio(better: ltcl.Transport) -> np.ndarray:
+    def error_ratio(better: Transport) -> np.ndarray:
         squares = (relative_errors(better, true) / errors) ** 2
-        return np.sqrt(np.maximum(squares - TRUTH_VARIANCE, 0.0) / (1.0 - TRUTH_VARIANCE))
+        own_squares = np.maximum(squares - TRUTH_VARIANCE, 0.0)
+        return np.sqrt(own_squares / (1.0 - TRUTH_VARIANCE))
 
     nbytes = compressed.compression.channels[0].nbytes
     return Judgement(
@@ -151,7 +153,7 @@ def judge(T: ltcl.Transport, true: ltcl.Transport) -> Judgement:
     )
 
 
-def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
+def judge_scene(measured: list[Transport]) -> dict[str, list[Judgement]]:
     """Judge some measurements, by the noise model they are options."""
     alone = []
     with_second = []
@@ -159,9 +161,9 @@ def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
         first, second, *others = measured[k:] + measured[:k]
         matrix = first.to_numpy()
         mean = np.mean([T.to_numpy() for T in others], axis=0)
-        true = ltcl.Transport(mean, first.grid)
-        alone.append(judge(ltcl.Transport(matrix, first.grid), true))
-        twice = ltcl.Transport(matrix, first.grid, noise=second)
+        true = Transport(mean, first.grid)
+        alone.append(judge(Transport(matrix, first.grid), true))
+        twice = Transport(matrix, first.grid, noise=second)
         with_second.append(judge(twice, true))
     return {"noise by T alone": alone, "noise by two measurements": with_second}
 
