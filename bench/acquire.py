@@ -267,9 +267,9 @@ class Judge:
         shares_within = np.mean(np.abs(error) < 3 * deviation, axis=(1, 2))
         return ratios.tolist(), float(np.min(shares_within))
 
-        def _grey(self, patterns: np.ndarray) -> np.ndarray:
-            """Patterns (N, k) in each channel, (N, k, channels)."""
-            return np.repeat(patterns[..., None], self.channels, axis=-1)
+    def _grey(self, patterns: np.ndarray) -> np.ndarray:
+        """Patterns (N, k) in each channel, (N, k, channels)."""
+        return np.repeat(patterns[..., None], self.channels, axis=-1)
 
     def _all_bounces(self, separation: Any) -> np.ndarray:
         """Direct light and bounces, (4, N, channels)."""
