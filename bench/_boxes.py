@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -70,8 +71,8 @@ def terms(systems: Sequence[Any], l_out: np.ndarray, count: int) -> np.ndarray:
     powers = [l_out]
     for _ in range(count):
         power = powers[-1]
-        products = map(np.matmul, systems, power)
-        powers.append(power - np.stack(list(products)))
+        products = list(map(operator.matmul, systems, power))
+        powers.append(power - np.stack(products))
     return np.stack(powers)
 
 
