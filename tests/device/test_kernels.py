@@ -212,7 +212,7 @@ def test_a_bound_launch_refuses_names_that_its_kernel_has_not(device):
     launch = device.kernel("vector", "vector_fill").bind(
         3, 1, count=3, value=1.0, out=device.empty(3)
     )
-    with pytest.raises(InputTypeError, match="vector_fill has no argument x; it has count"):
+    with pytest.raises(InputTypeError, match="vector_fill .* x; .*count"):
         launch.set(x=1.0)
 
 
