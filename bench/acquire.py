@@ -98,7 +98,8 @@ class Scan:
 def corner(n: int, albedo: float = ALBEDO) -> np.ndarray:
     """T of two walls of n x n / 2 pixels, from exact form factors of squares joined in pairs."""
     G = np.asarray(ltcl.scenes.dihedral(n).form_factors, np.float64)
-    pairs = G.reshape(n, n, 2, n, n, 2).sum(axis=5).mean(axis=2).reshape(n * n, n * n)
+    joined = G.reshape(n, n, 2, n, n, 2).sum(axis=5).mean(axis=2)
+    pairs = joined.reshape(n * n, n * n)
     return albedo * np.linalg.inv(np.eye(n * n) - albedo * pairs)
 
 
@@ -153,7 +154,8 @@ class Truth:
 def measured_pictures(T: ltcl.Transport, patterns: np.ndarray) -> np.ndarray:
     """Pictures (N, k, channels) of a measured T."""
     N, k, channels = patterns.shape
-    frames = np.moveaxis(patterns, 1, 0).reshape(k, *T.grid, channels).astype(np.float32)
+    frames = np.moveaxis(patterns, 1, 0).reshape(k, *T.grid, channels)
+    frames = frames.astype(np.float32)
     if channels == 1:
         frames = frames[..., 0]
     pictures = np.asarray(T @ frames, np.float64)
@@ -220,11 +222,13 @@ class Judge:
 
     def row_sum_error(self) -> float:
         """Largest relative error of a row sum."""
-        return float(np.max(np.abs(self.unit * self._white / self._true_white - 1)))
+        ratio = self.unit * self._white / self._true_white
+        return float(np.max(np.abs(ratio - 1)))
 
     def pattern_error(self) -> float:
         """Relative error of T p of held patterns."""
-        patterns = np.repeat(held_patterns(self.truth.n)[..., None], self.channels, axis=-1)
+        grey = held_patterns(self.truth.n)[..., None]
+        patterns = np.repeat(grey, self.channels, axis=-1)
         ours = self.unit * measured_pictures(self.T, patterns)
         return relative_error(ours, self.truth.pictures(patterns))
 
@@ -236,10 +240,11 @@ class Judge:
         tiles = np.arange(TILES**2)
         patterns = np.repeat((tile == tiles)[..., None], self.channels, axis=-1)
         row, column = np.divmod(tile, TILES)
-        other_row, other_column = np.divmod(tiles, TILES)
-        distance = np.maximum(abs(row - other_row), abs(column - other_column))
+        lit_row, lit_column = np.divmod(tiles, TILES)
+        distance = np.maximum(abs(row - lit_row), abs(column - lit_column))
         is_far = (distance > 1)[..., None]
-        ours = np.sum(is_far * (self.unit * measured_pictures(self.T, patterns)), axis=1)
+        pictures = self.unit * measured_pictures(self.T, patterns)
+        ours = np.sum(is_far * pictures, axis=1)
         exact = np.sum(is_far * self.truth.pictures(patterns), axis=1)
         total_errors = np.abs(ours.sum(axis=0) / exact.sum(axis=0) - 1)
         return relative_error(ours, exact), float(np.max(total_errors))
@@ -260,7 +265,8 @@ class Judge:
         variance = np.mean(deviation.astype(np.float64) ** 2, axis=(1, 2))
         ratios = np.sqrt(mean_square / variance)
         is_within = np.abs(error) < 3 * deviation
-        return ratios.tolist(), float(np.min(np.mean(is_within, axis=(1, 2))))
+        shares_within = np.mean(is_within, axis=(1, 2))
+        return ratios.tolist(), float(np.min(shares_within))
 
     def _all_bounces(self, separation: Any) -> np.ndarray:
         """Direct light and bounces, (4, N, channels)."""
@@ -279,7 +285,8 @@ class Judge:
             target = target[..., 0]
         pattern = ltcl.compensate(self.T, target, rtol=1e-3).pattern
         light = np.asarray(pattern, np.float64).reshape(-1, 1, self.channels)
-        error = self.truth.pictures(light)[:, 0] - desired.reshape(-1, self.channels)
+        picture = self.truth.pictures(light)[:, 0]
+        error = picture - desired.reshape(-1, self.channels)
         return float(10 * np.log10(desired.max() ** 2 / np.mean(error**2)))
 
 

@@ -29,7 +29,7 @@ import ltcl
 from _figures import Claim
 from _harness import parse_options
 from ltcl.plots.page import OTHERS
-from ltcl.tasks.denoising.bases import multiwavelets
+from ltcl.tasks.denoising.multiwavelets import multiwavelets
 from ltcl.tasks.denoising.problem import DenoisingProblem
 from ltcl.tasks.denoising.shrinkage import refine, threshold_coefficients
 

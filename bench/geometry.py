@@ -55,7 +55,11 @@ SIZES = (1.5, 2.0, 3.0, 4.0)
 CLAIMED_SIZES = (3.0, 4.0)
 NOISE_SIZE = 3.0
 # Electrons at full scale, and read noise.
-NOISES = {"10000 electrons": (10000.0, 0.0005), "2000": (2000.0, 0.002), "500": (500.0, 0.005)}
+NOISES = {
+    "10000 electrons": (10000.0, 0.0005),
+    "2000": (2000.0, 0.002),
+    "500": (500.0, 0.005),
+}
 QUIET = "10000 electrons"
 # Columns of the held patterns.
 KINDS = {"noise": slice(0, 2), "stripes": slice(2, 3), "smooth": slice(3, 6)}
@@ -242,7 +246,8 @@ class RenderedCorner:
         # Pixels all neighbours of which are well seen.
         is_covered = calibration.resampling.coverage > 0.8
         self.inner: Any = scipy.ndimage.binary_erosion(is_covered, np.ones((3, 3)))
-        self.white = np.asarray(self.T @ np.ones(grid, np.float32), np.float64)[self.inner]
+        white = np.asarray(self.T @ np.ones(grid, np.float32), np.float64)
+        self.white = white[self.inner]
 
     def true_picture(self, pattern: np.ndarray) -> np.ndarray:
         """Light on the inner pixels, rendered from the projector's place."""
@@ -271,7 +276,8 @@ class RenderedCorner:
         picture = self.true_picture(pattern)
         inner = desired[self.inner]
         scaled = picture * (picture @ inner) / (picture @ picture)
-        return float(10 * np.log10(inner.max() ** 2 / np.mean((scaled - inner) ** 2)))
+        mean_square = np.mean((scaled - inner) ** 2)
+        return float(10 * np.log10(inner.max() ** 2 / mean_square))
 
 
 def rendered_loop(n: int, samples: int, patterns: np.ndarray, device: Device) -> RenderedLoop:
@@ -308,12 +314,14 @@ def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
     decoded = decode(photographs, BOARD_GRID)
     is_lit = white.astype(np.float32) - black > LIT_DIFFERENCE
     on_board = decoded.valid & _board(white)
-    camera = np.stack(np.nonzero(on_board)[::-1], axis=1).astype(np.float64)
-    projector = np.stack([decoded.x[on_board], decoded.y[on_board]], axis=1).astype(np.float64)
+    v, u = np.nonzero(on_board)
+    camera = np.stack([u, v], axis=1).astype(np.float64)
+    projector = np.stack([decoded.x, decoded.y], axis=-1)[on_board].astype(np.float64)
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
     mapped = cv2.perspectiveTransform(camera[:, None], H)[:, 0]
     distance = np.linalg.norm(mapped - projector, axis=1)
-    in_projector, in_camera = _reprojected(camera[::20], STEP * projector[::20], folder)
+    some = slice(None, None, 20)
+    in_projector, in_camera = _reprojected(camera[some], STEP * projector[some], folder)
     homography = "real, from a homography on the board"
     return {
         "real photographs, lit pixels decoded": float(decoded.valid[is_lit].mean()),
@@ -444,8 +452,8 @@ def draw(results: Results) -> Figure:
     figure = figures.page(
         height,
         "A camera that is not aligned with the projector",
-        "Above: largest error of T p over held patterns, of a corner with 16 x 16 projector pixels",
-        "seen askance. Below: a rendered corner, by a camera half a wall beside the projector.",
+        "Above: largest error of T p over held patterns, of a corner with 16 x 16",
+        "projector pixels seen askance. Below: a rendered corner, by a camera half a wall beside.",
     )
     xlabel = "camera pixels to a projector pixel's side"
     by_size = figures.graph(figure, (80, 140, 400, 220), "By size", xlabel, "")
@@ -466,8 +474,14 @@ def plot_sizes(axes: Axes, results: Results) -> None:
         sizes = [scan.size for scan in scans]
         for kind, style in LINE_STYLES.items():
             errors = [scan.errors[kind] for scan in scans]
-            label = f"{camera}, {kind}"
-            axes.plot(sizes, errors, style, color=f"C{number}", marker="o", label=label)
+            axes.plot(
+                sizes,
+                errors,
+                style,
+                color=f"C{number}",
+                marker="o",
+                label=f"{camera}, {kind}",
+            )
     sizes = [scan.size for scan in results.at_random]
     worst = [scan.worst for scan in results.at_random]
     label = f"{len(sizes)} cameras at random, worst"

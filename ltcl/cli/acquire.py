@@ -180,7 +180,7 @@ def _check_card(project: Any, take: Path | None) -> None:
         raise InputError(f"--take is given, but {rig}, not folder")
     if not take.is_dir():
         advice = "--take needs the one with the camera's files"
-        raise FileError(f"{take}: is no folder; {advice}")
+        raise FileError(f"{take}: is not a folder; {advice}")
 
 
 def _has_all_photographs(project: Any) -> bool:

@@ -42,7 +42,7 @@ def describe(
         channels=len(matrices),
         stored=stored,
         dtype=str(matrices[0].dtype),
-        entries=sum(_count_entries(record, matrix) for matrix in matrices),
+        entries=sum(map(_count_entries, matrices)),
         nbytes=sum(map(_count_bytes, matrices)),
         first_bounce_from="diagonal" if record.first_bounce is None else "file",
         solution_error=0.0,
@@ -95,8 +95,8 @@ def _facts(
     )
 
 
-def _count_entries(record: StoreRecord, matrix: Any) -> int:
-    if record.dense:
+def _count_entries(matrix: Any) -> int:
+    if isinstance(matrix, np.ndarray):
         return int(np.count_nonzero(matrix))
     return int(matrix.nnz)
 
@@ -126,9 +126,8 @@ def _first_bounce(record: StoreRecord) -> np.ndarray | None:
         """Return the measured noise, or estimate it, which takes a while."""
         if record.noise is not None:
             return record.noise
-        grid = (1, columns) if record.grid is None else record.grid
-        camera_grid = grid if record.camera_grid is None else record.camera_grid
-        return estimate(matrices, grid, camera_grid)
+        grid = record.grid or (1, columns)
+        return estimate(matrices, grid, record.camera_grid or grid)
 
     rule = first_bounce.DarkRule(
         matrices=matrices,

@@ -66,9 +66,11 @@ def info(
         entries.append(GoodFile(**vars(facts), verdict=VerdictReport.from_verdict(verdict)))
         rows.append(_table_row(facts))
     panels.write_first_bounces(show_dark, first_bounces)
-    lines = [table(COLUMNS, rows)] if rows else []
+    lines = verdict_lines(verdicts)
+    if rows:
+        lines.insert(0, table(COLUMNS, rows))
     code = FAILED if len(rows) < len(files) else 0
-    return Answer(entries, [*lines, *verdict_lines(verdicts)], code)
+    return Answer(entries, lines, code)
 
 
 def _read_facts(file: Path, variable: str | None) -> tuple[FileFacts, np.ndarray | None, Verdict]:

@@ -17,7 +17,7 @@ from ltcl.errors import InputError
 from ltcl.operators import rank_device
 from ltcl.solvers.solve import SAMPLED
 from ltcl.tasks import report
-from ltcl.tasks.requirements import default_rtol, resolve_reference
+from ltcl.tasks.requirements import check_exact, default_rtol
 from ltcl.transport.transport import Transport
 
 # Relative error of a float32 picture by rounding.
@@ -101,7 +101,7 @@ def solver_settings(
 ) -> dict[str, Any]:
     """Return arguments of a task: method, tolerance, inverse, original, and progress.
 
-    The task has the tolerance `base_rtol` by default, and so many solves for each channel.
+    The default tolerance is `base_rtol`; the task makes `solves` solves for each channel.
     """
     options = context.options
     method = options["method"]
@@ -114,13 +114,15 @@ def solver_settings(
     rtol = options["rtol"]
     if rtol is None:
         rtol = default_rtol(base_rtol, T, exact, inverse)
-    solves_of_item = solves if method in SAMPLED else solves * T.channels
+    # Sampling methods solve all channels at once.
+    if method not in SAMPLED:
+        solves *= T.channels
     return {
         "method": method,
         "rtol": rtol,
         "inverse": inverse,
         "exact": exact,
-        "callback": context.progress.solve(rtol, solves_of_item),
+        "callback": context.progress.solve(rtol, solves),
         **_given_options(context, "samples", "seed"),
     }
 
@@ -138,7 +140,7 @@ def _load_original(context: Context, T: Transport) -> Transport:
         device=T.device,
     )
     # It refuses other colours.
-    resolve_reference(T, exact)
+    check_exact(T, exact)
     channels = (3,) if T.channels == 3 else ()
     pattern = np.random.default_rng(0).random((*T.grid, *channels))
     picture = T @ pattern

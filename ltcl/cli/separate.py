@@ -86,7 +86,9 @@ class PartsWriter:
     ) -> SeparatedPicture:
         """Write all parts of a picture, and return its report."""
         light = _parts(result)
-        deviations = _deviations(result) if self.has_std else {}
+        deviations: dict[str, np.ndarray] = {}
+        if self.has_std:
+            deviations = _deviations(result)
         solved = dict(zip(_solved_names(result), result.solutions, strict=True))
         whole = _mean(photograph)
         parts = []

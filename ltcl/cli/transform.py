@@ -17,6 +17,7 @@ from ltcl.cli.options import option, out_option
 from ltcl.cli.reports.transports import CompressReport, DenoiseReport, InvertReport, NoiseReport
 from ltcl.cli.tables import COLOURS, table
 from ltcl.errors import InputError
+from ltcl.operators.wavelets import EXAMPLES
 from ltcl.store import formats
 from ltcl.tasks import compression, denoising
 from ltcl.transport.transport import Transport
@@ -62,7 +63,7 @@ def _accuracy_options(
     basis: Annotated[
         list[str] | None,
         option(
-            "Basis of R: pixels or a wavelet (haar, db2, ...; compress also takes "
+            f"Basis of R: pixels or a wavelet ({EXAMPLES}, ...; compress also takes "
             "'db2 rows'); the best one if given more than once."
         ),
     ] = None,
