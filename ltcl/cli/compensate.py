@@ -165,7 +165,7 @@ def compensate_pictures(
         pictures.write_report(folder, report)
     lines = [
         table(COLUMNS, rows),
-        f"\npatterns, appearances and what is out of reach as .exr and .png in {out}",
+        f"\npatterns, appearances and light out of reach as .exr and .png in {out}",
         f"look at {out / 'compensate.png'}",
     ]
     return Answer(report, [*lines, *job.notes])

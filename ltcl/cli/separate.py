@@ -55,8 +55,9 @@ def separate(
     )
     with pictures.fill(out) as folder:
         for name, path in zip(context.progress.each([*photographs]), picture, strict=True):
-            result = separation.separate(T, photographs[name], bounces, **settings)
-            entry = writer.write(folder, name, path, photographs[name], result)
+            photograph = photographs[name]
+            result = separation.separate(T, photograph, bounces, **settings)
+            entry = writer.write(folder, name, path, photograph, result)
             report.pictures.append(entry)
         panels.contact_sheet(writer.sheet).save(folder / "separate.png")
         pictures.write_report(folder, report)
