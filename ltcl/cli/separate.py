@@ -56,8 +56,9 @@ def separate(
     with pictures.fill(out) as folder:
         names = context.progress.each([*photographs])
         for name, path in zip(names, picture, strict=True):
-            result = separation.separate(T, photographs[name], bounces, **settings)
-            entry = writer.write(folder, name, path, photographs[name], result)
+            photograph = photographs[name]
+            result = separation.separate(T, photograph, bounces, **settings)
+            entry = writer.write(folder, name, path, photograph, result)
             report.pictures.append(entry)
         panels.contact_sheet(writer.sheet).save(folder / "separate.png")
         pictures.write_report(folder, report)
