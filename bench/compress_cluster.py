@@ -19,7 +19,7 @@ from _coefficients import note
 from _corner import Bounce
 from _harness import Options, Row, parse_options, report
 from ltcl.operators import Wavelet
-from ltcl.tasks.compression.bases import CoefficientAnalysis
+from ltcl.tasks.compression.basis_pairs import CoefficientAnalysis
 from ltcl.tasks.compression.coefficients import Coefficients, coefficients
 from ltcl.tasks.compression.sources import source
 from resolution131k import BLOCK_BYTES, REFERENCE, THRESHOLD

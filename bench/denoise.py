@@ -31,7 +31,7 @@ from _figures import Claim
 from _harness import parse_options
 from ltcl import Transport
 from ltcl.plots.page import OTHERS
-from ltcl.tasks.denoising.bases import multiwavelets
+from ltcl.tasks.denoising.multiwavelets import multiwavelets
 from ltcl.tasks.denoising.problem import DenoisingProblem
 from ltcl.tasks.denoising.shrinkage import refine, threshold_coefficients
 

@@ -55,7 +55,11 @@ SIZES = (1.5, 2.0, 3.0, 4.0)
 CLAIMED_SIZES = (3.0, 4.0)
 NOISE_SIZE = 3.0
 # Electrons at full scale, and read noise.
-NOISES = {"10000 electrons": (10000.0, 0.0005), "2000": (2000.0, 0.002), "500": (500.0, 0.005)}
+NOISES = {
+    "10000 electrons": (10000.0, 0.0005),
+    "2000": (2000.0, 0.002),
+    "500": (500.0, 0.005),
+}
 QUIET = "10000 electrons"
 # Columns of the held patterns.
 KINDS = {"noise": slice(0, 2), "stripes": slice(2, 3), "smooth": slice(3, 6)}
@@ -321,7 +325,8 @@ def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
     mapped = cv2.perspectiveTransform(camera[:, None], H)[:, 0]
     distance = np.linalg.norm(mapped - projector, axis=1)
-    in_projector, in_camera = _reprojected(camera[::20], STEP * projector[::20], folder)
+    some = slice(None, None, 20)
+    in_projector, in_camera = _reprojected(camera[some], STEP * projector[some], folder)
     homography = "real, from a homography on the board"
     return {
         "real photographs, lit pixels decoded": float(decoded.valid[is_lit].mean()),
@@ -453,8 +458,8 @@ def draw(results: Results) -> Figure:
     figure = figures.page(
         height,
         "A camera that is not aligned with the projector",
-        "Above: largest error of T p over held patterns, of a corner with 16 x 16 projector pixels",
-        "seen askance. Below: a rendered corner, by a camera half a wall beside the projector.",
+        "Above: largest error of T p over held patterns, of a corner with 16 x 16",
+        "projector pixels seen askance. Below: a rendered corner, by a camera half a wall beside.",
     )
     xlabel = "camera pixels to a projector pixel's side"
     box = (80, 140, 400, 220)

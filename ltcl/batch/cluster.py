@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Tries of an item whose workers are lost, before the item is taken for the reason.
+# Attempts of an item whose workers are lost, before the item itself is taken for the cause.
 MAX_TRIES = 4
-# Seconds without a worker before a stream ends: what was killed has been started again by then.
+# Seconds without a worker before a stream ends: workers that were killed have restarted by then.
 PATIENCE = 60.0
 # Seconds between two looks at the list of workers.
 PERIOD = 1.0
@@ -66,7 +66,7 @@ def stream(
         worker that cannot unpickle it takes no work.
     items : iterable
     window : int
-        Number of items on the way for each worker: one is computed, others are there when it ends.
+        Number of items sent to each worker: while one is computed, the others wait there.
     share_gpu : bool
         Let several workers use one GPU; else all but the first are excluded. Workers always share
         a CPU.
@@ -161,7 +161,7 @@ def connect(
     device : str, optional
         The device that local workers share, LTCL_DEVICE when not given. Without either they have a
         GPU each, or share the CPU, each with all of its cores: with fewer, sums are rounded in
-        another order than without a cluster.
+        a different order than without a cluster.
 
     Raises
     ------
@@ -412,9 +412,8 @@ class _Crew:
         """Answers of the workers that were not asked yet, by address."""
         known = self.ready.keys() | self.excluded
         new = [address for address in present if address not in known]
-        if (
-            not new
-        ):  # Dask would send the function to the scheduler all the same, and it may be large
+        if not new:
+            # Dask would send the function to the scheduler all the same, and it may be large.
             return {}
         version = importlib.import_module("ltcl").__version__
         return self.client.run(
@@ -440,7 +439,7 @@ class _Crew:
         reason = answer
         if isinstance(answer, tuple):
             name, gpu = answer
-            sharing = [other for other, other_gpu in self.ready.items() if other_gpu == gpu]
+            sharing = [worker for worker, used_gpu in self.ready.items() if used_gpu == gpu]
             if gpu is None or not sharing or self.share_gpu:
                 self.ready[address] = gpu
                 return

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import chain, islice, repeat, tee
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -86,21 +86,28 @@ class BatchSolver:
             for S in self.T.systems:
                 survey(S)
 
-    def __getstate__(self) -> dict[str, Any]:
-        options = {name: value for name, value in self.options.items() if name != "callback"}
-        T = None if self.reload else self.T
-        return dict(vars(self), T=T, options=options)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what `_on_worker` takes: T only if it has no file there."""
+        state = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+        state["options"] = {**self.options}
+        state["options"].pop("callback", None)
         if self.reload is not None:
-            self.T = self.reload()
-            if identity(self.T) != self.identity:
-                raise InputError("the file of T holds another T there; give all workers the same")
-        for value in (self.T, *self.options.values()):
-            # A worker opens its own device.
-            if isinstance(value, (Transport, Inverse)):
-                value.forget_device()
+            state["T"] = None
+        return _on_worker, (state,)
+
+
+def _on_worker(state: dict[str, Any]) -> BatchSolver:
+    """Make the solver of a worker, with T from its file if it has one."""
+    reload = state["reload"]
+    if reload is not None:
+        state["T"] = reload()
+        if identity(state["T"]) != state["identity"]:
+            raise InputError("the file of T holds another T there; give all workers the same")
+    for value in (state["T"], *state["options"].values()):
+        # A worker opens its own device.
+        if isinstance(value, (Transport, Inverse)):
+            value.forget_device()
+    return BatchSolver(**state)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -146,9 +153,8 @@ class FilmRun:
         self.solver.gain = self.head["gain"]
 
         to_solve, to_write = tee(chain(first, batches))
-        tasks = (([read.frame.number for read in batch], stack(batch)) for batch in to_solve)
         with ThreadPoolExecutor(WRITERS) as writers:
-            results = self.stream(self.solver, tasks)
+            results = self.stream(self.solver, map(_task, to_solve))
             for solved, batch in zip(results, to_write, strict=True):
                 self._keep(batch, solved, writers)
                 yield len(self.done)
@@ -291,6 +297,11 @@ class FilmRun:
             images.write(file, light)
         else:
             images.write(file, light / np.float32(white), bits=16)
+
+
+def _task(batch: Sequence[ReadFrame]) -> tuple[list[int], np.ndarray]:
+    """Numbers and pictures of a batch, as a `BatchSolver` takes them."""
+    return [read.frame.number for read in batch], stack(batch)
 
 
 def stack(batch: Sequence[ReadFrame]) -> np.ndarray:

@@ -10,9 +10,10 @@ tolerance: the rest after `frames=`, or a lost pattern.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from ltcl.images.frames import Source, check_video, open_frames, write_video
 from ltcl.tasks.compensation import compensate
 from ltcl.tasks.compensation.inputs import check_gain
 from ltcl.tasks.report import versions
-from ltcl.tasks.requirements import error_note, resolve_reference
+from ltcl.tasks.requirements import check_exact, error_note
 from ltcl.transport import frames as picture_frames
 from ltcl.transport.transport import Transport, check_transport
 
@@ -189,37 +190,26 @@ def compensate_frames(
         fps = checks.number("fps", fps, above=0.0)
     if frames is not None:
         frames = checks.count("frames", frames)
-    check_transport(T, square=False)
-    resolve_reference(T, options.get("exact"))
-    check_gain(gain, loss)
+    white = _check_light(T, gain, loss, options)
     _check_functions(codes=codes, progress=progress)
-    _check_pictures(T, options)
-    _, high = checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
     if video is not None:
         check_video(video, T.grid)
     source_frames = open_frames(source, encoding=encoding)
     folder = as_path(out)
     _check_places(source_frames, out=out, video=video)
 
-    settings = {
-        **(compensate.__kwdefaults__ or {}),
-        "gain": gain,
-        "loss": loss,
-        "batch": batch,
-        "format": format,
-        "appearance": appearance,
-        "encoding": encoding,
-        "resize": resize,
-        "codes": None if codes is None else curve(codes, T.grid),
+    head = _head(
+        T,
+        gain=gain,
+        loss=loss,
+        batch=batch,
+        format=format,
+        appearance=appearance,
+        encoding=encoding,
+        resize=resize,
+        codes=codes,
         **options,
-    }
-    settings.pop("callback", None)
-    head = {
-        "versions": versions(),
-        "settings": {name: setting(value) for name, value in settings.items()},
-        "transport": identity(T),
-        "gain": None,
-    }
+    )
     solver = BatchSolver(
         T=T,
         options=options,
@@ -234,32 +224,69 @@ def compensate_frames(
         limit=frames,
         folder=folder,
         head=head,
-        white=high if high > 0 else 1.0,
+        white=white,
         codes=codes,
     )
     with locked(folder, wait=False):
         run.records |= manifest.read(folder, head, resume)
-        try:
+        with _finished_frames_named(run):
             for done in run.solve(gain, loss):
                 if progress is not None:
                     progress("frames", done, run.count)
             if video is not None:
-                write_video(video, run.patterns(), fps or source_frames.fps or DEFAULT_FPS)
-        except LtclError as error:
-            if run.records and not isinstance(error, OtherRun):
-                done = f"{len(run.records)} frame(s) are done and stay in {folder}"
-                error.args = (f"{error}; {done}; resume=True (--resume) goes on from there",)
-            raise
+                rate = fps or source_frames.fps or DEFAULT_FPS
+                video = as_path(video)
+                write_video(video, run.patterns(), rate)
     reference = options.get("exact") or T
     return CompensatedFrames(
         folder=folder,
-        video=None if video is None else as_path(video),
+        video=video,
         gain=head["gain"] or 0.0,
         records=tuple(run.records[number] for number in sorted(run.done)),
         solved=run.solved_count,
         seconds=time.perf_counter() - start,
         transport_error=reference.error,
     )
+
+
+def _check_light(
+    T: Transport, gain: float | str, loss: float | None, options: dict[str, Any]
+) -> float:
+    """Check T and what `compensate` gets; return the light that is white in .png."""
+    check_transport(T, square=False)
+    if options.get("exact") is not None:
+        check_exact(T, options["exact"])
+    check_gain(gain, loss)
+    _check_pictures(T, options)
+    _, high = checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
+    return high if high > 0 else 1.0
+
+
+def _head(T: Transport, **settings: Any) -> dict[str, Any]:
+    """Return the head of the list of frames: what must be the same when a run goes on."""
+    if settings["codes"] is not None:
+        settings["codes"] = curve(settings["codes"], T.grid)
+    settings = {**(compensate.__kwdefaults__ or {}), **settings}
+    settings.pop("callback", None)
+    return {
+        "versions": versions(),
+        "settings": {name: setting(value) for name, value in settings.items()},
+        "transport": identity(T),
+        "gain": None,
+    }
+
+
+@contextlib.contextmanager
+def _finished_frames_named(run: FilmRun) -> Iterator[None]:
+    """Tell in an error of the block how many frames are done, and how to go on."""
+    try:
+        yield
+    except LtclError as error:
+        if run.records and not isinstance(error, OtherRun):
+            done = f"{len(run.records)} frame(s) are done and stay in {run.folder}"
+            advice = "resume=True (--resume) goes on from there"
+            error.args = (f"{error}; {done}; {advice}",)
+        raise
 
 
 def _check_functions(**functions: Any) -> None:

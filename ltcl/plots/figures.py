@@ -132,7 +132,7 @@ def _draw_products(axes: Axes, channels: list[ChannelAnalysis]) -> None:
         for place, name in enumerate(methods):
             products = channel.products[name]
             y = place - 0.4 + (row + 0.5) * height
-            length = products if math.isfinite(products) else 0
+            length = np.nan_to_num(products, posinf=0.0)
             bar = axes.barh(y, length, 0.85 * height, color=colours[name])
             label = f"  {_forecast(products)}"
             axes.bar_label(bar, [label], color=FAINT, fontsize=font_size)
@@ -207,8 +207,8 @@ class _Page:
     def draw_heading(self, figure: Figure, title: str, subtitle: str) -> None:
         """Title and subtitle."""
         heading(figure, self.margin, 18 * self.scale, title, 17 * self.scale)
-        top = 52 if title else 18
-        label_at(figure, self.margin, top * self.scale, subtitle, size=11 * self.scale, color=FAINT)
+        top = self.scale * (52 if title else 18)
+        label_at(figure, self.margin, top, subtitle, size=11 * self.scale, color=FAINT)
 
     def place_row(self, row: Mapping[str, np.ndarray], top: float) -> list[_PlacedPicture]:
         """Pictures side by side, as wide as the page, their names above."""
@@ -278,8 +278,9 @@ def _draw_picture(
     codes = np.broadcast_to(np.atleast_3d(to_srgb(light)), (h, w, 3))
     paper = np.array([int(PAPER[start : start + 2], 16) / 255 for start in (1, 3, 5)])
     codes = np.where(black[..., None], paper, codes)
+    codes = np.rint(255 * codes).astype(np.uint8)
     axes = axes_at(figure, (left, top, w, h))
-    axes.imshow(np.rint(255 * codes).astype(np.uint8), interpolation="none", aspect="auto")
+    axes.imshow(codes, interpolation="none", aspect="auto")
     axes.axis("off")
 
 
@@ -300,10 +301,13 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
         products, residuals = _convergence_line(solution, most_products)
         lowest = min(lowest, float(residuals.min()))
         highest = max(highest, float(residuals.max()))
-        is_below = solution.residual < LOWEST_RESIDUAL
-        label = f"{name} \u2193" if is_below else name
-        # Neumann runs on top of Jacobi, which must stay visible.
-        style = SHORT_DASHES if name == "neumann" else "-"
+        label = name
+        if solution.residual < LOWEST_RESIDUAL:
+            label = f"{name} \u2193"
+        style: Any = "-"
+        if name == "neumann":
+            # Neumann runs on top of Jacobi, which must stay visible.
+            style = SHORT_DASHES
         axes.plot(
             products, residuals, color=colours[name], lw=2.6, ls=style, clip_on=False, label=label
         )

@@ -27,9 +27,8 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     known = figure.canvas.get_supported_filetypes()
     extension = os.path.splitext(path)[1].lstrip(".").lower()
     if extension not in known:
-        name = extension or "missing"
         formats = ", ".join(sorted(known))
-        raise InputError(f"{path}: extension {name!r} is unknown; plots are {formats}")
+        raise InputError(f"{path}: extension is {extension!r}; plots are saved as {formats}")
     with replace_file(path) as temporary:
         figure.savefig(temporary, dpi=DPI, facecolor=figure.get_facecolor())
 

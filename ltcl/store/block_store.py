@@ -241,17 +241,20 @@ class BlockStore:
         layout = self.layout
         if compressed is not None:
             layout, content = compressed_content(compressed)
-            content = FinalContent(
-                extras={**extras, **content.extras}, state={**self.attributes, **content.state}
-            )
+            state = {**self.attributes, **content.state}
+            content = FinalContent(extras={**extras, **content.extras}, state=state)
         else:
             missing = self.missing()
             if missing:
                 raise FileError(
                     f"lacks {len(missing)} blocks (channel, block) {missing[:6]}; resume it"
                 )
-            rows = self._rows(memory, change)
-            content = FinalContent(rows=rows, extras=extras, state=self.attributes, sigmas=sigmas)
+            content = FinalContent(
+                rows=self._rows(memory, change),
+                extras=extras,
+                state=self.attributes,
+                sigmas=sigmas,
+            )
         write_final(self.path, layout, self.provenance, content)
 
     def verify(self) -> None:
@@ -265,8 +268,9 @@ class BlockStore:
                     self._log.get(name)
 
     def _name(self, channel: int, block: int) -> str:
+        blocks = self.layout.blocks(self._orientation)
         checks.count("channel", channel, least=0, most=self.layout.channels - 1)
-        checks.count("block", block, least=0, most=self.layout.blocks(self._orientation) - 1)
+        checks.count("block", block, least=0, most=blocks - 1)
         if self.final:
             return f"channel_{channel}/block_{block:06d}"
         return f"columns_{channel}.{block:06d}"
@@ -324,9 +328,9 @@ class BlockStore:
         channel_bytes = log_bytes // layout.channels
         # Entries lie in memory four times: as they are read, cut, joined and transposed.
         passes = min(4 * channel_bytes // memory + 1, layout.blocks())
-        parts = np.array_split(np.arange(layout.blocks()), passes)
-        for channel, part in itertools.product(range(layout.channels), parts):
-            numbers = part.tolist()
+        groups = np.array_split(np.arange(layout.blocks()), passes)
+        for channel, group in itertools.product(range(layout.channels), groups):
+            numbers = group.tolist()
             first, _ = layout.span(numbers[0])
             _, stop = layout.span(numbers[-1])
             T, V = self._gather(channel, first, stop)
@@ -416,14 +420,19 @@ def write(path: Path, record: StoreRecord | CompressedRecord) -> None:
 def _record_content(record: StoreRecord) -> tuple[StoreLayout, FinalContent]:
     """Layout and content of the store of matrices."""
     matrices: Any = record.matrices
-    dtype = np.result_type(*(matrix.dtype for matrix in matrices), np.float32).name
+    types = [matrix.dtype for matrix in matrices]
     layout = StoreLayout(
-        record.shape, record.grid, record.camera_grid, channels=len(matrices), dtype=dtype
+        record.shape,
+        record.grid,
+        record.camera_grid,
+        channels=len(matrices),
+        dtype=np.result_type(*types, np.float32).name,
     )
     extras = {}
-    for name, value in (("first_bounce", record.first_bounce), ("mixing", record.mixing)):
-        if value is not None:
-            extras[name] = np.atleast_2d(value)
+    if record.first_bounce is not None:
+        extras["first_bounce"] = np.atleast_2d(record.first_bounce)
+    if record.mixing is not None:
+        extras["mixing"] = np.atleast_2d(record.mixing)
     if record.noise is not None:
         extras |= record.noise.to_arrays()
 

@@ -64,7 +64,8 @@ def check_block(matrix: Any, variance: Any, shape: tuple[int, int]) -> Block:
         values = checks.finite("matrix as float32", matrix.data.astype(np.float32))
     if variance is None:
         variance = np.full(matrix.nnz, np.nan)
-    variance = checks.shape("variance", checks.real("variance", variance), (matrix.nnz,))
+    variance = checks.real("variance", variance)
+    checks.shape("variance", variance, (matrix.nnz,))
     if np.any(variance < 0) or np.any(np.isinf(variance)):
         raise InputError(
             "variance is negative or infinite; it must be at least 0, or NaN where unknown"
@@ -75,9 +76,12 @@ def check_block(matrix: Any, variance: Any, shape: tuple[int, int]) -> Block:
 
 def write_final(root: Path, layout: StoreLayout, provenance: Any, content: FinalContent) -> None:
     """Write all files of a final store into `root`, flushed, and last its document."""
-    groups = ["extra", *(f"channel_{channel}" for channel in range(layout.channels))]
+    groups = ["extra"]
+    for channel in range(layout.channels):
+        groups.append(f"channel_{channel}")
     for group in groups:
-        shutil.rmtree(root / group, ignore_errors=True)  # a process may have ended here
+        # A process may have ended here.
+        shutil.rmtree(root / group, ignore_errors=True)
         _write_group(root / group, {})
     F = np.zeros((layout.channels, layout.shape[1]))
     for channel, number, rows in content.rows:

@@ -110,8 +110,9 @@ def _transport(
     if isinstance(first_bounce, str) and first_bounce == "exact":
         record = record.in_memory()  # all entries are needed at once
     if first_bounce is None:
-        has_first_bounce = record.first_bounce is not None and camera_grid in (None, grid)
-        first_bounce = record.first_bounce if has_first_bounce else "diagonal"
+        first_bounce = "diagonal"
+        if record.first_bounce is not None and camera_grid in (None, grid):
+            first_bounce = record.first_bounce
     settings = options | {
         "first_bounce": first_bounce,
         "mixing": record.mixing,
@@ -124,9 +125,11 @@ def _grid(name: str, grid: Any, pixels: int, device: str) -> tuple[int, int]:
     """A grid of so many pixels of a projector or camera, which must be known."""
     if grid:
         return checks.grid(name, grid, pixels)
+    advice = f"give {name}=(h, w)"
     side = round(pixels**0.5)
-    example = f", perhaps {name}=({side}, {side})" if side * side == pixels else ""
-    raise FileError(f"has no grid of the {pixels} {device} pixels; give {name}=(h, w){example}")
+    if side * side == pixels:
+        advice += f", perhaps {name}=({side}, {side})"
+    raise FileError(f"has no grid of the {pixels} {device} pixels; {advice}")
 
 
 def save(path: str | os.PathLike[str], T: Transport) -> None:
@@ -173,7 +176,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
 
 
 def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
-    """Save what `ltcl.invert` made as .npz, whole or not at all; FileError if impossible.
+    """Save the result of `ltcl.invert` as .npz, whole or not at all; FileError if impossible.
 
     Examples
     --------
@@ -186,12 +189,12 @@ def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
     """
     if not isinstance(inverse, Inverse):
         kind = type(inverse).__name__
-        raise InputTypeError(f"inverse is a {kind}; it must be what ltcl.invert(T) gives")
+        raise InputTypeError(f"inverse is a {kind}; it must be the result of ltcl.invert(T)")
     write(path, CompressedRecord(inverse.to_arrays(), INVERSE_FORMAT))
 
 
 def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse:
-    """Load an inverse of `save_inverse` onto a device (see `open_device`); errors as of `load`."""
+    """Load an inverse of `save_inverse` onto a device; it raises the errors of `load`."""
     record = read(path)
     with about(path):
         if not isinstance(record, CompressedRecord) or record.format != INVERSE_FORMAT:
@@ -213,9 +216,7 @@ def read(
     if suffix != ".zarr":
         input_file(path)
     elif path.is_dir() and not (path / "zarr.json").exists():
-        raise FileError(
-            f"{path}: is a folder with neither zarr.json, of a store, nor acquisition.toml"
-        )
+        raise FileError(f"{path}: is a folder without zarr.json (of a store) or acquisition.toml")
     with about(path, reading=True):
         if file_format.has_names:
             return file_format.read(path, variable)

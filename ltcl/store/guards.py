@@ -29,7 +29,7 @@ MAX_ROWS_PER_ENTRY = 64
 def about(path: Any, *, reading: bool = False) -> Iterator[None]:
     """Put the name of `path` in front of each refusal in the block.
 
-    In `reading`, any exception counts as damage of the file.
+    With `reading`, any exception counts as damage of the file.
     """
     try:
         yield
@@ -60,22 +60,22 @@ def _reason(error: Exception) -> str:
 
 
 def check_declared(
-    what: str, dtype: np.dtype, shape: tuple[int, ...], most: int, least: int = 0
+    name: str, dtype: np.dtype, shape: tuple[int, ...], most: int, least: int = 0
 ) -> None:
     """Refuse an array whose declared bytes are not `least` .. `most`, or too many for the host."""
     nbytes = math.prod(shape) * dtype.itemsize
     if min(shape, default=0) < 0 or not least <= nbytes <= most:
         size = f"{dtype.newbyteorder('=')} {shape}, {checks.size(nbytes)}"
         stored = f"{checks.size(most)} ({most} bytes)"
-        raise FileError(f"{what} is declared as {size}, but {stored} are stored")
-    checks.fits_host(f"{what} {shape}", 2 * nbytes)
+        raise FileError(f"{name} is declared as {size}, but {stored} are stored")
+    checks.fits_host(f"{name} {shape}", 2 * nbytes)
 
 
-def floats(what: str, array: np.ndarray) -> np.ndarray:
+def floats(name: str, array: np.ndarray) -> np.ndarray:
     """Real values as float32 if their type fits it exactly (at most 16 bits), else as float64."""
     fits_float32 = np.result_type(array.dtype, np.float32) == np.float32
     dtype = np.float32 if fits_float32 else np.float64
-    return np.ascontiguousarray(checks.real(what, array), dtype)
+    return np.ascontiguousarray(checks.real(name, array), dtype)
 
 
 def sparse_floats(

@@ -58,8 +58,9 @@ def assemble_members(
         array = _numbers(members[name])
         if not is_reversed:
             return array
-        if name == "first_bounce":  # a row or a column of one channel
-            return array.ravel() if 1 in array.shape else array
+        if name == "first_bounce":
+            has_one_channel = 1 in array.shape
+            return array.ravel() if has_one_channel else array
         return array.swapaxes(-1, -2) if array.ndim > 1 else array
 
     return assemble(shapes, load, variable, names)
@@ -87,12 +88,12 @@ def _numbers(data: Any) -> np.ndarray:
     """The numbers of a dataset, after its declared size was compared with what is stored."""
     if isinstance(data, np.ndarray):
         return data
-    what = f"dataset {data.name.lstrip('/')!r}"
+    dataset = f"dataset {data.name.lstrip('/')!r}"
     if data.external or data.is_virtual:
-        raise FileError(f"{what} is kept in other files; those are not opened")
+        raise FileError(f"{dataset} is kept in other files; those are not opened")
     most = EXPANSION * data.id.get_storage_size()
-    check_declared(what, data.dtype, data.shape or (), most)
-    return checks.real(what, data[()])
+    check_declared(dataset, data.dtype, data.shape or (), most)
+    return checks.real(dataset, data[()])
 
 
 def write_hdf5(path: Path, record: StoreRecord) -> None:

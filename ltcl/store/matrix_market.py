@@ -53,9 +53,11 @@ class Header:
     @property
     def is_possible(self) -> bool:
         """True if the sizes are those of a matrix."""
-        is_symmetric = self.symmetry == "symmetric" and self.rows == self.columns
-        has_symmetry = self.symmetry == "general" or is_symmetric
-        return has_symmetry and min(self.rows, self.columns) >= 1
+        if min(self.rows, self.columns) < 1:
+            return False
+        if self.symmetry == "general":
+            return True
+        return self.symmetry == "symmetric" and self.rows == self.columns
 
     @property
     def line(self) -> bytes:

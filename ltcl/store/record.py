@@ -70,12 +70,12 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1, (stop - start, N)."""
         size = self._store.layout.block_rows
-        parts = []
+        slices = []
         for block in range(start // size, -(-stop // size)):
             first = block * size
-            part = self._block(block)[max(start - first, 0) : stop - first]
-            parts.append(part.toarray())
-        return np.concatenate(parts)
+            rows = self._block(block)[max(start - first, 0) : stop - first]
+            slices.append(rows.toarray())
+        return np.concatenate(slices)
 
     def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """The entries where ascending `rows` meet `columns`, (len(rows), len(columns)) float64."""
@@ -145,10 +145,11 @@ class StoreRecord:
                 f"matrices are {names}; they must be one or three arrays or csr_array"
             )
         shapes = {tuple(matrix.shape or ()) for matrix in self.matrices}
-        are_matrices = all(len(shape) == 2 and 0 not in shape for shape in shapes)
-        if len(shapes) > 1 or not are_matrices:
+        shape = min(shapes)
+        if len(shapes) > 1 or len(shape) != 2 or 0 in shape:
+            shapes = sorted(shapes)
             raise InputError(
-                f"matrices have the shapes {sorted(shapes)}; they must be one (M, N), not empty"
+                f"matrices have the shapes {shapes}; they must be one (M, N), not empty"
             )
         if self.first_bounce is not None:
             pixels = self.shape[1]
@@ -176,8 +177,8 @@ class StoreRecord:
         if not self.stored:
             return self
         matrices = [matrix.tocsr() for matrix in self.matrices]
-        is_full = all(matrix.nnz == math.prod(matrix.shape) for matrix in matrices)
-        if is_full:
+        entries = sum(matrix.nnz for matrix in matrices)
+        if entries == len(matrices) * math.prod(self.shape):
             matrices = [matrix.toarray() for matrix in matrices]
         return replace(self, matrices=tuple(matrices))
 
@@ -185,8 +186,9 @@ class StoreRecord:
         """Named arrays: `EXTRAS`, those of noise, and T (M, N) or (3, M, N) where that is dense."""
         arrays: dict[str, Any] = {}
         if self.dense:
-            is_grey = len(self.matrices) == 1
-            arrays["T"] = self.matrices[0] if is_grey else np.stack(self.matrices)
+            arrays["T"] = self.matrices[0]
+            if len(self.matrices) == 3:
+                arrays["T"] = np.stack(self.matrices)
         for name in EXTRAS:
             value = getattr(self, name)
             if value is not None:
@@ -250,15 +252,18 @@ def _matrix_names(
         return [names.matrix]
     if set(names.channels) <= set(shapes):
         return names.channels
-    others = {}
+    matrices = []
+    content = []
+    step = -1 if names.is_reversed else 1  # axes as the user knows them
     for name, shape in shapes.items():
-        if name not in EXTRAS and not name.startswith("noise_"):
-            others[name] = shape
-    matrices = [name for name, shape in others.items() if _is_matrix(shape)]
+        if name in EXTRAS or name.startswith("noise_"):
+            continue
+        content.append(f"{name!r} {shape[::step]}")
+        if _is_matrix(shape):
+            matrices.append(name)
     if len(matrices) == 1:
         return matrices
-    step = -1 if names.is_reversed else 1  # axes as the user knows them
-    listed = ", ".join(f"{name!r} {shape[::step]}" for name, shape in others.items())
+    listed = ", ".join(content)
     raise FileError(
         f"holds {listed or 'no numbers':.300}; it must hold {names.matrix} of (M, N) or of three "
         "channels, or one matrix by another name; variable= names one of several"
@@ -271,12 +276,15 @@ def _check_dense(
     shapes: Mapping[str, tuple[int, ...]],
     names: FileNames,
 ) -> None:
-    wrong = [matrix.shape for matrix in matrices if not _is_matrix(matrix.shape)]
-    if not wrong:
-        return
-    shape = shapes[name][::-1] if names.is_reversed else wrong[0]
-    order = "(M, N, 3)" if names.is_reversed else "(3, M, N)"
-    raise FileError(f"{name} has shape {shape}; it must be (M, N) or {order}, not empty")
+    for matrix in matrices:
+        if _is_matrix(matrix.shape):
+            continue
+        shape = matrix.shape
+        order = "(3, M, N)"
+        if names.is_reversed:
+            shape = shapes[name][::-1]
+            order = "(M, N, 3)"
+        raise FileError(f"{name} has shape {shape}; it must be (M, N) or {order}, not empty")
 
 
 def _is_matrix(shape: tuple[int, ...]) -> bool:
@@ -358,13 +366,16 @@ class CompressedRecord:
     def entries(self) -> int:
         """Number of values that are not 0, in all cores."""
         values = self._ending_with(".data", ".codes", ".matrix")
-        return sum(int(np.count_nonzero(array)) for array in values)
+        return int(sum(map(np.count_nonzero, values)))
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Names of the cores and bases, each once."""
-        names = [str(array) for array in self._ending_with(".kind") + self._ending_with(".name")]
-        return tuple(name for name in dict.fromkeys(names) if name not in ("compressed", "sum"))
+        names = map(str, self._ending_with(".kind") + self._ending_with(".name"))
+        kinds = dict.fromkeys(names)
+        for composition in ("compressed", "sum"):
+            kinds.pop(composition, None)
+        return tuple(kinds)
 
     def _ending_with(self, *endings: str) -> list[np.ndarray]:
         return [array for name, array in self.arrays.items() if name.endswith(endings)]

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from ltcl.tasks.compression.bases import INVERSE_NAMES
+from ltcl.tasks.compression.basis_pairs import INVERSE_NAMES
 from ltcl.tasks.compression.compress import compress
 from ltcl.tasks.compression.fit import ChannelCompression, Compression, Trial
 from ltcl.tasks.compression.invert import invert

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ltcl.tasks.denoising.bases import Grid, SeparableBasis
+from ltcl.tasks.denoising.multiwavelets import Grid, SeparableBasis
 from ltcl.tasks.denoising.reciprocity import MAX_LOG_FACTOR, TINY, fit_log_factors, pair_gauge
 from ltcl.transport.noise import Noise
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ltcl.tasks.denoising.bases import (
+from ltcl.tasks.denoising.multiwavelets import (
     DEFAULT_SHIFTS,
     SeparableBasis,
     find_folds,

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ltcl.tasks.denoising.bases import Grid, WallEnds
+from ltcl.tasks.denoising.multiwavelets import Grid, WallEnds
 
 # Orders of the axes (rows, columns, rows', columns') before unfolding: rows with rows' against
 # columns with columns', and rows with columns' against columns with rows'.

@@ -17,7 +17,7 @@ import ltcl
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Wavelet
-from ltcl.tasks.compression.bases import CoefficientAnalysis
+from ltcl.tasks.compression.basis_pairs import CoefficientAnalysis
 from ltcl.tasks.compression.coefficients import coefficients
 from ltcl.tasks.compression.sources import source
 
