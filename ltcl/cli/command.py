@@ -31,12 +31,12 @@ WAITING = 3
 INTERNAL = 70
 INTERRUPTED = 130
 EXIT_CODES = (
-    "**Exit codes:** 0 done; 1 refused or failed, with one line that tells why; 2 wrong usage; "
-    "3 'ltcl acquire run' waits for photographs that a person has to take; 70 an error in ltcl "
-    "itself; 130 Ctrl-C.\n\n"
+    "**Exit codes:** 0 done; 1 refused or failed, with one line that tells "
+    "why; 2 wrong usage; 3 'ltcl acquire run' waits for photographs that a "
+    "person has to take; 70 an error in ltcl itself; 130 Ctrl-C.\n\n"
     "With **--json** stdout holds one JSON document, also if a command fails: "
-    '{"error": the problem, "type": its class in ltcl.errors, "exit_code": as above}. '
-    "docs/reference/json.md has all fields."
+    '{"error": the problem, "type": its class in ltcl.errors, '
+    '"exit_code": as above}. docs/reference/json.md has all fields.'
 )
 # Level of a note, between INFO and WARNING.
 NOTE = 25
@@ -160,7 +160,8 @@ def fail(error: BaseException, json: bool = False, verbose: bool = False) -> Err
     code = FAILED
     if isinstance(error, KeyboardInterrupt):
         code = INTERRUPTED
-        message = message or "interrupted"
+        if not message:
+            message = "interrupted"
     elif isinstance(error, UsageError):
         code = USAGE
     elif isinstance(error, MemoryError) and not isinstance(error, LtclError):
@@ -186,8 +187,9 @@ class _StderrHandler(logging.Handler):
     """Prints records of ltcl as lines on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        is_warning = record.levelno >= logging.WARNING
-        level = f"{record.levelname.lower()}: " if is_warning else ""
+        level = ""
+        if record.levelno >= logging.WARNING:
+            level = f"{record.levelname.lower()}: "
         message = " ".join(record.getMessage().split())
         typer.echo(f"ltcl: {level}{message}", err=True)
 

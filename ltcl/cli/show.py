@@ -99,9 +99,8 @@ def show(
     This needs the extra projector. With --browser Ctrl-C ends it, and it needs the extra view.
     """
     if every is not None and arrival:
-        raise InputError(
-            f"--every is {every:g}, but --arrival is given; one of them decides what comes next"
-        )
+        problem = f"--every is {every:g}, but --arrival is given"
+        raise InputError(f"{problem}; one of them decides what comes next")
     from ltcl.acquisition import rigs
 
     advance: Any = "key"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,29 +17,27 @@ from ltcl.cli.reports.program import ViewReport
 from ltcl.device import open_device
 from ltcl.errors import InputError
 
-ADDRESS_PANEL = "Address of the page"
+address_option = partial(option, panel="Address of the page")
 
 
 def address_options(
     host: Annotated[
         str,
-        option(
-            "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute.",
-            panel=ADDRESS_PANEL,
+        address_option(
+            "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute."
         ),
     ] = "127.0.0.1",
     port: Annotated[
         int,
-        option(
-            "Port of the page; a page left open finds the next viewer on the same port. Default: "
-            "a free one.",
+        address_option(
+            "Port of the page; a page left open finds the next viewer on the "
+            "same port. Default: a free one.",
             min=0,
             max=65535,
-            panel=ADDRESS_PANEL,
         ),
     ] = 0,
     no_browser: Annotated[
-        bool, option("Print the URL, and open no browser.", "--no-browser", panel=ADDRESS_PANEL)
+        bool, address_option("Print the URL, and open no browser.", "--no-browser")
     ] = False,
 ) -> None:
     """Options of the address of a page."""
@@ -70,7 +69,8 @@ def view(
     """
     from ltcl.viewer.server import Viewer
 
-    scene = _make_scene(context, transport, picture or [])
+    paths = [] if picture is None else picture
+    scene = _make_scene(context, transport, paths)
     with Viewer(scene, **address(context)) as viewer:
         typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
         context.progress(f"showing {transport}")
@@ -90,5 +90,6 @@ def _make_scene(context: Context, transport: Path, paths: list[Path]) -> Any:
         pictures = {path.name: images.read(path) for path in paths}
         return ViewerScene(T, transport.name, pictures, loading.load_setup(transport))
     if paths:
-        raise InputError(f"PICTURE is {paths[0]}, but {transport} is an acquisition; it takes none")
+        problem = f"PICTURE is {paths[0]}, but {transport} is an acquisition"
+        raise InputError(f"{problem}; it takes none")
     return Scan(transport, open_device(context.options["device"]))

@@ -68,5 +68,7 @@ def view(
         pictures = picture
     elif picture is not None:
         pictures = {"picture": picture}
-    scene = ViewerScene(T, title or repr(T).strip("<>"), pictures, setup)
+    if not title:
+        title = repr(T).strip("<>")
+    scene = ViewerScene(T, title, pictures, setup)
     return Viewer(scene, host, port, open_browser)

@@ -116,9 +116,9 @@ def _token_of_port(port: int) -> str:
         file.touch(0o600, exist_ok=False)
         file.write_text(_new_token(), "ascii")
     # On Windows the permissions of the folder decide.
-    is_public = os.name == "posix" and bool(file.stat().st_mode & 0o077)
+    readers = file.stat().st_mode & 0o077 if os.name == "posix" else 0
     token = file.read_text("latin-1")
-    if is_public or len(token) < MIN_TOKEN_LENGTH:
+    if readers or len(token) < MIN_TOKEN_LENGTH:
         raise OSError(f"{file} is no token, or others can read it; delete it")
     return token
 
