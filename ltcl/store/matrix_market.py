@@ -71,7 +71,8 @@ def read_mtx(path: Path) -> StoreRecord:
     """Read a Matrix Market file; its values come back as float64."""
     # An entry takes 6 bytes of text or more.
     checks.fits_host("the matrix", 8 * path.stat().st_size)
-    rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(path)
+    data = path.read_bytes() + b"\n"
+    rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(io.BytesIO(data))
     header = Header(
         rows=rows,
         columns=columns,
@@ -80,7 +81,6 @@ def read_mtx(path: Path) -> StoreRecord:
         field=field,
         symmetry=symmetry,
     )
-    data = path.read_bytes() + b"\n"
     head = _check_lines(header, data)
 
     def read() -> Any:
@@ -131,4 +131,6 @@ def write_mtx(path: Path, record: StoreRecord) -> None:
         comment += f"ltcl grid {record.grid[0]} x {record.grid[1]}"
     if record.camera_grid:
         comment += f", camera grid {record.camera_grid[0]} x {record.camera_grid[1]}"
-    scipy.io.mmwrite(path, record.matrices[0], comment=comment, symmetry="general")
+    # An open file, as SciPy takes names in UTF-8 alone.
+    with path.open("wb") as file:
+        scipy.io.mmwrite(file, record.matrices[0], comment=comment, symmetry="general")
