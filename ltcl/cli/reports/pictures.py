@@ -78,6 +78,7 @@ class FrameReport(Report):
     number: Annotated[int, "Number of the frame, from 1."]
     name: Annotated[str, "Name of its file, or of the film."]
     digest: Annotated[str, "SHA-256 of the data that was read."]
+    output_digest: Annotated[str, "SHA-256 of the files that were written."]
     error: Annotated[float, "Relative error of what the scene will show."]
     clipped: Annotated[float, "Share of the pattern at a bound."]
 
