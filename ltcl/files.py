@@ -117,11 +117,11 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         suffix = target.suffix.lower()
         with _temporary(_make_file, target.parent, target.stem, suffix) as temporary:
             yield temporary
-            _flush(temporary)
+            flush(temporary)
             if target.exists():
                 shutil.copymode(target, temporary)
             os.replace(temporary, target)
-            _flush(target.parent)
+            flush(target.parent)
 
 
 @contextlib.contextmanager
@@ -144,7 +144,9 @@ def fill_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Itera
                 _move_into(target, temporary, files)
             else:
                 _put_folder(temporary, target)
-            _flush(target.parent)
+            flush(target.parent)
+            if not is_joining:
+                _discard(_earlier(target))
 
 
 def _put_folder(temporary: Path, target: Path) -> None:
@@ -186,7 +188,6 @@ def _put_folder_in_two_steps(temporary: Path, target: Path) -> None:
     _discard(earlier)
     os.replace(target, earlier)
     os.replace(temporary, target)
-    _discard(earlier)
 
 
 def restore(target: Path) -> None:
@@ -398,7 +399,7 @@ def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
         os.replace(file, destination)
         folders.add(destination.parent)
     for folder in folders:
-        _flush(folder)
+        flush(folder)
 
 
 def _is_no_folder(path: Path) -> bool:
@@ -440,7 +441,7 @@ def _make_folders(folder: Path) -> None:
     missing = _missing_folders(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for place in missing:
-        _flush(place.parent)
+        flush(place.parent)
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
@@ -459,11 +460,11 @@ def flush_tree(folder: Path) -> list[Path]:
     """Flush all in a folder to the disk, and return its files."""
     places = sorted(folder.rglob("*"))
     for place in (*places, folder):
-        _flush(place)
+        flush(place)
     return [place for place in places if place.is_file()]
 
 
-def _flush(path: Path) -> None:
+def flush(path: Path) -> None:
     """Flush a file to the disk; or a folder, so that a rename in it survives a power cut."""
     if not path.is_dir():
         _flush_handle(os.open(path, os.O_RDWR))

@@ -261,7 +261,7 @@ class FilmRun:
             advice = f"give the same frames to go on, or another folder than {self.folder}"
             raise OtherRun(f"{place} has changed since its pattern was made; {advice}")
         with contextlib.suppress(OSError):
-            return _digest(self._files(frame.number)) == record.output_digest
+            return files_digest(self._files(frame.number)) == record.output_digest
         return False
 
     def _check_size(self, picture: np.ndarray, place: str) -> None:
@@ -301,7 +301,7 @@ class FilmRun:
         if appearance is not None:
             # Divided by the gain it is as bright as the picture that was asked for.
             self._write_light(appearance_file[0], appearance, self.head["gain"])
-        return _digest(files)
+        return files_digest(files)
 
     def _write_light(self, file: Path, light: np.ndarray, white: float) -> None:
         """Write light as it is in .exr, in .png with white at `white`."""
@@ -311,7 +311,7 @@ class FilmRun:
             images.write(file, light / np.float32(white), bits=16)
 
 
-def _digest(files: Sequence[Path]) -> str:
+def files_digest(files: Sequence[Path]) -> str:
     """SHA-256 of the bytes of files, one behind the other."""
     digest = hashlib.sha256()
     for file in files:
