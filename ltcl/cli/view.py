@@ -8,12 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from ltcl.cli import loading, options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option
 from ltcl.cli.reports.program import ViewReport
+from ltcl.cli.streams import print_line
 from ltcl.device import open_device
 from ltcl.errors import InputError
 
@@ -72,7 +71,7 @@ def view(
     paths = [] if picture is None else picture
     scene = _make_scene(context, transport, paths)
     with Viewer(scene, **address(context)) as viewer:
-        typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
+        print_line(f"{viewer.url} shows {transport}; Ctrl-C ends it")
         context.progress(f"showing {transport}")
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()
