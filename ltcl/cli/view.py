@@ -35,6 +35,12 @@ def address_options(
             max=65535,
         ),
     ] = 0,
+    url: Annotated[
+        str,
+        address_option(
+            "URL of the page behind a proxy or on a forwarded port, such as http://localhost:9000."
+        ),
+    ] = "",
     no_browser: Annotated[
         bool, address_option("Print the URL, and open no browser.", "--no-browser")
     ] = False,
@@ -47,6 +53,7 @@ def address(context: Context) -> dict[str, Any]:
     return {
         "host": context.options["host"],
         "port": context.options["port"],
+        "url": context.options["url"],
         "open_browser": not context.options["no_browser"],
     }
 
