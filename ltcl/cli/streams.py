@@ -2,11 +2,13 @@
 """Output of the program: results on stdout, lines for the user on stderr.
 
 A result that cannot be written, as on a full disk, is an error. A line for the user that cannot be
-written is lost, and the work goes on.
+written is lost, and the work goes on. Characters that a stream cannot encode, as of file names that
+are not UTF-8, are written as JSON escapes them.
 """
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
 import sys
@@ -16,6 +18,9 @@ from typing import TextIO
 import typer
 
 from ltcl.errors import FileError, LtclError
+
+# Name of the handler of characters that cannot be encoded.
+ESCAPED = "ltcl.escaped"
 
 
 @contextlib.contextmanager
@@ -38,15 +43,34 @@ def print_result(text: str) -> None:
     if sys.stdout is None:
         raise FileError("stdout: cannot be written: it is closed")
     with checked_stdout():
-        typer.echo(text)
+        typer.echo(_escaped(text, sys.stdout))
 
 
 def print_line(text: str) -> None:
     """Print a line for the user on stderr, if that can be written."""
     try:
-        typer.echo(text, err=True)
+        typer.echo(_escaped(text, sys.stderr), err=True)
     except OSError:
         _discard(sys.stderr)
+
+
+def _escaped(text: str, stream: TextIO) -> str:
+    """Escape what a strict stream cannot encode, in units of UTF-16 as JSON does."""
+    if getattr(stream, "errors", None) != "strict":
+        return text
+    return text.encode(stream.encoding, ESCAPED).decode(stream.encoding)
+
+
+def _escape(error: UnicodeError) -> tuple[str, int]:
+    """Handle the characters of a text that cannot be encoded."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    characters = error.object[error.start : error.end]
+    units = characters.encode("utf-16-be", "surrogatepass").hex(" ", 2).split()
+    return "".join(f"\\u{unit}" for unit in units), error.end
+
+
+codecs.register_error(ESCAPED, _escape)
 
 
 def _discard(stream: TextIO) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import logging
 import re
 import subprocess
@@ -152,6 +154,23 @@ def test_a_closed_stdout_is_an_error(transport, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdout", None)
     assert main(["info", str(transport)]) == 1
     assert "stdout: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "latin-1"])
+@pytest.mark.parametrize("name", ["H\udcf6he", "Höhe", "漢字", "\U0001d11e"])
+def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, name, encoding):
+    """Single surrogates stand for bytes that are not UTF-8."""
+    path = tmp_path / f"{name}.npz"
+    path.write_bytes(Path(transport).read_bytes())
+    printed = {}
+    for options in ([], ["--json"]):
+        stdout = io.TextIOWrapper(io.BytesIO(), encoding, errors="strict")
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert main(["info", str(path), *options]) == 0
+        stdout.seek(0)
+        printed[len(options)] = stdout.read()
+    assert ".npz" in printed[0]
+    assert json.loads(printed[1])[0]["file"] == str(path)
 
 
 def test_quiet_and_verbose(program, transport, tmp_path):
