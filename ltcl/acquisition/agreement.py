@@ -334,15 +334,15 @@ class LinearLight:
         """Leave one photograph out."""
         return self.select([number for number in range(len(self.value)) if number != k])
 
-    def plus(self, other: LinearLight) -> LinearLight:
+    def plus(self, addend: LinearLight) -> LinearLight:
         """Sums of the values of photographs, for the seconds of the first ones."""
         return LinearLight(
             seconds=self.seconds,
-            value=self.value + other.value,
-            variance=self.variance + other.variance,
-            limit=self.limit + other.limit,
-            bias=self.bias + other.bias,
-            dim_bias=self.dim_bias + other.dim_bias,
+            value=self.value + addend.value,
+            variance=self.variance + addend.variance,
+            limit=self.limit + addend.limit,
+            bias=self.bias + addend.bias,
+            dim_bias=self.dim_bias + addend.dim_bias,
         )
 
     def mean(self) -> _MeanLight:

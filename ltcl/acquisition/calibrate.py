@@ -45,7 +45,7 @@ from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
     CaptureSession,
     Photograph,
-    Progress,
+    ProgressFunction,
     Request,
     acquisition_error,
     ignore_progress,
@@ -109,8 +109,9 @@ class Effort:
         ramps = []
         for k in range(count):
             shifted = np.roll(codes, k * len(codes) // count)
-            line = shifted if width >= height else shifted[:, None]
-            ramps.append(np.broadcast_to(line, grid).copy())
+            if width < height:
+                shifted = shifted[:, None]
+            ramps.append(np.broadcast_to(shifted, grid).copy())
         return ramps
 
     def repeats(self, frames: int, camera_pixels: float) -> int:
@@ -143,7 +144,8 @@ class Effort:
         lit_channels = [white]
         if channels == 3:
             codes = (*codes, 1.0)
-            lit_channels = [white[..., None] * colour for colour in np.eye(3, dtype=np.float32)]
+            colours = np.eye(3, dtype=np.float32)
+            lit_channels = [white[..., None] * colour for colour in colours]
         groups = [blocks[:1], dark_requests, bright_requests]
         for channel in lit_channels:
             groups.append([(np.float32(code) * channel, times.black[0]) for code in codes])
@@ -207,7 +209,7 @@ def measure(
     exposures: Sequence[float] | None = None,
     frames: int = 16,
     side: int = 1,
-    progress: Progress = ignore_progress,
+    progress: ProgressFunction = ignore_progress,
     log: ArrayLog | None = None,
 ) -> Calibration:
     """Measure a set-up, with as many photographs as `expected_photographs` says.
@@ -248,23 +250,14 @@ def measure(
         view.sharpness.check(side)
 
     # 3. Black, white, uniform codes and blocks.
-    longest = longest_exposure(session, white_exposure)
-    if exposures is None:
-        scan = scan_exposures(shots, white_exposure, longest)
-    else:
-        scan = offered_exposures(shots, exposures)
-    times = CaptureTimes(
-        black=sorted({white_exposure, longest}),
-        white=offered_exposures(shots, [white_exposure / 2, white_exposure, longest]),
-        scan=scan,
-    )
+    times = _choose_times(session, white_exposure, exposures)
     repeats = effort.repeats(frames, view.camera_pixels)
     requests = effort.requests(shots.grid, shots.channels, repeats, times)
     before, dark, bright, *uniform, after = session.take(requests)
 
     # 4. Noise and offset of the camera; then photographs can be compared.
-    shortest_dark = [photograph for photograph in dark if photograph.seconds == white_exposure]
-    consistency.check_black(session, shortest_dark)
+    of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
+    consistency.check_black(session, of_white_exposure)
     with session.naming_photographs():
         session.camera = _measure_camera(session, dark, bright)
     session.check_agreement()
@@ -274,14 +267,14 @@ def measure(
     ambient = session.merge(dark)
     lit = session.merge(bright)
     white = lit - ambient
-    consistency.check_light(scan, white, view.resampling, session.camera)
+    consistency.check_light(times.scan, white, view.resampling, session.camera)
     projector, mixing = _measure_projector(session, effort, uniform, ambient, lit)
     blocks = session.merge([*before, *after])
     block_light = (blocks - ambient).value
     consistency.check_map(session, view.resampling, view.stripes, block_light, white.value)
     resampling = view.resampling.ascertained(white.value, white.valid)
     return Calibration(
-        exposures=scan,
+        exposures=times.scan,
         response=session.camera.response,
         noise=session.camera.noise,
         offset=session.camera.offset,
@@ -292,6 +285,23 @@ def measure(
         resampling=resampling,
         sharpness=view.sharpness,
         anchor=Anchor.of(blocks, resampling),
+    )
+
+
+def _choose_times(
+    session: CaptureSession, white: float, exposures: Sequence[float] | None
+) -> CaptureTimes:
+    """Exposures of black, white and the scan, by that of white."""
+    shots = session.shots
+    longest = longest_exposure(session, white)
+    if exposures is None:
+        scan = scan_exposures(shots, white, longest)
+    else:
+        scan = offered_exposures(shots, exposures)
+    return CaptureTimes(
+        black=sorted({white, longest}),
+        white=offered_exposures(shots, [white / 2, white, longest]),
+        scan=scan,
     )
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ltcl.acquisition import agreement, anchor
-from ltcl.acquisition.agreement import CameraModel
+from ltcl.acquisition.agreement import ADVICE, CameraModel
 from ltcl.acquisition.geometry import Correspondence, Resampling, decode
 from ltcl.acquisition.radiometry import Radiance
 from ltcl.acquisition.radiometry.exposures import NO_LIGHT
@@ -67,7 +67,8 @@ def check_black(session: CaptureSession, photographs: Sequence[Photograph]) -> N
 
     Compared pixel by pixel with that one, all others would deviate.
     """
-    light = np.stack([session.linear(photograph).ravel() for photograph in photographs])
+    pictures = map(session.linear, photographs)
+    light = np.stack([picture.ravel() for picture in pictures])
     level = light.mean(axis=1)
     deviation = light - light.mean(axis=0) - level[:, None]
     noise_of_level = float(np.std(deviation)) / math.sqrt(light.shape[1])
@@ -76,9 +77,7 @@ def check_black(session: CaptureSession, photographs: Sequence[Photograph]) -> N
     is_too_bright = (excess > threshold) & (excess < MAX_LAMP_LEVEL)
     if is_too_bright.any():
         name = session.name(photographs[int(np.argmax(is_too_bright))])
-        raise AcquisitionError(
-            f"{name}, of black, is too bright: another light was on; {agreement.ADVICE}"
-        )
+        raise AcquisitionError(f"{name}, of black, is too bright: another light was on; {ADVICE}")
 
 
 def check_light(
@@ -98,9 +97,11 @@ def check_light(
     longest = exposures[-1]
     read_noise = float(np.sqrt(camera.noise.variance(0.0)))
     if shortest * MIN_DIRECT_SHARE * level > camera.noise.saturation:
-        reason = f"saturates at {shortest:g} s, which must be below {shortest / 2:.2g}"
+        limit = f"below {shortest / 2:.2g}"
+        reason = f"saturates at {shortest:g} s, which must be {limit}"
     elif 0 < longest * level < MIN_SIGMAS * read_noise:
-        reason = f"is lost in noise at {longest:g} s, which must be above {2 * longest:.2g}"
+        limit = f"above {2 * longest:.2g}"
+        reason = f"is lost in noise at {longest:g} s, which must be {limit}"
     else:
         return
     raise InputError(f"exposures is {exposures}; half of white {reason}")
@@ -121,14 +122,17 @@ class _UniformReference:
         known = white.valid & ambient.valid
         in_all_channels = known.reshape(*known.shape[:2], -1).all(axis=2)
         pixels = agreement.spread(np.flatnonzero(in_all_channels))
-        black = agreement.sample(ambient.value, pixels).astype(np.float64)
-        bright = agreement.sample(white.value, pixels).astype(np.float64)
+
+        def sampled(picture: np.ndarray) -> np.ndarray:
+            return agreement.sample(picture, pixels).astype(np.float64)
+
+        black = sampled(ambient.value)
         return cls(
             pixels=pixels,
             black=black,
-            black_variance=agreement.sample(ambient.variance, pixels).astype(np.float64),
-            light=bright - black,
-            white_variance=agreement.sample(white.variance, pixels).astype(np.float64),
+            black_variance=sampled(ambient.variance),
+            light=sampled(white.value) - black,
+            white_variance=sampled(white.variance),
         )
 
     def share_of_white(self, picture: Radiance) -> tuple[float, float]:
@@ -138,7 +142,8 @@ class _UniformReference:
         valid = agreement.sample(picture.valid, self.pixels)
         weight = self.light[valid]
         total = max(float(np.sum(weight**2)), 1e-30)
-        share = float(np.sum(((value - self.black) * self.light)[valid])) / total
+        products = (value - self.black) * self.light
+        share = float(np.sum(products[valid])) / total
         noise = (variance + self.black_variance)[valid]
         deviation = float(np.sqrt(np.sum(weight**2 * noise))) / total
         return share, deviation
@@ -178,13 +183,15 @@ def check_uniform(
         if deviation is not None:
             raise AcquisitionError(
                 f"{name}, of a uniform code, does not show a part of white{about_white}: "
-                f"another light was on, or it is another pattern; {agreement.ADVICE}"
+                f"another light was on, or it is another pattern; {ADVICE}"
             )
-        tolerance = MIN_SIGMAS * share_noise + PROJECTOR_UNEVENNESS * previous_share
+        unevenness = PROJECTOR_UNEVENNESS * previous_share
+        tolerance = MIN_SIGMAS * share_noise + unevenness
         if previous_name is not None and share < previous_share - tolerance:
+            ratio = share / previous_share
             raise AcquisitionError(
-                f"{previous_name} or {name} deviates: it shows {share / previous_share:.2g} times "
-                f"the light of a darker code; {agreement.ADVICE}"
+                f"{previous_name} or {name} deviates: it shows {ratio:.2g} times "
+                f"the light of a darker code; {ADVICE}"
             )
         previous_share = share
         previous_name = name
@@ -216,10 +223,12 @@ def check_map(
         with contextlib.suppress(InputError):
             mapping = decode(exchanged, resampling.grid, levels=session.shots.levels)
             corrected = Resampling.of(mapping)
-            if _block_correlation(corrected, blocks, white) > max(likeness, MIN_MAP_CORRELATION):
-                names = f"{session.name(stripes[k])} and {session.name(stripes[k + 1])}"
+            likeness_of_corrected = _block_correlation(corrected, blocks, white)
+            if likeness_of_corrected > max(likeness, MIN_MAP_CORRELATION):
+                first = session.name(stripes[k])
+                second = session.name(stripes[k + 1])
                 raise AcquisitionError(
-                    f"{names} are exchanged, a pattern and its inverse; {agreement.ADVICE}"
+                    f"{first} and {second} are exchanged, a pattern and its inverse; {ADVICE}"
                 )
 
 

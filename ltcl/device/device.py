@@ -29,6 +29,25 @@ POOLED_PART_OF_BUFFER = 16
 POOL_BIN_BITS = 4
 
 
+class Session:
+    """Everything that is open on an OpenCL device; several `Device`s may share it."""
+
+    def __init__(self, handle: Any) -> None:
+        import pyopencl as cl
+        from pyopencl.tools import ImmediateAllocator, MemoryPool
+
+        self.context = cl.Context([handle])
+        self.queue = cl.CommandQueue(self.context)
+        allocator = ImmediateAllocator(self.queue)
+        self.pool = MemoryPool(allocator, leading_bits_in_bin_id=POOL_BIN_BITS)
+        self.launches = Counter[str]()
+        # A program of pyopencl and its kernels by name, for each file and defines.
+        self.programs: dict[tuple, tuple[Any, dict[str, Kernel]]] = {}
+        # Plans of ltcl.device.vectors, by kernel and size.
+        self.reductions: dict[tuple, Any] = {}
+        self.lock = threading.RLock()
+
+
 class Device:
     """OpenCL device with a context and an in-order queue. Made by `ltcl.open_device`.
 
@@ -52,9 +71,8 @@ class Device:
         them.
     """
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: Description, session: Session | None = None) -> None:
         import pyopencl as cl
-        from pyopencl.tools import ImmediateAllocator, MemoryPool
 
         handle = description.handle
         self.description = description
@@ -63,28 +81,26 @@ class Device:
         self.kind = description.kind
         self.handle = handle
         self.cl: Any = cl
-        with driver_errors.translated(f"opening {self.name}"):
-            self.context = cl.Context([handle])
-            self.queue = cl.CommandQueue(self.context)
+        if session is None:
+            with driver_errors.translated(f"opening {self.name}"):
+                session = Session(handle)
+        self.session = session
+        self.context = session.context
+        self.queue = session.queue
+        self.launches = session.launches
         self.compute_units: int = handle.max_compute_units
         self.max_group: int = handle.max_work_group_size
         self.local_memory: int = handle.local_mem_size
         self.max_allocation: int = handle.max_mem_alloc_size
-        self.memory: int = checks.host_memory() if self.is_cpu else handle.global_mem_size
+        self.memory: int = handle.global_mem_size
+        if self.is_cpu:
+            self.memory = checks.host_memory()
         self.others: tuple[Device, ...] = ()
 
         self.allocations = 0
-        self.launches = Counter[str]()
-        allocator = ImmediateAllocator(self.queue)
-        self._pool = MemoryPool(allocator, leading_bits_in_bin_id=POOL_BIN_BITS)
         self._largest_pooled = min(
             self.memory // POOLED_PART_OF_MEMORY, self.max_allocation // POOLED_PART_OF_BUFFER
         )
-        # A program of pyopencl and its kernels by name, for each file and defines.
-        self._programs: dict[tuple, tuple[Any, dict[str, Kernel]]] = {}
-        # Plans of ltcl.device.vectors, by kernel and size.
-        self.reductions: dict[tuple, Any] = {}
-        self._lock = threading.RLock()
 
     def __repr__(self) -> str:
         return f"<ltcl device {self.description.index} {self.name}, {self.driver}>"
@@ -98,10 +114,11 @@ class Device:
         """Kernel `name` of `kernels/<file>.cl` with `defines`; built at the first call only."""
         driver_errors.refuse_forked()
         key = (file, *sorted(defines.items()))
-        with self._lock:
-            if key not in self._programs:
-                self._programs[key] = sources.build(self, file, defines), {}
-            program, kernels = self._programs[key]
+        programs = self.session.programs
+        with self.session.lock:
+            if key not in programs:
+                programs[key] = sources.build(self, file, defines), {}
+            program, kernels = programs[key]
             if name not in kernels:
                 kernels[name] = Kernel(self, program, name)
             return kernels[name]
@@ -135,19 +152,20 @@ class Device:
                 f"that {self.name} allows, {checks.size(self.max_allocation)}"
             )
         action = f"allocating {checks.size(nbytes)} on {self.name}"
-        with driver_errors.translated(action), self._lock:
+        with driver_errors.translated(action), self.session.lock:
             return Array(self, self._allocate(buffer_size), shape, dtype)
 
     def _allocate(self, size: int) -> Any:
         """Buffer from the pool, or a new one for which unused blocks of the pool make room."""
+        pool = self.session.pool
         if size > self._largest_pooled:
             self.allocations += 1
-            self._pool.free_held()
+            pool.free_held()
             return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)
-        unused_blocks = self._pool.held_blocks
+        unused_blocks = pool.held_blocks
         # The pool frees unused blocks and tries again by itself.
-        buffer = self._pool.allocate(size)
-        is_new = self._pool.held_blocks >= unused_blocks
+        buffer = pool.allocate(size)
+        is_new = pool.held_blocks >= unused_blocks
         self.allocations += is_new
         return buffer
 
@@ -156,17 +174,18 @@ class Device:
         host = rounded(values, dtype)
         return self.empty(host.shape, dtype).set(host)
 
-    def require(self, nbytes: int, what: str) -> None:
-        """Refuse `what` if it needs more bytes than the device has, before allocation."""
+    def require(self, nbytes: int, purpose: str) -> None:
+        """Refuse `purpose` if it needs more bytes than the device has, before allocation."""
         # The memory of a host changes while a program runs.
         if self.is_cpu and nbytes > checks.host_memory():
-            self._pool.free_held()
+            self.session.pool.free_held()
         memory = self.memory
         if self.is_cpu:
             memory = min(memory, checks.host_memory())
         if nbytes > memory:
             raise MemoryLimitError(
-                f"{what} needs {checks.size(nbytes)}, but {self.name} has {checks.size(memory)}; "
+                f"{purpose} needs {checks.size(nbytes)}, "
+                f"but {self.name} has {checks.size(memory)}; "
                 "threshold or compress it, or choose another device"
             )
 

@@ -180,8 +180,9 @@ def _plan(name: str, x: Array) -> _Plan:
     device = x.device
     rows, k = _rows_and_columns(x)
     key = name, rows, k
-    if key in device.reductions:
-        return device.reductions[key]
+    plans = device.session.reductions
+    if key in plans:
+        return plans[key]
 
     kernel = kernel_of(device, name)
     if not device.is_cpu:
@@ -196,8 +197,8 @@ def _plan(name: str, x: Array) -> _Plan:
         group_limit = max(MIN_GROUP_LIMIT, 4 * device.compute_units)
         filled_groups = -(-rows * k // (group * values_per_item))
         groups = max(1, min(filled_groups, group_limit))
-    device.reductions[key] = _Plan(kernel, rows, k, groups, group)
-    return device.reductions[key]
+    plans[key] = _Plan(kernel, rows, k, groups, group)
+    return plans[key]
 
 
 def _rows_and_columns(x: Array) -> tuple[int, int]:

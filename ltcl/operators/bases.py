@@ -21,6 +21,8 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import PLAIN, Epilogue, widest_launch
 
+# The name of no basis.
+PIXELS = "pixels"
 # Work-items side by side on a GPU.
 GROUP_ITEMS = 64
 # Items along the second and third dimension, in which kernels stride: GPUs take 65535 groups.
@@ -146,13 +148,15 @@ class SubsetBasis(Basis):
         inverse[self.places] = np.arange(len(self.places))
         self._order = device.upload(self.places, np.int32)
         self._inverse_order = device.upload(inverse, np.int32)
-        name = "pixels" if of is None else of.name
-        super().__init__(
-            device, (h, w), name, len(self.places), self._order, self._inverse_order, of
-        )
-        is_permutation = len(self.places) == count
-        self.orthonormal = is_permutation and (of is None or of.orthonormal)
-        self.isometric = of is None or of.isometric
+        size = len(self.places)
+        super().__init__(device, (h, w), PIXELS, size, self._order, self._inverse_order, of)
+        if of is not None:
+            self.name = of.name
+            self.orthonormal = of.orthonormal
+            self.isometric = of.isometric
+        # Synthesis can not bring back what a true subset leaves out.
+        if size < count:
+            self.orthonormal = False
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The arrays of W, or name and grid, and the places."""

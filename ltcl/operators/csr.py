@@ -149,12 +149,7 @@ class CSR(SparseRows):
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, from which `from_arrays` makes the same operator, to the bit."""
-        return {
-            "shape": np.array(self.shape, np.int64),
-            "data": self.data.astype(np.float32),
-            "indices": self._host.indices.astype(np.int32),
-            "indptr": self.pattern.indptr,
-        }
+        return plain_arrays(self._host)
 
     @classmethod
     def from_arrays(
@@ -175,6 +170,16 @@ class CSR(SparseRows):
 
     def _transposed_rows(self) -> CSR:
         return CSR(self.device, scipy.sparse.csr_array(self._host.T))
+
+
+def plain_arrays(matrix: scipy.sparse.csr_array) -> dict[str, np.ndarray]:
+    """The arrays of a matrix as `CSR` keeps them."""
+    return {
+        "shape": np.array(matrix.shape, np.int64),
+        "data": matrix.data.astype(np.float32),
+        "indices": matrix.indices.astype(np.int32),
+        "indptr": matrix.indptr.astype(np.int64),
+    }
 
 
 class RowBlocks(CSR):

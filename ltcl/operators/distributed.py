@@ -14,6 +14,7 @@ scripts by ``mpiexec -n 2 python -m mpi4py script.py``, which then ends them all
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import platform
@@ -30,7 +31,7 @@ from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import PLAIN
 from ltcl.operators.knowledge import Norms
 from ltcl.operators.parts import Parts, upload_part
-from ltcl.operators.rows import RowOperator
+from ltcl.operators.rows import EntrySums, RowOperator
 
 _opened: weakref.WeakValueDictionary[tuple[int, Device], RankDevice] = weakref.WeakValueDictionary()
 
@@ -43,7 +44,7 @@ class RankDevice(Device):
 
     def __init__(self, comm: Any, device: Device) -> None:
         # The same device with another way to split rows: one queue, memory pool, set of kernels.
-        vars(self).update(vars(device))
+        super().__init__(device.description, device.session)
         self.comm = comm
         # The devices of the other ranks are alike.
         self.others = (device,) * (comm.size - 1)
@@ -194,14 +195,8 @@ class Distributed(Parts):
 
     def norms(self) -> Norms:
         """Norms of all rows together."""
-        sums = self.comm.allgather(self.rows.sums())
-        columns = np.sum([rank.columns for rank in sums], axis=0)
-        return Norms(
-            one=float(np.max(columns)),
-            inf=max(rank.largest_row for rank in sums),
-            frobenius=sum(rank.squares for rank in sums) ** 0.5,
-            lowest=min(rank.lowest for rank in sums),
-        )
+        sums_of_ranks = self.comm.allgather(self.rows.sums())
+        return functools.reduce(EntrySums.joined, sums_of_ranks).norms()
 
     def _host_product(self, x: Array, transpose: bool) -> np.ndarray:
         if transpose:

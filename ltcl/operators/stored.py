@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Device
@@ -28,16 +29,17 @@ from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis, SubsetBasis
 from ltcl.operators.compressed import Compressed
-from ltcl.operators.csr import CSR, Pattern
+from ltcl.operators.csr import CSR, Pattern, plain_arrays
 from ltcl.operators.dense import Dense
 from ltcl.operators.identity_plus import IdentityPlus
+from ltcl.operators.pyramid import PYRAMID
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet, basis
 
 Arrays = dict[str, np.ndarray]
 KINDS: dict[str, Any] = {"csr": CSR, "dense": Dense, "tiles": Tiles}
 # The number of a basis where a side is pixels.
-PIXELS = -1
+NO_BASIS = -1
 
 
 def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
@@ -59,6 +61,29 @@ def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
     return arrays
 
 
+def pyramid_arrays(
+    grid: tuple[int, int], cores: Sequence[scipy.sparse.csr_array], diagonals: np.ndarray
+) -> Arrays:
+    """The arrays of S = I + R, R = C W in the pyramid W of `grid`, made without a device.
+
+    `cores` are C, (N, coefficients), and `diagonals`, (channels, N), are those of R.
+    """
+    arrays = {"basis_0.name": np.array(PYRAMID), "basis_0.grid": np.array(grid)}
+    for number, (C, diagonal) in enumerate(zip(cores, diagonals, strict=True)):
+        R = {
+            "kind": np.array("compressed"),
+            "error": np.array(0.0),
+            "out": np.array(NO_BASIS),
+            "into": np.array(0),
+            "diagonal": diagonal,
+        }
+        core = {"kind": np.array("csr"), "error": np.array(0.0), **plain_arrays(C)}
+        R |= _prefixed("core", core)
+        system = {"sign": np.array(1.0), "solution_error": np.array(0.0), **_prefixed("R", R)}
+        arrays |= _prefixed(f"system_{number}", system)
+    return arrays
+
+
 def _operator_arrays(R: Operator, bases: dict[Basis, int]) -> Arrays:
     if not isinstance(R, Compressed):
         return _core_arrays(R)
@@ -77,7 +102,7 @@ def _operator_arrays(R: Operator, bases: dict[Basis, int]) -> Arrays:
 def _number_basis(W: Basis | None, bases: dict[Basis, int]) -> int:
     """The number of a basis, a new one at the first time."""
     if W is None:
-        return PIXELS
+        return NO_BASIS
     return bases.setdefault(W, len(bases))
 
 
@@ -156,7 +181,7 @@ class StoredSystems:
         return core
 
     def _read_basis(self, number: int) -> Basis | None:
-        if number == PIXELS:
+        if number == NO_BASIS:
             return None
         if number not in self._bases:
             self._bases[number] = basis_of(self._device, under(self._arrays, f"basis_{number}"))

@@ -17,9 +17,13 @@ import pywt
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.errors import InputError
-from ltcl.operators.bases import Basis, launch_grid, launch_group
-from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.bases import PIXELS, Basis, launch_grid, launch_group
+from ltcl.operators.pyramid import PYRAMID, Pyramid
 
+# Wavelets that are compared where no basis is named, the best one first.
+COMPARED_WAVELETS = ("db2", "haar", "db4")
+EXAMPLES = ", ".join(COMPARED_WAVELETS)
+WAVELET_NAME = f"an orthonormal wavelet of PyWavelets, such as {EXAMPLES}"
 # Compiled, so that no type checker knows its names.
 _pywt: Any = pywt
 # Pixels of a level up to which one launch does all the levels from it on.
@@ -139,13 +143,12 @@ def filters(name: Any) -> np.ndarray:
     h_(t-1) the high-pass is g_i = (-1)^i h_(t-1-i). Both are orthonormal, to each other and to
     themselves moved by pairs, and h sums to sqrt(2), so that a constant has one coefficient.
     """
-    offered = "an orthonormal wavelet of PyWavelets, such as haar, db2, sym8 or coif1"
     if name not in _pywt.wavelist(kind="discrete"):
-        raise InputError(f"wavelet is {name!r}; it must be {offered}")
+        raise InputError(f"wavelet is {name!r}; it must be {WAVELET_NAME}")
     wavelet = _pywt.Wavelet(name)
     taps = np.array([wavelet.rec_lo, wavelet.rec_hi])
     if not _deviation(taps) < MAX_FILTER_DEVIATION:
-        raise InputError(f"wavelet {name} is not orthonormal; it must be {offered}")
+        raise InputError(f"wavelet {name} is not orthonormal; it must be {WAVELET_NAME}")
     return taps
 
 
@@ -178,8 +181,8 @@ def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
     >>> basis(ltcl.open_device(), (8, 8), "db2").orthonormal
     True
     """
-    if name == "pixels":
+    if name == PIXELS:
         return None
-    if name == "pyramid":
+    if name == PYRAMID:
         return Pyramid(device, grid)
     return Wavelet(device, grid, name)

@@ -11,10 +11,11 @@ all others                             S of each channel, see `ltcl.operators.st
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
@@ -48,6 +49,25 @@ def to_arrays(T: Transport) -> dict[str, np.ndarray]:
         if not np.array_equal(matrix.d, f):
             arrays[f"columns_{channel}"] = np.asarray(matrix.d, np.float64)
     return arrays | stored_operators.to_arrays(systems)
+
+
+def arrays_of_scan(
+    grid: tuple[int, int],
+    cores: Sequence[scipy.sparse.csr_array],
+    diagonals: np.ndarray,
+    first_bounce: np.ndarray,
+    mixing: np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
+    """The arrays of T = I + C W of each channel, C (N, cells) between pixels and the pyramid W.
+
+    `diagonals` are those of C W, (channels, N); `first_bounce` is like them.
+    """
+    arrays = {"grid": np.array(grid), "first_bounce": first_bounce}
+    if mixing is not None:
+        arrays["mixing"] = np.asarray(mixing)
+    for channel in range(len(cores)):
+        arrays[f"columns_{channel}"] = np.ones(diagonals.shape[1])
+    return arrays | stored_operators.pyramid_arrays(grid, cores, diagonals)
 
 
 def matrices_from_arrays(

@@ -136,12 +136,12 @@ class Footprints:
         J = self.J.reshape(-1, 4)
         chunks = []
         for start in range(0, known.size, PIXELS_AT_ONCE):
-            part = slice(start, start + PIXELS_AT_ONCE)
-            xu, xv, yu, yv = J[part].T[..., None]
-            points_x = x[part, None] + xu * du + xv * dv
-            points_y = y[part, None] + yu * du + yv * dv
+            chunk = slice(start, start + PIXELS_AT_ONCE)
+            xu, xv, yu, yv = J[chunk].T[..., None]
+            points_x = x[chunk, None] + xu * du + xv * dv
+            points_y = y[chunk, None] + yu * du + yv * dv
             numbers = padded.numbers(points_x, points_y)
-            chunks.append(_count_points(numbers, known[part], padded.size))
+            chunks.append(_count_points(numbers, known[chunk], padded.size))
         return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
 
 

@@ -273,6 +273,6 @@ def _normalise_rows(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
 def _keep_rows(weights: scipy.sparse.csr_array, is_kept: np.ndarray) -> scipy.sparse.csr_array:
     """Weights in float32, with empty rows for pixels that are not kept."""
     mask = scipy.sparse.diags_array(is_kept.astype(np.float32))
-    kept = scipy.sparse.csr_array(mask @ weights, dtype=np.float32)
-    kept.eliminate_zeros()
-    return kept
+    rows = scipy.sparse.csr_array(mask @ weights, dtype=np.float32)
+    rows.eliminate_zeros()
+    return rows

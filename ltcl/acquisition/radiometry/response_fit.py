@@ -236,7 +236,8 @@ class CurveFit:
         table = _tabulate(self.theta, SETTINGS.inverse_size)
         light = np.interp(self.near, grid, table) + self.offset
         squares = np.maximum((self.weight * self.t**2).sum(axis=0), TINY)
-        x = (self.weight * self.t * light).sum(axis=0) / squares * self.t  # L_p t_k
+        L = (self.weight * self.t * light).sum(axis=0) / squares
+        x = L * self.t
 
         self.near = np.interp(x, table, grid)
         slope = np.interp(self.near, grid, np.gradient(table, grid))
@@ -249,7 +250,8 @@ class CurveFit:
         low, high = np.interp([0.0, self.saturation], grid, table)
         margin = SETTINGS.margin * sigma
         is_clear = self.is_usable & (x + margin < high) & (x - margin > low)
-        biweight = np.clip(1.0 - (residual / (SETTINGS.tukey * sigma)) ** 2, 0.0, 1.0) ** 2
+        deviation = residual / (SETTINGS.tukey * sigma)
+        biweight = np.clip(1.0 - deviation**2, 0.0, 1.0) ** 2
         self.weight = is_clear * biweight / sigma**2
 
     def _fit_curve(self) -> np.ndarray:
@@ -270,7 +272,8 @@ class CurveFit:
         P = P - anchor @ P
         H = P.T @ M @ P
         constant = np.full(SPLINE_SIZE, value)
-        g = -P.T @ (M @ constant + v) - H @ np.full(SPLINE_SIZE - 1, MIN_STEP)
+        least_steps = np.full(SPLINE_SIZE - 1, MIN_STEP)
+        g = -P.T @ (M @ constant + v) - H @ least_steps
         scale = 1.0 / np.sqrt(np.diagonal(H))
         scaled = H * scale * scale[:, None]
         root = scipy.linalg.cholesky(scaled + RIDGE * np.eye(SPLINE_SIZE - 1))
@@ -284,7 +287,8 @@ class CurveFit:
         w = self.weight
         t = self.t
         B = _design(self.near.ravel())
-        C = ((w * t)[:, :, None] * B.reshape(*self.near.shape, SPLINE_SIZE)).sum(axis=0)
+        B_of_pixels = B.reshape(*self.near.shape, SPLINE_SIZE)
+        C = ((w * t)[:, :, None] * B_of_pixels).sum(axis=0)
         inverse = 1.0 / np.maximum((w * t**2).sum(axis=0), TINY)
         M = B.T @ (w.reshape(-1, 1) * B) - C.T @ (inverse[:, None] * C)
         light_offset = inverse * (w * t * self.offset).sum(axis=0)
@@ -293,9 +297,11 @@ class CurveFit:
 
     def _slope_changes(self) -> np.ndarray:
         """D with the changes of slope D @ theta, relative to the slopes of the round before."""
-        slopes = np.diff(np.eye(SPLINE_SIZE), axis=0) / np.diff(GREVILLE_ABSCISSAE)[:, None]
+        steps = np.diff(GREVILLE_ABSCISSAE)
+        slopes = np.diff(np.eye(SPLINE_SIZE), axis=0) / steps[:, None]
         size = np.maximum(slopes @ self.theta, 1e-3)
-        return np.diff(slopes, axis=0) / np.minimum(size[1:], size[:-1])[:, None]
+        smaller = np.minimum(size[1:], size[:-1])
+        return np.diff(slopes, axis=0) / smaller[:, None]
 
 
 def _residual_noise(
@@ -305,21 +311,25 @@ def _residual_noise(
 
     Unlike `estimate` of repeated photographs, there is one sample of each pixel, and outliers.
     """
-    bins = [pixels for pixels in np.array_split(np.argsort(x), SETTINGS.noise_bins) if len(pixels)]
-    if len(bins) < 2:
+    if len(x) < 2:
         return NoiseModel(levels=levels)
+    count = min(SETTINGS.noise_bins, len(x))
+    bins = np.array_split(np.argsort(x), count)
     rounding_model = NoiseModel(read=0.0, levels=levels)
     variance = np.empty(len(bins))
     light = np.empty(len(bins))
     rounding = np.empty(len(bins))
     for k, pixels in enumerate(bins):
-        variance[k] = (DEVIATION_OF_MEDIAN * np.median(np.abs(residual[pixels]))) ** 2
+        median = np.median(np.abs(residual[pixels]))
+        variance[k] = (DEVIATION_OF_MEDIAN * median) ** 2
         light[k] = max(x[pixels].mean(), 0.0)
         rounding[k] = rounding_model.variance(0.0, slope[pixels]).mean()
     variance = np.maximum(variance, rounding + 1e-12)
-    columns = np.stack([light, np.ones_like(light)], axis=1) / variance[:, None]
-    (gain, floor), _ = scipy.optimize.nnls(columns, 1.0 - rounding / variance)
-    return NoiseModel(electrons=1.0 / max(gain, 1e-9), read=float(np.sqrt(floor)), levels=levels)
+    columns = np.stack([light / variance, 1.0 / variance], axis=1)
+    line, _ = scipy.optimize.nnls(columns, 1.0 - rounding / variance)
+    gain, floor = line
+    electrons = 1.0 / max(gain, 1e-9)
+    return NoiseModel(electrons=electrons, read=float(np.sqrt(floor)), levels=levels)
 
 
 def _design(codes: np.ndarray) -> np.ndarray:

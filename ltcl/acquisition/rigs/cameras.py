@@ -200,7 +200,7 @@ class OpenCVCamera(Closing):
         before = self._capture.get(setting)
         self._capture.set(setting, value)
         actual = self._capture.get(setting)
-        is_missing = before == UNKNOWN_PROPERTY and actual == UNKNOWN_PROPERTY
+        is_missing = before == actual == UNKNOWN_PROPERTY
         if actual != value and not is_missing:
             raise AcquisitionError(
                 f"automatic {name} of {self.source!r} cannot be switched off: "
@@ -265,7 +265,8 @@ class GPhoto2Camera(Closing):
             with self._refusing("photograph"):
                 place = self._camera.capture(gphoto2.GP_CAPTURE_IMAGE)
                 path = Path(folder) / Path(place.name).name
-                file = self._camera.file_get(place.folder, place.name, gphoto2.GP_FILE_TYPE_NORMAL)
+                kind = gphoto2.GP_FILE_TYPE_NORMAL
+                file = self._camera.file_get(place.folder, place.name, kind)
                 file.save(str(path))
                 self._camera.file_delete(place.folder, place.name)
             return read_photograph("the camera's file", path, self.channels, self._seconds)
@@ -310,7 +311,8 @@ class GPhoto2Camera(Closing):
         """Choices of the shutter that are an exposure, by their seconds."""
         choices = {}
         if self._shutter:
-            for choice in self._camera.get_single_config(self._shutter).get_choices():
+            widget = self._camera.get_single_config(self._shutter)
+            for choice in widget.get_choices():
                 seconds = _shutter_seconds(str(choice))
                 if seconds > 0:
                     choices[seconds] = str(choice)

@@ -75,7 +75,8 @@ class Display(Closing):
             levels = levels[..., None]
         levels = np.broadcast_to(levels, (*self.size, 3))
         # pygame counts pixels (x, y).
-        self._pygame.surfarray.blit_array(self._screen, levels.swapaxes(0, 1))
+        transposed = levels.swapaxes(0, 1)
+        self._pygame.surfarray.blit_array(self._screen, transposed)
         self._pygame.display.flip()
 
     def key_pressed(self) -> bool:
@@ -89,7 +90,8 @@ class Display(Closing):
         is_pressed = False
         for event in pygame.event.get():
             is_key = event.type == pygame.KEYDOWN
-            if event.type == pygame.QUIT or (is_key and event.key == pygame.K_ESCAPE):
+            is_escape = is_key and event.key == pygame.K_ESCAPE
+            if is_escape or event.type == pygame.QUIT:
                 self.close()
                 raise AcquisitionError("the display was closed by its window or the Escape key")
             is_pressed |= is_key
@@ -97,7 +99,12 @@ class Display(Closing):
 
     def describe(self) -> dict[str, Any]:
         """The display as plain JSON."""
-        return {"kind": "display", "index": self.index, "size": self.size, "period": self.period}
+        return {
+            "kind": "display",
+            "index": self.index,
+            "size": self.size,
+            "period": self.period,
+        }
 
     def close(self) -> None:
         """Release the display; it cannot show anything afterwards."""
@@ -111,10 +118,12 @@ class Display(Closing):
         self.index = _choose_display(index, sizes)
         w, h = sizes[self.index]
         self.size = (h, w)
-        enlarge(np.zeros(self.grid), self.size)  # refuses a grid that does not fit
+        # Refuses a grid that does not fit.
+        enlarge(np.zeros(self.grid), self.size)
         rate = display.get_desktop_refresh_rates()[self.index]
         self.period = 1.0 / rate if rate > 0 else None
-        self._screen = display.set_mode((w, h), self._pygame.FULLSCREEN, display=self.index)
+        mode = self._pygame.FULLSCREEN
+        self._screen = display.set_mode((w, h), mode, display=self.index)
         actual_size = self._screen.get_size()
         if actual_size != (w, h):
             raise AcquisitionError(
@@ -131,10 +140,11 @@ def _choose_display(index: int | None, sizes: list[tuple[int, int]]) -> int:
     else:
         chosen = checks.count("index", index, least=0)
     if chosen not in range(len(sizes)):
-        offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes))
-        if not offered:
-            offered = "none"
-        raise InputError(f"index is {index}, of {offered}; a projector must extend the desktop")
+        offered = [f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes)]
+        displays = ", ".join(offered) if offered else "none"
+        raise InputError(
+            f"index is {index}; the displays are {displays}: a projector must extend the desktop"
+        )
     return chosen
 
 
@@ -195,8 +205,10 @@ def show(
         return 0
 
     h, w = images.read(folder / shots[0].pattern).shape[:2]
-    is_open = hasattr(display, "show")
-    with contextlib.nullcontext(display) if is_open else Display((h, w), index=display) as screen:
+    opened: Any = contextlib.nullcontext(display)
+    if not hasattr(display, "show"):
+        opened = Display((h, w), index=display)
+    with opened as screen:
         for done, shot in enumerate(shots):
             screen.show(images.read(folder / shot.pattern, encoding="linear"))
             if progress is not None:
@@ -213,7 +225,10 @@ def _shots_to_show(rig: FolderRig, advance: str | float) -> list[Shot]:
     has_project = (folder / "acquisition.toml").exists()
     if advance == "arrival" or not folder.is_dir() or has_project:
         raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
-    return [Shot(frame.number, frame.name, 0.0, "") for frame in open_frames(folder)]
+    shots = []
+    for frame in open_frames(folder):
+        shots.append(Shot(frame.number, frame.name, 0.0, ""))
+    return shots
 
 
 def _wait_for_next(screen: Any, rig: FolderRig, shot: Shot, advance: str | float) -> None:

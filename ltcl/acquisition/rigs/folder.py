@@ -173,7 +173,8 @@ class FolderRig:
     def missing(self) -> tuple[int, ...]:
         """Numbers on the list whose photographs are still missing."""
         self._files = self._list_photographs()
-        return tuple(shot.number for shot in self.shots if shot.number not in self._files)
+        numbers = [shot.number for shot in self.shots]
+        return tuple(number for number in numbers if number not in self._files)
 
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in place of those that are missing.
@@ -191,7 +192,7 @@ class FolderRig:
         InputError
             The number of files is another.
         FileError
-            One is no photograph.
+            One is not a photograph.
         """
         numbers = self.missing()
         unique_files = dict.fromkeys(map(input_file, files))
@@ -226,7 +227,8 @@ class FolderRig:
         """Put a shot on the list and its pattern in the folder, unless they are there."""
         codes, seconds = as_shot(self, codes, seconds)
         # The hash is that of the projected levels: shots that differ by less are the same.
-        levels = np.rint(codes * ((1 << self._pattern_bits) - 1)).astype("<u2")
+        largest_level = (1 << self._pattern_bits) - 1
+        levels = np.rint(codes * largest_level).astype("<u2")
         size = () if self._projector is None else self._projector
         key = ShotKey(shot_key(levels, *size), seconds)
         is_new = not self._list.has_pattern(key)
@@ -283,12 +285,12 @@ class FolderRig:
         return PhotographMissing(text, shot.number, shot, len(missing))
 
     def _new_files(self, files: list[Path]) -> list[Path]:
-        """Files that were not copied before; FileError for one that is no photograph."""
+        """Files that were not copied before; FileError for one that is not a photograph."""
         copied = [path for paths in self._files.values() for path in paths]
         new = []
         for path in files:
             if path.suffix.lower() not in PHOTOGRAPH_SUFFIXES:
-                raise FileError(f"{path}: is no photograph; it must be {PHOTOGRAPH_KINDS}")
+                raise FileError(f"{path}: is not a photograph; it must be {PHOTOGRAPH_KINDS}")
             twin = _find_equal(path, copied)
             if twin is None:
                 new.append(path)

@@ -47,7 +47,8 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     codes, exposure = _read_with_exposure(name, path)
     if seconds is not None:
         _check_exposure(name, exposure, seconds)
-    if codes.dtype.kind == "f" and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
+    is_float = codes.dtype.kind == "f"
+    if is_float and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
         raise AcquisitionError(
             f"{name} reaches {codes.max():.4g}; full scale of float photographs is 1: "
             "divide all by the largest value of the camera"
@@ -82,7 +83,8 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
 
     The black level stays, as subtracting it would clip noise; 65535 is the sensor's white level.
     """
-    rawpy = load_extra("rawpy", "camera", f"{path}, camera RAW instead of 16-bit TIFF,")
+    user = f"{path}, camera RAW instead of 16-bit TIFF,"
+    rawpy = load_extra("rawpy", "camera", user)
     try:
         with rawpy.imread(str(path)) as raw:
             codes = raw.postprocess(
@@ -100,10 +102,11 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
             )
             return codes, raw.other.shutter_speed
     except (rawpy.LibRawError, rawpy.NotSupportedError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        if not reason:
-            reason = type(error).__name__
-        raise FileError(f"{path}: is no readable camera RAW file: {reason}") from error
+        text = str(error)
+        if not text.strip():
+            text = type(error).__name__
+        reason = " ".join(text.split())
+        raise FileError(f"{path}: is not a readable camera RAW file: {reason}") from error
 
 
 def _exif_exposure(path: Path) -> float | None:

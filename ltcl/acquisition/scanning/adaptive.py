@@ -39,7 +39,7 @@ from ltcl.acquisition.scanning.pictures import (
 )
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore, CompressedRecord
-from ltcl.transport import first_bounce
+from ltcl.transport import first_bounce, stored
 
 BATCH_SIZE = 16
 """Patterns of a batch."""
@@ -65,7 +65,8 @@ class Cells:
         """Each level as blocks of pixels."""
         longest = max(self.grid)
         count = (longest - 1).bit_length() + 1
-        return tuple(Blocks(self.grid, min(1 << level, longest)) for level in range(count))
+        sides = [min(1 << level, longest) for level in range(count)]
+        return tuple(Blocks(self.grid, side) for side in sides)
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
@@ -91,7 +92,8 @@ class Cells:
         for blocks, level in zip(self.levels, numbers, strict=True):
             cells.append(blocks.enlarged(level.reshape(blocks.grid)))
         pixels = np.tile(np.arange(self.pixels), len(cells))
-        return scipy.sparse.csr_array((np.ones(len(pixels)), (np.ravel(cells), pixels)))
+        places = np.ravel(cells), pixels
+        return scipy.sparse.csr_array((np.ones(len(pixels)), places))
 
     @cached_property
     def areas(self) -> np.ndarray:
@@ -261,16 +263,17 @@ class _Division:
     def run(self, grid: ScanGrid, log: PictureLog) -> Entries:
         """Photograph the children, and return their entries, by cell."""
         groups = self._groups(len(grid.seen))
-        log.announce(self._pattern(child, members) for child, members in groups)
+        log.announce(self._pattern(*group) for group in groups)
         cell = self.children[:, self.parent]
         energy = np.zeros((4, *self.parents.energy.shape))
         # The light is unknown unless a photograph follows.
         variance = energy + np.where(cell >= 0, UNKNOWN, 0.0)[:, None]
         for first in range(0, len(groups), BATCH_SIZE):
             batch = groups[first : first + BATCH_SIZE]
-            patterns = [self._pattern(child, members) for child, members in batch]
+            patterns = [self._pattern(*group) for group in batch]
             pictures = log.take(patterns)
-            for (child, members), pattern, picture in zip(batch, patterns, pictures, strict=True):
+            for group, pattern, picture in zip(batch, patterns, pictures, strict=True):
+                child, members = group
                 entries = np.flatnonzero(np.isin(self.parent, members))
                 pixels = self.parents.pixel[entries]
                 known = self._known_light(pattern, pixels)
@@ -429,53 +432,31 @@ def transport_arrays(
 ) -> dict[str, np.ndarray]:
     """The arrays of a scan as a compressed transport (`ltcl.transport`).
 
-    It is S diag(1) with S = I + (C W - I): C W - I is C less 1 at every pixel's own cell. Its first
-    bounce is 0, so that the pixel can be masked, where it is not above 0 by `sigmas` standard
-    deviations.
+    It is S = I + (C W - I): C W - I is C less 1 at every pixel's own cell. Its first bounce is 0,
+    so that the pixel can be masked, where it is not above 0 by `sigmas` standard deviations.
     """
     cells = core.cells
     matrices = core.matrices()
     diagonal = np.stack([_diagonal_of_product(C, cells) for C in matrices])
     noise = np.stack([_diagonal_of_product(V, cells) for V in core.variances()])
-    result: dict[str, Any] = {
-        "grid": cells.grid,
-        "first_bounce": first_bounce.drop_uncertain(diagonal, noise, sigmas),
-        "basis_0.name": "pyramid",
-        "basis_0.grid": cells.grid,
-    }
-    if mixing is not None:
-        result["mixing"] = mixing
-    for c, C in enumerate(matrices):
-        result[f"columns_{c}"] = np.ones(cells.pixels)
-        result[f"system_{c}.sign"] = 1.0
-        result[f"system_{c}.solution_error"] = 0.0
-        for name, value in _remainder_arrays(C, diagonal[c]).items():
-            result[f"system_{c}.R.{name}"] = value
-    return {name: np.asarray(value) for name, value in result.items()}
+    remainders = []
+    for C in matrices:
+        row = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
+        # A pixel's own cell has its number.
+        values = C.data - (C.indices == row)
+        remainders.append(scipy.sparse.csr_array((values, C.indices, C.indptr), shape=C.shape))
+    return stored.arrays_of_scan(
+        cells.grid,
+        remainders,
+        diagonal - 1.0,
+        first_bounce.drop_uncertain(diagonal, noise, sigmas),
+        mixing,
+    )
 
 
 def _diagonal_of_product(C: scipy.sparse.csr_array, cells: Cells) -> np.ndarray:
     """Diagonal of C W, (N,)."""
     return C.multiply(cells.W.T).sum(axis=1)
-
-
-def _remainder_arrays(C: Any, diagonal: np.ndarray) -> dict[str, Any]:
-    """R = C W - I as a compressed operator: its core C less 1 at every pixel's own cell."""
-    rows = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
-    values = C.data - (C.indices == rows)
-    return {
-        "kind": "compressed",
-        "error": 0.0,
-        "out": -1,
-        "into": 0,
-        "diagonal": diagonal - 1.0,
-        "core.kind": "csr",
-        "core.error": 0.0,
-        "core.shape": np.array(C.shape, np.int64),
-        "core.data": values.astype(np.float32),
-        "core.indices": C.indices.astype(np.int32),
-        "core.indptr": C.indptr.astype(np.int64),
-    }
 
 
 def colour_cells(starts: np.ndarray, pixels: np.ndarray, count: int) -> np.ndarray:

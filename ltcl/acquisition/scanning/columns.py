@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -192,16 +193,18 @@ class ColumnScan:
         `progress` is called with the number of patterns of earlier runs, then with 1 for each.
         """
         missing = sorted({block for _, block in self.store.missing()})
-        counts = []
-        for block in range(self.store.layout.blocks("columns")):
-            counts.append(len(self.code.patterns(self._pixels(block))))
-        progress(sum(counts) - sum(counts[block] for block in missing))
+        blocks = self.store.layout.blocks("columns")
+        counts = np.array([self._count_patterns(block) for block in range(blocks)])
+        progress(int(counts.sum() - counts[missing].sum()))
 
-        coming = (pattern for block in missing for pattern in self._patterns(block))
-        self.camera.announce(coming, max(counts))
+        patterns = chain.from_iterable(map(self._patterns, missing))
+        self.camera.announce(patterns, int(counts.max()))
         for block in missing:
             pictures = self.camera.take(self._patterns(block), progress)
             self._commit(block, pictures)
+
+    def _count_patterns(self, block: int) -> int:
+        return len(self.code.patterns(self._pixels(block)))
 
     def _pixels(self, block: int) -> int:
         """Number of columns of a block."""
@@ -229,10 +232,12 @@ class ColumnScan:
             correlation = self.code.correlation(variance, ambient)
             x, keep = significant(x, v, self.camera.grid, self.sigmas, correlation)
             keep &= self.camera.seen
-            is_known = v[keep] < KNOWN_VARIANCE
+            v = v[keep]
+            is_known = v < KNOWN_VARIANCE
             values = np.where(is_known, x[keep], 0.0).astype(np.float32)
-            matrix = scipy.sparse.csr_array((values, np.nonzero(keep)), shape=x.shape)
-            self.store.write(c, block, matrix, np.where(is_known, v[keep], np.nan))
+            entries = values, np.nonzero(keep)
+            matrix = scipy.sparse.csr_array(entries, shape=x.shape)
+            self.store.write(c, block, matrix, np.where(is_known, v, np.nan))
 
 
 def finish(store: BlockStore, grid: ScanGrid, patterns: int, sigmas: float) -> None:
@@ -299,19 +304,22 @@ def significant(
     keep = (variance >= KNOWN_VARIANCE) | (value**2 > sigmas**2 * variance)
     sides = _tile_sides(grid)
 
+    noise = variance, correlation
+
     # 1. Tiles of each column.
     for side in sides:
         tiles = Blocks(grid, side)
-        keep |= _significant_tiles(value, variance, keep, tiles, sigmas, correlation, 1)
+        keep |= _significant_tiles(value, noise, keep, tiles, sigmas, 1)
 
     # 2. Tiles of all columns together.
     single = keep.copy()
     for side in sides:
         tiles = Blocks(grid, side)
-        keep |= _significant_tiles(value, variance, keep, tiles, sigmas, correlation, len(value))
+        keep |= _significant_tiles(value, noise, keep, tiles, sigmas, len(value))
 
     together = keep & ~single
-    return np.where(together, _shared_mean(value, together), value), keep
+    mean = _shared_mean(value, together)
+    return np.where(together, mean, value), keep
 
 
 def _tile_sides(grid: tuple[int, int]) -> list[int]:
@@ -326,17 +334,18 @@ def _tile_sides(grid: tuple[int, int]) -> list[int]:
 
 def _significant_tiles(
     value: np.ndarray,
-    variance: np.ndarray,
+    noise: tuple[np.ndarray, np.ndarray | float],
     keep: np.ndarray,
     tiles: Blocks,
     sigmas: float,
-    correlation: np.ndarray | float,
     columns: int,
 ) -> np.ndarray:
     """Entries in tiles whose sum, of entries not kept before, is light.
 
-    Sums are over so many columns. Returns (k / columns, M) bool, to be broadcast.
+    `noise` is the variance of entries and the correlation of their errors; sums are over so many
+    `columns`. Returns (k / columns, M) bool, to be broadcast.
     """
+    variance, correlation = noise
     grid = tiles.pixels
 
     def column_sums(entries: np.ndarray) -> np.ndarray:
@@ -347,10 +356,10 @@ def _significant_tiles(
         return tiles.sum(np.moveaxis(entries.reshape(-1, *grid), 0, -1))
 
     terms = column_sums(np.ones_like(value))
-    noise = column_sums(variance)
-    noise *= 1.0 + correlation * np.maximum(terms - 1.0, 0.0)
-    light_of_tile = tile_sums(column_sums(value))
-    is_light = light_of_tile**2 > sigmas**2 * tile_sums(noise)
+    sum_variance = column_sums(variance)
+    sum_variance *= 1.0 + correlation * np.maximum(terms - 1.0, 0.0)
+    light = tile_sums(column_sums(value))
+    is_light = light**2 > sigmas**2 * tile_sums(sum_variance)
     pixels = tiles.enlarged(is_light.astype(np.float32)) > 0
     return np.moveaxis(pixels, -1, 0).reshape(-1, value.shape[1])
 
@@ -359,7 +368,7 @@ def _shared_mean(value: np.ndarray, together: np.ndarray) -> np.ndarray:
     """Means (k, M) over neighbouring columns, of the entries that count only together."""
     starts = np.arange(0, len(value), SHARED_COLUMNS)
     light = np.add.reduceat(np.where(together, value, 0.0), starts, axis=0)
-    terms = np.add.reduceat(np.where(together, np.ones_like(value), 0.0), starts, axis=0)
+    terms = np.add.reduceat(together, starts, axis=0, dtype=value.dtype)
     mean = light / np.maximum(terms, 1.0)
     return np.repeat(mean, SHARED_COLUMNS, axis=0)[: len(value)]
 
@@ -420,8 +429,9 @@ def balance(
     ([[0.56, 0.12]], [1.2, 0.8])
     """
     lengths = np.diff(matrix.indptr)
-    V: Any = scipy.sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
-    rows, N = V.shape
+    rows, N = matrix.shape
+    places = matrix.indices, matrix.indptr
+    V: Any = scipy.sparse.csr_array((variance, *places), shape=matrix.shape)
     median = np.zeros(rows)
     for row, entries in enumerate(np.split(variance, matrix.indptr[1:-1])):
         if len(entries):
@@ -437,5 +447,5 @@ def balance(
     # Unknown entries are in rows that stay.
     spread = np.nan_to_num(variance)
     values = matrix.data + spread * np.repeat(move, lengths)
-    balanced = scipy.sparse.csr_array((values, matrix.indices, matrix.indptr), shape=(rows, N))
+    balanced = scipy.sparse.csr_array((values, *places), shape=matrix.shape)
     return balanced, variance - spread**2 / np.repeat(total, lengths)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, islice
+from itertools import combinations, islice, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,7 +91,8 @@ class ScanGrid:
         self.channels = len(calibration.offset)
         self.blocks = Blocks(calibration.resampling.grid, side)
         self.grid = self.blocks.grid
-        self.seen = self.blocks.sum(calibration.resampling.seen.astype(np.float32)).ravel() > 0
+        seen_pixels = calibration.resampling.seen.astype(np.float32)
+        self.seen = self.blocks.sum(seen_pixels).ravel() > 0
         self.sharpness = None
         if calibration.sharpness is not None:
             self.sharpness = calibration.sharpness.of_blocks(side)
@@ -133,10 +134,10 @@ class ScanGrid:
         variance_sums = self._block_sums(variance * share**2)
         count = self._block_sums(is_good.astype(np.float32))
         pixels = np.maximum(count, 1.0) * self.calibration.light[:, None]
-        mean_variance = np.where(count > 0, variance_sums / pixels**2, UNKNOWN)
+        variance = np.where(count > 0, variance_sums / pixels**2, UNKNOWN)
         return Picture(
             value=(light_sums / pixels).astype(np.float32),
-            variance=mean_variance.astype(np.float32),
+            variance=variance.astype(np.float32),
         )
 
     def _block_sums(self, picture: np.ndarray) -> np.ndarray:
@@ -162,14 +163,15 @@ class ScanCamera(ScanGrid):
         super().__init__(calibration, side)
         self.shots = shots
         # Photographs are compared at some of the pixels that see the projector.
-        self._pixels = spread(np.unique(calibration.resampling.weights.indices))
+        seeing = np.unique(calibration.resampling.weights.indices)
+        self._pixels = spread(seeing)
 
     def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:
         """Announce the patterns that come next to the rig, in batches of `size`."""
         times = self.calibration.exposures
-        remaining = iter(patterns)
-        while batch := [self.blocks.enlarged(pattern) for pattern in islice(remaining, size)]:
-            shots = [(codes, seconds) for codes in batch for seconds in times]
+        codes = map(self.blocks.enlarged, patterns)
+        while batch := list(islice(codes, size)):
+            shots = [*product(batch, times)]
             self.shots.prepare([*shots, (anchor.marked(batch), times[0])])
 
     def take(
@@ -221,20 +223,22 @@ class ScanCamera(ScanGrid):
     def _without_ambient(self, lit: Picture) -> Picture:
         """A picture less the ambient light, of whose variance each picture has the same part."""
         known = (lit.variance < UNKNOWN) & (self.dark.variance < UNKNOWN)
-        value = np.where(known, lit.value - self.dark.value, np.float32(0.0))
-        return Picture(value=value, variance=np.where(known, lit.variance, UNKNOWN))
+        return Picture(
+            value=np.where(known, lit.value - self.dark.value, np.float32(0.0)),
+            variance=np.where(known, lit.variance, UNKNOWN),
+        )
 
     def _deviation(self, photographs: _ExposedPattern) -> Deviation | None:
         """Exposures of a pattern that deviate, at pixels that see the projector, or see it lit."""
         if len(photographs.images) < 2:
             return None
-        codes = photographs.codes
-        is_lit = codes != 0 if codes.ndim == 2 else codes.any(axis=2)
+        is_lit = photographs.codes.reshape(*self.shots.grid, -1).any(axis=2)
         weights = self.calibration.resampling.weights
-        lit_pixels = spread(np.unique(weights[np.flatnonzero(is_lit)].indices))
-        for pixels in (self._pixels, lit_pixels):
+        camera = self.calibration.camera
+        seeing_lit = np.unique(weights[np.flatnonzero(is_lit)].indices)
+        for pixels in (self._pixels, spread(seeing_lit)):
             samples = [sample(image, pixels) for image in photographs.images]
-            deviation = find_deviation(samples, photographs.seconds, self.calibration.camera)
+            deviation = find_deviation(samples, photographs.seconds, camera)
             if deviation is not None:
                 return deviation
         return None
@@ -244,8 +248,9 @@ class ScanCamera(ScanGrid):
 
         The pattern after it is photographed too: it tells whether photographs of both are mixed up.
         """
+        seconds = photographs.seconds
         suspects = [photographs]
-        suspects += [self._photograph(codes, photographs.seconds) for codes in following]
+        suspects += [self._photograph(codes, seconds) for codes in following]
         texts = []
         for suspect in suspects:
             deviation = self._deviation(suspect)
@@ -253,8 +258,10 @@ class ScanCamera(ScanGrid):
                 texts.append(deviation.describe(suspect.numbers, self.shots.name))
         text = "; ".join(texts)
         if len(texts) == 2:
-            order = _Rearrangement(suspects, self._deviation, self.shots.name).describe()
-            text = text if order is None else order
+            rearrangement = _Rearrangement(suspects, self._deviation, self.shots.name)
+            order = rearrangement.describe()
+            if order is not None:
+                text = order
         raise AcquisitionError(f"{text}; {ADVICE}")
 
     def _check_patterns(
@@ -264,7 +271,8 @@ class ScanCamera(ScanGrid):
         exposed: Sequence[_ExposedPattern],
     ) -> None:
         """Raise AcquisitionError if a picture shows the pattern of another one of its batch."""
-        for a, b in _BatchComparison(self.white, patterns, pictures).mixed_up():
+        comparison = _BatchComparison(self.white, patterns, pictures)
+        for a, b in comparison.mixed_up():
             first = self._names(exposed[a])
             second = self._names(exposed[b])
             raise AcquisitionError(f"{first} shows the pattern of {second}; {ADVICE}")
@@ -285,19 +293,17 @@ class ScanCamera(ScanGrid):
             return
         if known.anchor.deviation(image, seconds, known.camera) is None:
             return
-        shown = replace(blocks, images=[anchor.compact(self._merge(blocks))])
+        light = anchor.compact(self._merge(blocks))
+        series = [*exposed, replace(blocks, images=[light])]
+        setup = known.white, known.ambient, known.resampling
         shifts = []
-        for photographs in [*exposed, shown]:
+        for photographs in series:
             [picture] = photographs.images
-            shifts.append(
-                anchor.shift_of(
-                    photographs.codes, picture, known.white, known.ambient, known.resampling
-                )
-            )
+            shifts.append(anchor.shift_of(photographs.codes, picture, *setup))
         *earlier, moved = shifts
         first = anchor.first_moved(earlier, moved)
-        start = [*exposed, shown][max(first - 1, 0)].numbers[0]
-        stop = [*exposed, shown][first].numbers[-1]
+        start = series[max(first - 1, 0)].numbers[0]
+        stop = series[first].numbers[-1]
         raise AcquisitionError(
             f"{self.shots.name(blocks.numbers[0])}, of the pattern of blocks, deviates from that "
             f"of the calibration: from one of photographs {start} to {stop} on, the camera, the "
@@ -317,8 +323,11 @@ class _Rearrangement:
     ) -> None:
         self.patterns = patterns
         self.deviation = deviation
-        self.images = [image for pattern in patterns for image in pattern.images]
-        self.names = [name(number) for pattern in patterns for number in pattern.numbers]
+        self.images = []
+        self.names = []
+        for pattern in patterns:
+            self.images += pattern.images
+            self.names += map(name, pattern.numbers)
 
     def describe(self) -> str | None:
         """Photographs that are missing or exchanged; None if no such order makes all agree."""
@@ -362,7 +371,8 @@ class _Rearrangement:
                 if number is not None:
                     images.append(self.images[number])
                     exposures.append(seconds)
-            if self.deviation(replace(pattern, images=images, seconds=exposures)) is not None:
+            rearranged = replace(pattern, images=images, seconds=exposures)
+            if self.deviation(rearranged) is not None:
                 return False
         return True
 
@@ -406,16 +416,17 @@ class _BatchComparison:
         where_a, count_a, noise_a = self._means(lit, ~self.lit)
         has_pixels = (count_a > 0) & (count_b > 0)
         is_brighter = where_b > PATTERN_RATIO * where_a
-        is_certain = where_b - where_a > PATTERN_SIGMAS * np.sqrt(noise_a + noise_b)
+        noise = np.sqrt(noise_a + noise_b)
+        is_certain = where_b - where_a > PATTERN_SIGMAS * noise
         return has_pixels & is_brighter & is_certain
 
-    def _means(self, mask: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Mean of picture a over pixels in its mask and in `other` of b, (a, b).
+    def _means(self, mask: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Mean of picture a over pixels in its mask and in the region of b, (a, b).
 
         With the number of these pixels and the variance of the mean.
         """
         weight = mask.astype(np.float64)
-        pixels = other.T.astype(np.float64)
+        pixels = region.T.astype(np.float64)
         count = weight @ pixels
         total = np.maximum(count, 1.0)
         mean = (weight * self.value) @ pixels / total

@@ -116,8 +116,8 @@ class Report:
             saturated=1.0 - float(np.mean(calibration.white.valid)),
             entries=entries.count,
             unknown=entries.unknown / max(entries.count, 1),
-            noise_direct=_relative_noise(entries.variance, first_bounce, first_bounce > 0),
-            noise_sum=_relative_noise(white.variance, white.value, white.known & (white.value > 0)),
+            noise_direct=_relative_noise(entries.variance, first_bounce),
+            noise_sum=_relative_noise(white.variance, white.value, white.known),
             sum_deviation=sum_deviation,
         )
 
@@ -142,8 +142,8 @@ class Report:
         lines = [
             f"{self.strategy} ({self.why}), {h} x {w} pixels, {self.channels} channel(s)",
             f"{self.photographs} photographs: {self.patterns} patterns at {times}",
-            f"seen {self.coverage:.1%}, "
-            f"masked {self.masked:.2%} ({self.doubtful:.2%} too dark next to bright pixels), "
+            f"seen {self.coverage:.1%}, masked {self.masked:.2%} "
+            f"({self.doubtful:.2%} too dark next to bright pixels), "
             f"saturated {self.saturated:.2%}",
             f"{self.entries} entries stored, {self.unknown:.2%} of them without a valid photograph",
             f"noise of the first bounce {self.noise_direct:.2%}, of row sums {self.noise_sum:.2%}",
@@ -198,11 +198,14 @@ def _count_entries(scan: BlockStore, shape: tuple[int, ...]) -> _StoredEntries:
     return _StoredEntries(count=count, unknown=unknown, variance=variance)
 
 
-def _relative_noise(variance: np.ndarray, value: np.ndarray, known: np.ndarray) -> float:
-    """Median relative standard deviation of known values; NaN if there are none."""
-    if not known.any():
+def _relative_noise(
+    variance: np.ndarray, value: np.ndarray, known: np.ndarray | bool = True
+) -> float:
+    """Median relative standard deviation of known positive values; NaN if there are none."""
+    is_used = known & (value > 0)
+    if not is_used.any():
         return math.nan
-    return float(np.median(np.sqrt(variance[known]) / value[known]))
+    return float(np.median(np.sqrt(variance[is_used]) / value[is_used]))
 
 
 def _cells_of_pixels(store: BlockStore) -> scipy.sparse.csr_array:
