@@ -23,6 +23,7 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition.rig import as_exposures, as_shot, shot_key
+from ltcl.acquisition.rigs.memory_card import in_order_of_capture
 from ltcl.acquisition.rigs.photographs import (
     PHOTOGRAPH_KINDS,
     PHOTOGRAPH_SUFFIXES,
@@ -179,8 +180,9 @@ class FolderRig:
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in place of those that are missing.
 
-        They are taken in the order of the numbers in their names. Files that were copied before are
-        left out: a memory card need not be emptied. Nothing is copied on an error.
+        They are taken in the order in which they were photographed (`memory_card`). Files that were
+        copied before are left out: a memory card need not be emptied. Nothing is copied on an
+        error.
 
         Parameters
         ----------
@@ -190,13 +192,13 @@ class FolderRig:
         Raises
         ------
         InputError
-            The number of files is another.
+            The number of files is another, or their order is not known.
         FileError
             One is not a photograph.
         """
         numbers = self.missing()
         unique_files = dict.fromkeys(map(input_file, files))
-        paths = self._new_files(sorted(unique_files, key=_number_order))
+        paths = self._new_files(unique_files)
         if len(paths) != len(numbers):
             missing = f"{len(numbers)} are missing"
             if numbers:
@@ -284,13 +286,14 @@ class FolderRig:
         )
         return PhotographMissing(text, shot.number, shot, len(missing))
 
-    def _new_files(self, files: list[Path]) -> list[Path]:
-        """Files that were not copied before; FileError for one that is not a photograph."""
+    def _new_files(self, files: Iterable[Path]) -> list[Path]:
+        """Files that were not copied before, in order; FileError for one of another kind."""
         copied = [path for paths in self._files.values() for path in paths]
-        new = []
         for path in files:
             if path.suffix.lower() not in PHOTOGRAPH_SUFFIXES:
                 raise FileError(f"{path}: is not a photograph; it must be {PHOTOGRAPH_KINDS}")
+        new = []
+        for path in in_order_of_capture(list(files)):
             twin = _find_equal(path, copied)
             if twin is None:
                 new.append(path)
@@ -318,11 +321,6 @@ def _margins(pixels: int) -> tuple[int, int]:
     """Margins before and after a centred picture."""
     before = pixels // 2
     return before, pixels - before
-
-
-def _number_order(path: Path) -> str:
-    """Key to sort by: numbers in names compare as numbers."""
-    return re.sub("[0-9]+", lambda digits: digits[0].zfill(20), path.name)
 
 
 def _find_equal(path: Path, files: list[Path]) -> Path | None:
