@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 # Share of the linear range that the brightest pixels under white are to reach.
 WHITE_LEVEL = 0.7
+# Share that they may reach where the camera offers no exposure for that.
+MAX_WHITE_LEVEL = 0.9
 # Longest exposure relative to that of white: beyond, a photograph costs more time than its light
 # is worth.
 MAX_EXPOSURE_RATIO = 64.0
@@ -48,6 +50,18 @@ MAX_PROBES = 10
 def offered_exposures(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
     """The exposures of a camera nearest to `seconds`: ascending, each once."""
     return tuple(sorted({nearest(shots.exposures, t) for t in seconds}))
+
+
+def unsaturated_exposure(shots: Shots, seconds: float) -> float:
+    """The exposure of a camera nearest to `seconds`, at which white has `WHITE_LEVEL`.
+
+    If white were saturated there, the next shorter one, if there is any.
+    """
+    longest = seconds * MAX_WHITE_LEVEL / WHITE_LEVEL
+    chosen = nearest(shots.exposures, seconds)
+    if chosen <= longest or shots.exposures is None:
+        return chosen
+    return max((t for t in shots.exposures if t <= longest), default=chosen)
 
 
 def bracket(shortest: float, longest: float, count: int) -> tuple[float, ...]:

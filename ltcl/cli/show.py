@@ -74,8 +74,8 @@ def show(
         Path,
         argument(
             "FOLDER",
-            "A picture, a folder of pictures, the results of 'ltcl compensate', or the folder of an "
-            "acquisition.",
+            "A picture, a folder of pictures, the folder of an acquisition, or the results of "
+            "'ltcl compensate'.",
         ),
     ],
     display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
