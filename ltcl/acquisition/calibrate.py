@@ -33,6 +33,7 @@ from ltcl.acquisition.metering import (
     WHITE_LEVEL,
     bracket,
     brightness,
+    check_full_scale,
     fill_hot_pixels,
     find_white_exposure,
     hot_pixels,
@@ -263,6 +264,8 @@ def measure(
     # 4. Noise and offset of the camera; then photographs can be compared.
     of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
     consistency.check_black(session, of_white_exposure)
+    shown = {photograph.seconds: photograph.image for photograph in bright}
+    check_full_scale(shots, list(shown), list(shown.values()))
     with session.naming_photographs():
         session.camera = _measure_camera(session, dark, bright)
     session.check_agreement()
@@ -350,6 +353,7 @@ def _response_from_ramps(
     if shots.channels == 3:
         _expose_dark_colours(session, ramps, hot, times, exposed)
     images = [_side_by_side(group, hot) for group in exposed]
+    check_full_scale(shots, times, images)
     first = exposed[0][0].number
     subject = f"the response of the camera, photographs {first} to {shots.number}"
     with acquisition_error(subject):
@@ -484,4 +488,5 @@ def _measure_projector(
         if is_grey:
             return projector, None
         full = [channel[-1] for channel in pictures]
+        consistency.check_colours(full, lit, ambient)
         return projector, radiometry.mixing(full, ambient)

@@ -57,6 +57,8 @@ class FolderRig:
         Bits of the pattern files.
     camera_bits : int, optional
         Bits in use in photographs of 16 bits; None for all.
+    white_level : float, optional
+        Code of photographs from which on pixels are saturated; None for the largest code.
     exposures : sequence of float, optional
         Seconds that the camera offers, ascending; None for any.
     projector : (int, int), optional
@@ -96,6 +98,7 @@ class FolderRig:
         *,
         pattern_bits: int = 8,
         camera_bits: int | None = None,
+        white_level: float | None = None,
         exposures: Any = None,
         projector: tuple[int, int] | None = None,
     ) -> None:
@@ -107,6 +110,9 @@ class FolderRig:
         self.bits = camera_bits
         if camera_bits is not None:
             self.bits = checks.count("camera_bits", camera_bits, least=9, most=16)
+        self.white_level = white_level
+        if white_level is not None:
+            checks.number("white_level", white_level, above=0.0)
         self.exposures = as_exposures("exposures", exposures)
         self.number = 0
         self._pattern_bits = checks.one_of("pattern_bits", pattern_bits, (8, 16))
@@ -160,7 +166,9 @@ class FolderRig:
         self._save()
         path = self._find_photograph(shot)
         name = f"photograph {shot.number} ({path.name})"
-        image = read_photograph(name, path, self.channels, shot.seconds)
+        image = read_photograph(
+            name, path, self.channels, shot.seconds, white_level=self.white_level
+        )
         self._photographed[key] += 1
         self.number = shot.number
         return image
@@ -221,6 +229,7 @@ class FolderRig:
             "projector": self._projector,
             "pattern_bits": self._pattern_bits,
             "camera_bits": self.bits,
+            "white_level": self.white_level,
             "exposures": self.exposures,
             "channels": self.channels,
         }

@@ -41,7 +41,13 @@ EXPOSURE_TIME_TAG = 33434
 EXPOSURE_TOLERANCE = 0.05
 
 
-def read_photograph(name: str, path: Path, channels: int, seconds: float | None) -> np.ndarray:
+def read_photograph(
+    name: str,
+    path: Path,
+    channels: int,
+    seconds: float | None,
+    white_level: float | None = None,
+) -> np.ndarray:
     """Codes of a file, for a rig of 1 or 3 channels.
 
     One channel of a colour photograph is the green one: a mean of channels with different response
@@ -52,10 +58,11 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     if seconds is not None:
         _check_exposure(name, exposure, seconds)
     is_float = codes.dtype.kind == "f"
-    if is_float and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
+    is_unscaled = is_float and white_level is None
+    if is_unscaled and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
         raise AcquisitionError(
             f"{name} reaches {codes.max():.4g}; full scale of float photographs is 1: "
-            "divide all by the largest value of the camera"
+            "divide all by the largest value of the camera, or give it as white_level"
         )
     if codes.ndim == 3 and channels == 1:
         return np.ascontiguousarray(codes[..., 1])
