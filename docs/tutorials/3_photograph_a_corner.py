@@ -147,6 +147,7 @@ T = scan(folder, photographer)
 names = sorted((folder / "photographs").iterdir())
 shown = {"white": 1, "stripes, to find places": 20, "one pixel, short": 60, "one pixel, long": 61}
 figure = pictures({name: ltcl.images.read(names[k]) for name, k in shown.items()})
+figure
 
 # %%
 # What came of it
@@ -180,6 +181,7 @@ figure = pictures(
         "the pattern of ltcl projected": after,
     }
 )
+figure
 
 # %%
 # Every mistake, and what ltcl says then

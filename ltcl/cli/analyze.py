@@ -52,8 +52,10 @@ def analyze(
         facts = analysis.analyze(T, rtol=rtol)
         analyses[file.name] = facts
         verdicts[str(file)] = facts.verdict
-        entries.append(AnalyzedFile(file=file, device=T.device.name, **facts.to_dict()))
-        for colour, channel in zip(COLOURS[T.channels], facts.channels, strict=True):
+        entry = AnalyzedFile(file=file, device=T.device.name, **facts.to_dict())
+        entries.append(entry)
+        colours = COLOURS[T.channels]
+        for colour, channel in zip(colours, facts.channels, strict=True):
             label = {"file": str(file), "channel": colour}
             spectra.append({**label, **_spectrum(channel)})
             forecasts.append({**label, **channel.products})

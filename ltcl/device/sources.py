@@ -40,9 +40,9 @@ def load(name: str) -> str:
     return _expand(root / f"{name}.cl", root, set())
 
 
-def _expand(path: Path, root: Path, seen: set[Path]) -> str:
+def _expand(path: Path, root: Path, included_files: set[Path]) -> str:
     """Text of a file with each include in place of its line, at its first occurrence only."""
-    seen.add(path)
+    included_files.add(path)
     name = path.relative_to(root).as_posix()
     lines = [f'#line 1 "{name}"']
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
@@ -51,8 +51,8 @@ def _expand(path: Path, root: Path, seen: set[Path]) -> str:
             lines.append(line)
             continue
         included = path.parent / include[1]
-        if included not in seen:
-            lines.append(_expand(included, root, seen))
+        if included not in included_files:
+            lines.append(_expand(included, root, included_files))
         lines.append(f'#line {number + 1} "{name}"')
     return "\n".join(lines)
 

@@ -165,9 +165,13 @@ def _analyze_channel(
     rho = theory.spectral_radius(S.R, norms=norms)
     bounds = theory.free_bounds(S)
     surveyed = survey(S)
-    spectrum = surveyed.spectrum if surveyed.in_an_interval else None
+    spectrum = None
+    if surveyed.in_an_interval:
+        spectrum = surveyed.spectrum
     forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, surveyed.self_adjoint)
-    largest_radius = rho.upper if math.isfinite(rho.upper) else rho.value
+    largest_radius = rho.upper
+    if not math.isfinite(rho.upper):
+        largest_radius = rho.value
     # rho(R) <= m / (1 - m), eq. 14.
     m = largest_radius / (1.0 + largest_radius)
     lit = F[F > 0]

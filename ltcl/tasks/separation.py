@@ -27,7 +27,7 @@ from ltcl.operators import Operator
 from ltcl.solvers import Inverse, Solution, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.tasks.plausibility import bounce_warning, check_direct_light
-from ltcl.tasks.requirements import check_inverse, default_rtol, error_note, resolve_reference
+from ltcl.tasks.requirements import check_exact, check_inverse, default_rtol, error_note
 from ltcl.transport import frames as layout
 from ltcl.transport.transport import Transport, check_transport
 from ltcl.transport.uncertainty import SeparationStd, separation_std
@@ -162,7 +162,12 @@ def separate(
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     values = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * values * (bounces + 1))
-    reference, judging_systems = resolve_reference(T, exact)
+    reference = T
+    judging_systems: Sequence[Operator] = ()
+    if exact is not None:
+        check_exact(T, exact)
+        reference = exact
+        judging_systems = exact.systems
     if inverse is not None:
         _check_inverse_options(T, inverse, rtol, exact, method, options)
     if rtol is None:
@@ -215,7 +220,7 @@ class BounceSolver:
     """The solves of bounces, b_k = S^-1 l^(k), of all channels."""
 
     T: Transport
-    exact: Sequence[Operator | None]
+    exact: Sequence[Operator]
     inverse: Inverse | None
     method: str
     rtol: float

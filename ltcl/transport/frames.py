@@ -112,7 +112,8 @@ def unpack(
 
 def _warn_of_codes(name: str, array: np.ndarray) -> None:
     """Warn of integers above 1, which are codes of a file rather than light."""
-    if array.dtype.kind not in "iu" or array.size == 0 or array.max() <= 1:
+    is_integer = array.dtype.kind in "iu"
+    if not is_integer or array.size == 0 or array.max() <= 1:
         return
     white = 255
     if array.dtype in (np.uint8, np.uint16):
@@ -124,14 +125,15 @@ def _find_layout(
     name: str, array: np.ndarray, grid: tuple[int, int], channels: int
 ) -> PictureLayout:
     """The layout of the first shape that fits: flat, colour, grey; refused if there is none."""
-    is_colour_result = channels == 3
+    colour_grid = (*grid, 3)
+    is_colour_result = channels == 3 or array.shape[-3:] == colour_grid
     if array.shape == (grid[0] * grid[1],):
         return PictureLayout(True, None, is_colour_result)
-    for size, is_colour in (((*grid, 3), True), (grid, False)):
+    for size in (colour_grid, grid):
         if array.shape == size:
-            return PictureLayout(False, None, is_colour or is_colour_result)
+            return PictureLayout(False, None, is_colour_result)
         if array.shape[1:] == size and len(array):
-            return PictureLayout(False, len(array), is_colour or is_colour_result)
+            return PictureLayout(False, len(array), is_colour_result)
     allowed = f"{grid}, {(*grid, 3)} or frames of these"
     raise InputError(f"{name} has shape {array.shape}; it must be {allowed}")
 

@@ -11,6 +11,7 @@ The host keeps T as it was given. S and T are uploaded at their first use.
 from __future__ import annotations
 
 import logging
+import math
 import weakref
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -507,16 +508,16 @@ class Transport:
 
     def to_numpy(self) -> np.ndarray:
         """T on the host, dense, without `mixing`: (M, N), (3, M, N), or (3, 3, M, N) of blocks."""
-        M, N = self.shape
-        count = self.channels if self.blocks is None else 9
-        checks.fits_host("T as an array", 8 * count * M * N)
+        matrices = list(self.matrices)
+        leading: tuple[int, ...] = (3,)
         if self.blocks is not None:
-            rows = []
-            for row in self.blocks:
-                rows.append([self._to_dense(T) for T in row])
-            return np.array(rows)
-        dense = np.array([self._to_dense(T) for T in self.matrices])
-        return dense[0] if self.channels == 1 else dense
+            matrices = [block for row in self.blocks for block in row]
+            leading = (3, 3)
+        elif self.channels == 1:
+            leading = ()
+        checks.fits_host("T as an array", 8 * len(matrices) * math.prod(self.shape))
+        dense = np.array([self._to_dense(matrix) for matrix in matrices])
+        return dense.reshape(*leading, *self.shape)
 
     def _to_dense(self, matrix: Any) -> np.ndarray:
         if hasattr(matrix, "tocsr"):

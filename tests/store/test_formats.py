@@ -414,6 +414,6 @@ def test_what_holds_no_transport_is_refused(
 
 def test_without_h5py_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    with pytest.raises(FileError, match=r"T\.h5: \.h5 files need h5py; pip install 'ltcl\[hdf5\]'"):
+    with pytest.raises(FileError, match=r"T\.h5: .*h5py.*ltcl\[hdf5\]"):
         formats.write(tmp_path / "T.h5", StoreRecord((dense(),), (3, 4)))
     assert not list(tmp_path.iterdir())

@@ -276,7 +276,7 @@ def _bring_within_bounds(request: CompensationRequest, start: StartingLight) -> 
     """Step 3: the light within the bounds that comes nearest to the target, or the clamped one."""
     problem = request.problem
     limits = problem.limits
-    frames = request.shape.frames or 1
+    frames = request.shape.frame_count
     light: Columns = []
     solves: list[Bounded] = []
     clipped = np.zeros(frames)

@@ -175,13 +175,16 @@ class CompensationProblem:
         free_scale = np.where(limits.masked, 0.0, scale)[:, None]
         lower = (free_scale * limits.low).astype(np.float32)
         upper = (free_scale * limits.high).astype(np.float32)
+        weights = None
+        if self.weights is not None:
+            weights = self.weights[index]
         solution = minimise(
             A,
             self.light_to_add(gain)[index],
             lower[:, 0],
             upper[:, 0],
             scale[:, None] * start,
-            weights=None if self.weights is None else self.weights[index],
+            weights=weights,
             rtol=settings.rtol,
             atol=settings.atol,
             maxiter=settings.maxiter,

@@ -14,9 +14,9 @@ class Damage:
     ----------
     name : str
     threshold : float
-        The damage is named if the number is larger.
-    compensation_limit, bounces_limit : float
-        Larger numbers spoil compensation, or bounces.
+        The damage is named, and spoils compensation and bounces, if the number is larger.
+    compensation_limit, bounces_limit : float, optional
+        Limits of their own for what the damage spoils.
     cause, advice : str
         Texts, whose fields are {p} the number in percent, {n} the number, {where} a place in the
         picture, {more} a number of exposures, {which} the bounces that are uncertain.
@@ -24,10 +24,22 @@ class Damage:
 
     name: str
     threshold: float
-    compensation_limit: float
-    bounces_limit: float
     cause: str
     advice: str
+    compensation_limit: float | None = None
+    bounces_limit: float | None = None
+
+    def spoils_compensation(self, value: float) -> bool:
+        """True if the number spoils compensation."""
+        if self.compensation_limit is None:
+            return value > self.threshold
+        return value > self.compensation_limit
+
+    def spoils_bounces(self, value: float) -> bool:
+        """True if the number spoils bounces."""
+        if self.bounces_limit is None:
+            return value > self.threshold
+        return value > self.bounces_limit
 
 
 # Limit of a use that a damage does not spoil. Only a T that is noise alone exceeds it.
@@ -38,80 +50,60 @@ DAMAGES = (
     Damage(
         name="other_grid",
         threshold=0.0,
-        compensation_limit=0.0,
-        bounces_limit=0.0,
         cause="T fits a grid of {where} pixels better",
         advice="give --grid {where}",
     ),
     Damage(
         name="exchanged",
         threshold=0.0,
-        compensation_limit=0.0,
-        bounces_limit=0.0,
         cause="colour channels look exchanged, {where}",
         advice="put them in one order",
     ),
     Damage(
         name="shifted",
         threshold=0.2,
-        compensation_limit=0.2,
-        bounces_limit=0.2,
         cause="{p} of pixels are brightest {where} away",
         advice="align camera and projector",
     ),
     Damage(
         name="hot_rows",
         threshold=0.0,
-        compensation_limit=0.0,
-        bounces_limit=0.0,
         cause="{n} hot camera pixel(s){where} see all patterns alike",
         advice="mask or replace them",
     ),
     Damage(
         name="saturated",
         threshold=2.0,
-        compensation_limit=2.0,
-        bounces_limit=2.0,
         cause="{n} entries of T{where} saturate at one value",
         advice="take shorter exposures, too",
     ),
     Damage(
         name="saturation",
         threshold=0.01,
-        compensation_limit=0.01,
-        bounces_limit=0.01,
         cause="{p} of the camera saturates",
         advice="take shorter exposures, too",
     ),
     Damage(
         name="sum_deviation",
         threshold=0.03,
-        compensation_limit=0.03,
-        bounces_limit=0.03,
         cause="row sums deviate by {p} from white",
         advice="warm up, and scan again",
     ),
     Damage(
         name="ambient",
         threshold=0.05,
-        compensation_limit=0.05,
-        bounces_limit=0.05,
         cause="{p} of a bounce is ambient light left in T",
         advice="subtract black",
     ),
     Damage(
         name="offset",
         threshold=0.02,
-        compensation_limit=0.02,
-        bounces_limit=0.02,
         cause="T has a negative offset, {p} of its mean light",
         advice="subtract less black",
     ),
     Damage(
         name="flicker",
         threshold=0.02,
-        compensation_limit=0.02,
-        bounces_limit=0.02,
         cause="the light drifted by {p} from column to column",
         advice="scan again",
     ),
@@ -119,15 +111,12 @@ DAMAGES = (
         name="outliers",
         threshold=0.0,
         compensation_limit=0.02,
-        bounces_limit=0.0,
         cause="outliers{where} change pictures by {p}",
         advice="measure these pixels again",
     ),
     Damage(
         name="bounce_highest",
         threshold=1.0,
-        compensation_limit=1.0,
-        bounces_limit=1.0,
         cause="pixels return {p} of their light",
         advice="check black level and exposures",
     ),
@@ -135,14 +124,12 @@ DAMAGES = (
         name="irreciprocal",
         threshold=0.1,
         compensation_limit=NOISE_ALONE,
-        bounces_limit=0.1,
         cause="T is not reciprocal to {p}, as of gloss",
         advice="bounces are approximate",
     ),
     Damage(
         name="pictures",
         threshold=0.02,
-        compensation_limit=0.02,
         bounces_limit=NOISE_ALONE,
         cause="pictures are uncertain to {p} because of noise{where}",
         advice="{more}",
@@ -151,7 +138,6 @@ DAMAGES = (
         name="bounces",
         threshold=0.05,
         compensation_limit=NOISE_ALONE,
-        bounces_limit=0.05,
         cause="{which} uncertain to {p} because of noise{where}",
         advice="{more}",
     ),
@@ -159,7 +145,6 @@ DAMAGES = (
         name="negative_bounce",
         threshold=0.005,
         compensation_limit=NOISE_ALONE,
-        bounces_limit=0.005,
         cause="{p} of a bounce is negative, as of gloss",
         advice="bounces are rough",
     ),
@@ -167,7 +152,6 @@ DAMAGES = (
         name="no_bounces",
         threshold=0.0,
         compensation_limit=NOISE_ALONE,
-        bounces_limit=0.0,
         cause="bounces need one grid for camera and projector",
         advice="acquire T so",
     ),

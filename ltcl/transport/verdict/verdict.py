@@ -120,7 +120,9 @@ def _keep_worst(measure: Measure, numbers: dict[str, float], places: dict[str, s
             f"{name} is {value:g}: check T and its noise for numbers that are too large"
         )
     if name in numbers:
-        is_better = value >= numbers[name] if name == "gain" else value < numbers[name]
+        is_better = value < numbers[name]
+        if name == "gain":
+            is_better = value >= numbers[name]
         if is_better:
             return
     numbers[name] = float(value)
@@ -208,8 +210,8 @@ def _describe(damage: Damage, value: float, place: str, uncertain: list[int]) ->
     }
     return Finding(
         name=damage.name,
-        spoils_compensation=value > damage.compensation_limit,
-        spoils_bounces=value > damage.bounces_limit,
+        spoils_compensation=damage.spoils_compensation(value),
+        spoils_bounces=damage.spoils_bounces(value),
         cause=damage.cause.format(**facts),
         advice=damage.advice.format(**facts),
     )
