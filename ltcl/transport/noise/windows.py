@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
 
@@ -27,8 +27,14 @@ class Windows:
         Orthonormal pictures that are orthogonal to polynomials below a degree along each axis.
     gain : (windows, k)
         Standard deviation of the detail of weighted noise of 1.
+    grid : (h, w)
+    side, order : int
+        Pixels along a side, and that degree.
     """
 
+    grid: tuple[int, int]
+    side: int
+    order: int
     pixels: np.ndarray
     weight: np.ndarray
     detail: np.ndarray
@@ -57,10 +63,46 @@ class Windows:
         x = corners[:, [1]] + np.arange(sides[1])
         pixels = y[:, :, None] * grid[1] + x[:, None, :]
         pixels = pixels.reshape(len(corners), -1)
-        detail = np.kron(_detail_along(sides[0], order), _detail_along(sides[1], order))
-        weight = 1.0 / texture[pixels]
-        gain = np.sqrt(weight**2 @ detail.T**2)
-        return cls(pixels=pixels, weight=weight, detail=detail, gain=gain)
+        windows = cls(
+            grid=grid,
+            side=side,
+            order=order,
+            pixels=pixels,
+            weight=1.0 / texture[pixels],
+            detail=np.zeros((0, 0)),
+            gain=np.zeros((0, 0)),
+        )
+        return windows.with_order(order)
+
+    def with_order(self, order: int) -> Self:
+        """The same windows with detail of degree `order` or more."""
+        axes = [_detail_along(min(self.side, pixels), order) for pixels in self.grid]
+        detail = np.kron(*axes)
+        gain = np.sqrt(self.weight**2 @ detail.T**2)
+        return replace(self, order=order, detail=detail, gain=gain)
+
+    def finest(self) -> Self:
+        """The same windows with the highest third of all degrees."""
+        return self.with_order(self.side - max(self.side // 3, 1))
+
+
+def distances(camera: Windows, projector: Windows) -> np.ndarray:
+    """Steps between each two windows, (camera windows, projector windows).
+
+    0 or less if they share a pixel; infinite if the grids differ.
+    """
+    if camera.grid != projector.grid:
+        return np.full((len(camera.pixels), len(projector.pixels)), np.inf)
+    y, x = np.divmod(camera.pixels, camera.grid[1])
+    v, u = np.divmod(projector.pixels, projector.grid[1])
+    return np.maximum(_gaps(y, v), _gaps(x, u))
+
+
+def _gaps(y: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Steps from the range of each row of y to that of each row of v; 0 or less if they meet."""
+    above = y.min(axis=1)[:, None] - v.max(axis=1)
+    below = v.min(axis=1) - y.max(axis=1)[:, None]
+    return np.maximum(above, below)
 
 
 def _corners(grid: tuple[int, int], sides: list[int], overlap: bool) -> np.ndarray:
