@@ -43,11 +43,15 @@ class PictureDetail:
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """floor^2 and q on which blocks agree, and the share of them that do."""
+    """floor^2 and q on which blocks agree, the share of them that do, and the spread of all.
+
+    The spread is the median deviation of logarithms.
+    """
 
     floor2: float
     q: float
     share: float
+    spread: float
 
     @property
     def is_trusted(self) -> bool:
@@ -83,7 +87,7 @@ class _Scan:
         self.blocks = blocks
         self.has_factors = has_factors
         self.width = agreement_width(blocks)
-        light = blocks.light[blocks.is_known]
+        light = (blocks.light / blocks.scale)[blocks.is_known]
         dim_count = max(len(light) // 4, MIN_BLOCKS)
         self.dimmest = np.argsort(light)[:dim_count]
         self.ratios = RATIOS / max(float(np.median(light)), MIN_VARIANCE)
@@ -103,7 +107,10 @@ class _Scan:
             direct_q = (first.variance / self._floor2(q) - 1.0) / max(first.light, MIN_VARIANCE)
             if direct_q <= 2.0 * highest:
                 q = float(np.clip(direct_q, lowest, highest))
-        return Agreement(floor2=self._floor2(q), q=q, share=most / total)
+        floor2 = self._floor2(q)
+        deviation = np.abs(self._log_floors(q) - np.log(floor2))
+        spread = float(np.median(deviation))
+        return Agreement(floor2=floor2, q=q, share=most / total, spread=spread)
 
     def _count(self, q: float) -> int:
         """Number of blocks that agree with the dimmest ones on the floor."""
@@ -124,8 +131,7 @@ class _Scan:
 
 def agreement_width(blocks: Blocks) -> float:
     """Width of log v of blocks that agree."""
-    coefficients = len(blocks.camera.detail) * len(blocks.projector.detail)
-    return AGREEMENT_WIDTH / coefficients**0.5
+    return AGREEMENT_WIDTH / blocks.coefficients**0.5
 
 
 def _polish(table: np.ndarray) -> np.ndarray:

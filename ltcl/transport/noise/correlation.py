@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ltcl.transport.noise.blocks import Blocks, detail_variance
+from ltcl.transport.noise.windows import Windows
 
 # Gain from which on errors are shared.
 MIN_GAIN = 1.4
@@ -27,16 +28,17 @@ MAX_FLATNESS = 1.4
 
 @dataclass(frozen=True, kw_only=True)
 class Correlation:
-    """Factors of the variance by errors that pixels share; NaN if light hides them."""
+    """Factors of the variance by errors that pixels of a picture share; NaN if light hides them."""
 
-    camera: float
-    projector: float
+    camera: float = np.nan
+    projector: float = np.nan
 
     @property
     def factor(self) -> float:
         """Factor of the variance, 1 if it is not known."""
-        factors = np.array([self.camera, self.projector])
-        return float(np.prod(factors[np.isfinite(factors)]))
+        if np.isfinite(self.camera):
+            return self.camera
+        return 1.0
 
     @property
     def is_white(self) -> bool:
@@ -47,33 +49,26 @@ class Correlation:
 def find_correlation(blocks: Blocks, is_noise: np.ndarray) -> Correlation:
     """Compare details along one picture and along both, of the blocks that are noise."""
     X = blocks.entries
-    fine_camera = blocks.camera.finest()
-    fine_projector = blocks.projector.finest()
-    along_projector = detail_variance(X, None, fine_projector)
-    along_camera = detail_variance(X, fine_camera, None)
     return Correlation(
-        camera=_gain(
-            along_projector[is_noise],
-            both=detail_variance(X, blocks.camera, fine_projector)[is_noise],
-            coarse=detail_variance(X, None, blocks.projector)[is_noise],
-        ),
-        projector=_gain(
-            along_camera[is_noise],
-            both=detail_variance(X, fine_camera, blocks.projector)[is_noise],
-            coarse=detail_variance(X, blocks.camera, None)[is_noise],
-        ),
+        camera=_gain(X, blocks.projector, blocks.camera, is_noise),
+        projector=_gain(X.transpose(2, 3, 0, 1), blocks.camera, blocks.projector, is_noise.T),
     )
 
 
-def _gain(fine: np.ndarray, both: np.ndarray, coarse: np.ndarray) -> float:
-    """Factor of the variance by `fine` detail along one picture, over that along both."""
-    is_known = (fine > 0.0) & (both > 0.0)
-    if not is_known.any():
-        return float("nan")
-    gain = float(np.median(fine[is_known] / both[is_known]))
-    if gain < MIN_GAIN:
+def _gain(X: np.ndarray, projector: Windows, camera: Windows, is_noise: np.ndarray) -> float:
+    """Variance of fine detail along the projector, over that of detail along the camera, too."""
+    if camera.order < 2 or not is_noise.any():
+        return np.nan
+
+    def typical(camera: Windows | None, projector: Windows) -> float:
+        return float(np.median(detail_variance(X, camera, projector)[is_noise]))
+
+    finest = projector.finest()
+    independent = typical(camera, finest)
+    # Texture is the same for all pixels of a window, and has no detail even of the first degree.
+    if typical(camera.with_order(1), finest) < MIN_GAIN * independent:
         return 1.0
-    flatness = np.median(coarse[is_known] / fine[is_known])
-    if flatness > MAX_FLATNESS:
-        return float("nan")
-    return gain
+    shared = typical(None, finest)
+    if typical(None, projector) > MAX_FLATNESS * shared:
+        return np.nan
+    return shared / independent

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
 from ltcl.errors import InputError
 from ltcl.operators.interreflection import underlying_system
@@ -33,7 +34,14 @@ from ltcl.transport.noise.agreement import (
     PictureDetail,
     find_agreement,
 )
-from ltcl.transport.noise.blocks import ARRAYS, MEDIAN_SQUARE, MIN_VARIANCE, Blocks, read_entries
+from ltcl.transport.noise.blocks import (
+    ARRAYS,
+    MEDIAN_SQUARE,
+    MIN_VARIANCE,
+    BlockReader,
+    Blocks,
+    read_entries,
+)
 from ltcl.transport.noise.correlation import Correlation, find_correlation
 from ltcl.transport.noise.factors import find_factors
 from ltcl.transport.noise.fit import ChannelNoise
@@ -45,9 +53,12 @@ from ltcl.transport.noise.windows import Windows
 BLOCK_WINDOWS = ((6, 2), (4, 2), (3, 1))
 # Side and order of windows of a first bounce, or of another picture.
 PICTURE_WINDOWS = ((4, 2), (4, 3), (6, 4))
-# Share of the variance that is left without texture: below, T is divided by the first bounce.
-TEXTURE_SHARE = 0.5
-MIN_TEXTURE = 0.1
+# Bounds on the variance below this share of others count in their place.
+BETTER_SHARE = 0.5
+# Correlation of detail of the first bounce and of bounced light, at most, without texture.
+MAX_TEXTURE_CORRELATION = 0.3
+# Part of the spread of blocks that factors must leave at most.
+NARROWER_SHARE = 0.95
 
 
 def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[int, int]) -> Noise:
@@ -89,16 +100,13 @@ class _ChannelEstimator:
             rows, columns = map(np.ones, self.T.shape)
             return ChannelNoise(photons=0.0, floor=0.0, rows=rows, columns=columns, is_known=False)
         first: PictureDetail | None = None
-        if self.has_diagonal:
+        if self.has_diagonal and not self._has_texture():
             first = _picture_detail(self.F, self.grid, np.ones(len(self.F)))
-        if first is not None and first.light > 0.0:
-            flat = self._blocks_without_texture(blocks, first.light)
-            if flat is not None:
-                # Its texture hides the noise of the first bounce.
-                blocks = flat
-                first = None
         agreement, rows, columns = self._fit(blocks, first)
-        correlation = self._correlation(blocks.without_factors(rows, columns), agreement)
+        correlation = Correlation()
+        if blocks.is_smooth:
+            is_noise = agreement.explains(blocks.with_factors(rows, columns))
+            correlation = find_correlation(blocks, is_noise)
         q = agreement.q
         floor2 = agreement.floor2 * correlation.factor
         direct = 1.0
@@ -117,27 +125,29 @@ class _ChannelEstimator:
             is_known=not correlation.projector > 1.0,
         )
 
+    def _has_texture(self) -> bool:
+        """True if the first bounce has detail that the picture under white has, too."""
+        white = self.T @ np.ones(len(self.F), np.float32) - self.F
+        side, order = PICTURE_WINDOWS[0]
+        windows = Windows.from_grid(self.grid, side, order, overlap=True)
+        details = [picture[windows.pixels] @ windows.detail.T for picture in (self.F, white)]
+        ranks = [scipy.stats.rankdata(detail) for detail in details]
+        correlation = np.corrcoef(ranks)[0, 1]
+        return bool(correlation > MAX_TEXTURE_CORRELATION)
+
     def _find_blocks(self) -> Blocks | None:
-        """Blocks of the largest windows that enough of them know."""
-        texture = np.ones(max(self.T.shape))
+        """Blocks of the largest windows that enough of them know, by the best kind of detail."""
         for side, order in BLOCK_WINDOWS:
-            blocks = self._read_blocks(side, order, texture)
-            if blocks.far_count() >= MIN_BLOCKS:
-                return blocks
-        return None
-
-    def _read_blocks(self, side: int, order: int, texture: np.ndarray) -> Blocks:
-        camera = Windows.from_grid(self.camera_grid, side, order, texture)
-        projector = Windows.from_grid(self.grid, side, order, texture)
-        return Blocks.read(self.T, camera, projector)
-
-    def _blocks_without_texture(self, blocks: Blocks, median_F: float) -> Blocks | None:
-        """Blocks of T_ij / (F_i F_j), if their bound is much smaller."""
-        texture = np.maximum(self.F / median_F, MIN_TEXTURE)
-        flat = self._read_blocks(blocks.camera.side, blocks.camera.order, texture)
-        limit = TEXTURE_SHARE * np.nanmedian(blocks.variance)
-        if np.nanmedian(flat.variance) < limit:
-            return flat
+            camera = Windows.from_grid(self.camera_grid, side, order)
+            projector = Windows.from_grid(self.grid, side, order)
+            best = None
+            for blocks in BlockReader(self.T, camera, projector).kinds():
+                if blocks.far_count() < MIN_BLOCKS:
+                    continue
+                if best is None or _ratio(blocks, best) < BETTER_SHARE:
+                    best = blocks
+            if best is not None:
+                return best
         return None
 
     def _fit(
@@ -158,16 +168,14 @@ class _ChannelEstimator:
         def read_columns(j: np.ndarray) -> np.ndarray:
             return read_entries(self.T, camera.pixels.ravel(), j).T
 
-        rows = find_factors(read_rows, M, projector, agreement.q)
-        columns = find_factors(read_columns, N, camera, agreement.q)
-        agreement = find_agreement(blocks.without_factors(rows, columns), first)
-        if not agreement.is_trusted:
+        rows = find_factors(read_rows, M, projector, agreement)
+        columns = find_factors(read_columns, N, camera, agreement)
+        with_factors = find_agreement(blocks.with_factors(rows, columns), first)
+        plain = find_agreement(blocks, first)
+        is_better = with_factors.spread < NARROWER_SHARE * plain.spread
+        if not with_factors.is_trusted or not is_better:
             return none
-        return agreement, rows, columns
-
-    def _correlation(self, blocks: Blocks, agreement: Agreement) -> Correlation:
-        """How far neighbouring pixels share the errors of blocks that agree."""
-        return find_correlation(blocks, agreement.explains(blocks))
+        return with_factors, rows, columns
 
     def _neighbours(self, agreement: Agreement, rows: np.ndarray, columns: np.ndarray) -> float:
         """Share of neighbours that errors of a row lack, by the detail of row sums."""
@@ -185,11 +193,20 @@ class _ChannelEstimator:
         return cancellation(sums.variance, M // 8)
 
 
+def _ratio(blocks: Blocks, best: Blocks) -> float:
+    """Median of the bounds of some blocks over those of others."""
+    logs = blocks.log_floors(0.0) - best.log_floors(0.0)
+    is_known = blocks.is_known & best.is_known
+    if np.count_nonzero(is_known) < MIN_BLOCKS:
+        return 1.0
+    return float(np.exp(np.median(logs[is_known])))
+
+
 def _picture_detail(F: np.ndarray, grid: tuple[int, int], variance: np.ndarray) -> PictureDetail:
     """Median of a picture F (N,), and an upper bound on its noise over `variance`."""
     bounds = []
     for side, order in PICTURE_WINDOWS:
-        windows = Windows.from_grid(grid, side, order, np.ones(len(F)), overlap=True)
+        windows = Windows.from_grid(grid, side, order, overlap=True)
         expected = variance[windows.pixels].mean(axis=1)[:, None]
         squares = (F[windows.pixels] @ windows.detail.T) ** 2 / expected
         bounds.append(np.median(squares) / MEDIAN_SQUARE)

@@ -21,12 +21,8 @@ class Windows:
     ----------
     pixels : (windows, p)
         Numbers of the pixels.
-    weight : (windows, p)
-        1 / texture of the pixels.
     detail : (k, p)
         Orthonormal pictures that are orthogonal to polynomials below a degree along each axis.
-    gain : (windows, k)
-        Standard deviation of the detail of weighted noise of 1.
     grid : (h, w)
     side, order : int
         Pixels along a side, and that degree.
@@ -36,9 +32,7 @@ class Windows:
     side: int
     order: int
     pixels: np.ndarray
-    weight: np.ndarray
     detail: np.ndarray
-    gain: np.ndarray
 
     @classmethod
     def from_grid(
@@ -46,7 +40,6 @@ class Windows:
         grid: tuple[int, int],
         side: int,
         order: int,
-        texture: np.ndarray,
         overlap: bool = False,
     ) -> Self:
         """Windows of `side` pixels a side with detail of degree `order` or more.
@@ -68,18 +61,21 @@ class Windows:
             side=side,
             order=order,
             pixels=pixels,
-            weight=1.0 / texture[pixels],
             detail=np.zeros((0, 0)),
-            gain=np.zeros((0, 0)),
         )
         return windows.with_order(order)
 
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Rows and columns of a window."""
+        height, width = self.grid
+        return min(self.side, height), min(self.side, width)
+
     def with_order(self, order: int) -> Self:
         """The same windows with detail of degree `order` or more."""
-        axes = [_detail_along(min(self.side, pixels), order) for pixels in self.grid]
-        detail = np.kron(*axes)
-        gain = np.sqrt(self.weight**2 @ detail.T**2)
-        return replace(self, order=order, detail=detail, gain=gain)
+        rows, columns = self.sides
+        detail = np.kron(_detail_along(rows, order), _detail_along(columns, order))
+        return replace(self, order=order, detail=detail)
 
     def finest(self) -> Self:
         """The same windows with the highest third of all degrees."""
