@@ -27,6 +27,8 @@ RATIOS = np.concatenate([[0.0], np.geomspace(1e-2, 1e4, 31)])
 AGREEMENT_WIDTH = 10.0
 # Share of blocks that agree: from there on, the detail of single rows is noise.
 TRUSTED_SHARE = 0.7
+# Part of the blocks that agree best, above which those that agree without photon noise may be all.
+MAX_CHANCE_SHARE = 0.5
 # Standard deviations of a count, or of a correlation, that may be chance.
 CHANCE_SIGMAS = 2.0
 # Passes that take medians of rows and columns out of a table (Tukey's median polish).
@@ -97,7 +99,8 @@ class _Scan:
         most = self.counts.max()
         total = len(self.blocks.light[self.blocks.is_known])
         likely = self.ratios[self.counts >= most - CHANCE_SIGMAS * most**0.5]
-        if most < TRUSTED_SHARE * total:
+        if most < TRUSTED_SHARE * total and self.counts[0] > MAX_CHANCE_SHARE * most:
+            # Light that is not smooth may look like photon noise.
             likely[0] = 0.0
         lowest = likely[0]
         highest = likely[-1]

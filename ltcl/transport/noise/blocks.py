@@ -37,8 +37,6 @@ MEDIAN_SQUARE = 0.4549
 MIN_VARIANCE = 1e-60
 # Part of the exponent L^2 / v that zeros may have, as both are estimates.
 ZEROS_EXPONENT = 0.5
-# Share of entries of 0 in a block, at most, if differences are to leave them out.
-MAX_ZEROS = 0.2
 # Pixels by which a blurred first bounce may reach beyond its own.
 BLUR_REACH = 2
 # Differences that count as one independent coefficient.
@@ -126,6 +124,8 @@ class BlockReader:
         self.light = np.maximum(self.X.mean(axis=(1, 3)), 0.0)
         self.zeros = np.mean(self.X == 0.0, axis=(1, 3))
         self.distance = distances(camera, projector)
+        self.variance = detail_variance(self.X, camera, projector)
+        self.has_unexplained_zeros = has_unexplained_zeros(self.zeros, self.light, self.variance)
 
     def kinds(self) -> Iterator[Blocks]:
         """Blocks by each kind of detail."""
@@ -136,10 +136,8 @@ class BlockReader:
 
     def smooth(self) -> Blocks:
         """Blocks by detail along all axes."""
-        variance = detail_variance(self.X, self.camera, self.projector)
-        is_known = ~has_unexplained_zeros(self.zeros, self.light, variance)
         coefficients = len(self.camera.detail) * len(self.projector.detail)
-        return self._blocks(self.X, variance, is_known, coefficients)
+        return self._blocks(self.X, self.variance, ~self.has_unexplained_zeros, coefficients)
 
     def flattened(self) -> Blocks:
         """Blocks by differences of T over its row sums."""
@@ -189,7 +187,8 @@ class BlockReader:
         differences = _second_differences(np.where(X == 0.0, np.nan, X), weight, self)
         coefficients = differences.shape[2] // DIFFERENCES_PER_COEFFICIENT
         is_known = np.isfinite(differences).mean(axis=2) > 0.5
-        is_known &= self.zeros <= MAX_ZEROS
+        # Zeros that are noise must not be left out, as the others are then brighter.
+        is_known &= (self.zeros == 0.0) | self.has_unexplained_zeros
         with warnings.catch_warnings():
             # A block without a difference has the median NaN.
             warnings.simplefilter("ignore", RuntimeWarning)

@@ -172,8 +172,7 @@ class _ChannelEstimator:
         columns = find_factors(read_columns, N, camera, agreement)
         with_factors = find_agreement(blocks.with_factors(rows, columns), first)
         plain = find_agreement(blocks, first)
-        is_better = with_factors.spread < NARROWER_SHARE * plain.spread
-        if not with_factors.is_trusted or not is_better:
+        if with_factors.spread > NARROWER_SHARE * plain.spread:
             return none
         return with_factors, rows, columns
 
