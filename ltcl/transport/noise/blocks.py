@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Blocks of T between a window of the camera and one of the projector, and bounds on their noise.
 
-Light is smooth where the scene has no edge, gloss lobe or first bounce, and noise is not. So the
-variance v of detail is an upper bound on that of the entries. There are three kinds of detail d, and
-v = median(d^2) / 0.455:
+Light is smooth where the scene has no edge, gloss lobe or first bounce, and noise is not. So
+v = median(d^2) / 0.455 of detail d is an upper bound on the variance of entries. There are three
+kinds of detail:
 
 - `Windows.detail` along all four axes of a block, orthogonal to smooth light.
 - Second differences along one axis of each picture, of T over its row sums: a texture of the wall
@@ -156,8 +156,10 @@ class BlockReader:
         E[np.isnan(E)] = 0.0
         E[(self.X == 0.0) | (self.X == 0.0).transpose(2, 3, 0, 1)] = 0.0
         blocks = self._blocks_by_differences(E, np.ones((1, 1, 1, 1)))
-        # A window of dead pixels has no difference.
-        middle = np.array([np.median(values[np.isfinite(values)]) if np.isfinite(values).any() else 1.0 for values in d])
+        middle = np.ones(len(d))
+        # A window of dead pixels has no difference, and needs no gauge.
+        has_light = np.isfinite(d).any(axis=1)
+        middle[has_light] = np.nanmedian(d[has_light], axis=1)
         gauge = middle / middle[:, None]
         return replace(
             blocks,
@@ -185,6 +187,9 @@ class BlockReader:
 
     def _blocks_by_differences(self, X: np.ndarray, weight: np.ndarray) -> Blocks:
         differences = _second_differences(np.where(X == 0.0, np.nan, X), weight, self)
+        if differences.shape[2] == 0:
+            # Windows of less than 3 pixels a side have none.
+            differences = np.full((*self.light.shape, 1), np.nan)
         coefficients = differences.shape[2] // DIFFERENCES_PER_COEFFICIENT
         is_known = np.isfinite(differences).mean(axis=2) > 0.5
         # Zeros that are noise must not be left out, as the others are then brighter.

@@ -57,8 +57,8 @@ PICTURE_WINDOWS = ((4, 2), (4, 3), (6, 4))
 BETTER_SHARE = 0.5
 # Correlation of detail of the first bounce and of bounced light, at most, without texture.
 MAX_TEXTURE_CORRELATION = 0.3
-# Part of the spread of blocks that factors must leave at most.
-NARROWER_SHARE = 0.95
+# Factor of the spread of blocks, at most, by factors of rows and columns that are true.
+MAX_WIDENING = 1.1
 
 
 def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[int, int]) -> Noise:
@@ -172,7 +172,7 @@ class _ChannelEstimator:
         columns = find_factors(read_columns, N, camera, agreement)
         with_factors = find_agreement(blocks.with_factors(rows, columns), first)
         plain = find_agreement(blocks, first)
-        if with_factors.spread > NARROWER_SHARE * plain.spread:
+        if with_factors.spread > MAX_WIDENING * plain.spread:
             return none
         return with_factors, rows, columns
 

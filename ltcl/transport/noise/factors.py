@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Factors of the variance of rows, from the detail within each row; those of columns likewise.
 
-Two halves of the windows tell a factor each. As far as they agree over the rows, they are no chance.
+Two halves of the windows tell a factor each. As far as these agree over the rows, they are not
+chance.
 """
 
 from __future__ import annotations
