@@ -107,9 +107,11 @@ class Blocks:
             light = _symmetric_mean(light, self.gauge)
         return replace(self, scale=scale, light=light)
 
-    def far_count(self) -> int:
-        """Number of known blocks that no blurred first bounce reaches."""
-        return int(np.count_nonzero(self.is_known & ~self.is_near))
+    def are_enough(self, least: int) -> bool:
+        """True if so many are known, a third as many of which hold no blurred first bounce."""
+        known = np.count_nonzero(self.is_known)
+        far = np.count_nonzero(self.is_known & ~self.is_near)
+        return known >= least and 3 * far >= least
 
 
 class BlockReader:

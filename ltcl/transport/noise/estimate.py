@@ -142,7 +142,7 @@ class _ChannelEstimator:
             projector = Windows.from_grid(self.grid, side, order)
             best = None
             for blocks in BlockReader(self.T, camera, projector).kinds():
-                if blocks.far_count() < MIN_BLOCKS:
+                if not blocks.are_enough(MIN_BLOCKS):
                     continue
                 if best is None or _ratio(blocks, best) < BETTER_SHARE:
                     best = blocks
