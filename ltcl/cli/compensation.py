@@ -36,7 +36,7 @@ def parse_gain(text: str) -> float | str:
 Gain = Annotated[
     str | None,
     projector_option(
-        "Factor between the picture and what the scene shall show; auto: the "
+        "Factor between the picture and what the scene will show; auto: the "
         "largest within reach. Default: 1; auto if T was measured.",
         parser=parse_gain,
         metavar="FACTOR",
@@ -57,12 +57,15 @@ def target_options(
     clamp: Annotated[
         bool,
         projector_option(
-            "Clamp light beyond that range, instead of the best pattern within it.", "--clamp"
+            "Cut off light beyond that range, instead of finding the best pattern within it.",
+            "--clamp",
         ),
     ] = False,
     background: Annotated[
         Path | None,
-        projector_file("Picture of the light that stays. Default: as measured, else none."),
+        projector_file(
+            "Picture of the light without the projector. Default: as measured, else none."
+        ),
     ] = None,
     calibration: Annotated[
         Path | None,
