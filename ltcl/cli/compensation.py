@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from ltcl.cli import loading, pictures
@@ -116,8 +117,11 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
         settings[name] = _read_camera_picture(context, asked[name], T)
     resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
     notes = [loading.compression_caveat("errors are", T, asked["exact"])]
-    if settings["weights"] is None and T.masked.any():
-        notes.append("masked pixels do not count in errors")
+    if settings["weights"] is None and T.unlit.any():
+        notes.append(
+            f"{np.sum(T.unlit)} camera pixels that the projector does not light do not count "
+            "in errors"
+        )
     if setup is not None:
         notes.append(
             "pattern .png holds the codes of the measured projector; 'ltcl show' shows it there"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.images import resize, to_srgb
 from ltcl.images.pictures import as_picture
 from ltcl.plots.page import (
@@ -40,9 +40,9 @@ SHORT_DASHES = (0, (2, 2))
 
 
 def convergence(
-    solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence"
+    solutions: Mapping[str, Solution] | Solution, rtol: float, title: str = "Convergence"
 ) -> Figure:
-    """Relative residual of several solves of one system against the products they took.
+    """Relative residual of solves of one system, by name, against the products they took.
 
     Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level
     line. InputError if there is nothing to draw, or rtol is outside (0, 1).
@@ -55,6 +55,9 @@ def convergence(
     >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     ['jacobi', 'richardson', 'tolerance']
     """
+    if isinstance(solutions, Solution):
+        solutions = {solutions.method: solutions}
+    _check_named("solutions", solutions, Solution)
     figure = figure_of(900, 560)
     heading(figure, 34, 26, title, 17)
     axes = figure.add_axes((0.09, 0.13, 0.73, 0.72))
@@ -62,8 +65,8 @@ def convergence(
     return figure
 
 
-def analysis(analyses: Mapping[str, Analysis]) -> Figure:
-    """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
+def analysis(analyses: Mapping[str, Analysis] | Analysis) -> Figure:
+    """Bounds on rho(R) of transports by name, per channel, and their forecasts per method.
 
     On the left is the interval that holds rho(R), with the 1 beyond which the paper's series
     diverges; on the right are the products of each method, where there is a forecast. InputError if
@@ -77,8 +80,9 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     >>> [axes.get_title("left") for axes in figure.axes]
     ['spectral radius of R', 'products to 1 %']
     """
-    if not analyses:
-        raise InputError("analyses is empty; there must be at least one analysis to draw")
+    if isinstance(analyses, Analysis):
+        analyses = {"T": analyses}
+    _check_named("analyses", analyses, Analysis)
     channels = _named_channels(analyses)
     first_analysis = next(iter(analyses.values()))
     figure = figure_of(1300, 330 + 46 * len(channels))
@@ -91,6 +95,22 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     _draw_radii(left, channels)
     _draw_products(right, list(channels.values()))
     return figure
+
+
+def _check_named(argument: str, results: Any, kind: type) -> None:
+    """Refuse all but results of one kind by name, at least one of them."""
+    if not isinstance(results, Mapping):
+        raise InputTypeError(
+            f"{argument} is a {type(results).__name__}; it must be a {kind.__name__}, or a "
+            "dictionary of them by name"
+        )
+    for name, result in results.items():
+        if not isinstance(result, kind):
+            raise InputTypeError(
+                f"{argument}[{name!r}] is a {type(result).__name__}; it must be a {kind.__name__}"
+            )
+    if not results:
+        raise InputError(f"{argument} is empty; there must be at least one to draw")
 
 
 def _named_channels(analyses: Mapping[str, Analysis]) -> dict[str, ChannelAnalysis]:
@@ -166,6 +186,12 @@ def pictures(
     >>> [text.get_text() for text in figure.texts if text.get_text()]
     ['A corner', 'seen', 'too bright', 'three times']
     """
+    for number, row in enumerate(rows):
+        if not isinstance(row, Mapping):
+            raise InputTypeError(
+                f"rows[{number}] is a {type(row).__name__}; it must be a dictionary of pictures "
+                "by name"
+            )
     rows = tuple(row for row in rows if row)
     width = checks.count("width", width, least=100)
     if not rows:
@@ -289,8 +315,6 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     checks.number("rtol", rtol, above=0.0, below=1.0)
-    if not solutions:
-        raise InputError("solutions is empty; there must be at least one to draw")
     _dress(axes, "products with S")
     axes.set_ylabel("relative residual", color=FAINT, fontsize=12, labelpad=6)
     most_products = max(1, *(solution.products for solution in solutions.values()))

@@ -35,12 +35,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 def figure_of(width: int, height: int) -> Figure:
     """An empty page of so many pixels, drawn by Agg."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from ltcl.plots.shown_figure import ShownFigure
 
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
-    FigureCanvasAgg(figure)
-    return figure
+    return ShownFigure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
 
 
 def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:

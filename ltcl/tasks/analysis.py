@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -89,19 +90,16 @@ class Analysis:
         return f"<ltcl Analysis grid {height} x {width}, rho(R) {radii}>"
 
     def _repr_html_(self) -> str:
-        # Imports OpenCV.
-        from ltcl.images.thumbnails import thumbnails
-
-        bars = {}
+        methods = self.channels[0].products
+        head = "".join(f"<th>{name}</th>" for name in methods)
+        rows = []
         for channel in self.channels:
-            names = []
-            products = []
-            for name, count in channel.products.items():
-                if math.isfinite(count):
-                    names.append(f"{name} {count:.0f}")
-                    products.append(count)
-            bars["products: " + ", ".join(names)] = _bar_chart(products)
-        return thumbnails(self, bars)
+            cells = [f"<td>{_count_text(channel.products[name])}</td>" for name in methods]
+            rows.append(f"<tr>{''.join(cells)}</tr>")
+        table = f"<table><tr>{head}</tr>{''.join(rows)}</table>"
+        lines = [str(self), self.verdict.text, f"Products with S to rtol {self.rtol:g}:"]
+        paragraphs = [f"<div>{html.escape(line)}</div>" for line in lines]
+        return "".join([*paragraphs, table])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; infinite or unknown numbers are None."""
@@ -205,8 +203,8 @@ def _known_norms(R: Operator) -> Norms | None:
         return None
 
 
-def _bar_chart(lengths: list[float]) -> np.ndarray:
-    """A picture (4 * bars, 64) of horizontal bars."""
-    bars = np.array(lengths)[:, None]
-    columns = np.linspace(0, bars.max(), 64)
-    return np.repeat(columns <= bars, 4, axis=0)
+def _count_text(products: float) -> str:
+    """A number of products, infinite where a method diverges, NaN where it is unknown."""
+    if math.isfinite(products):
+        return f"{products:.0f}"
+    return "diverges" if products > 0 else "-"

@@ -33,7 +33,7 @@ from ltcl.operators import (
 )
 from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
-from ltcl.transport import diagnostics, stored
+from ltcl.transport import coverage, diagnostics, stored
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import (
     DARK_THRESHOLD,
@@ -468,6 +468,18 @@ class Transport:
         if not self.is_compressed:
             return 0.0
         return max(S.error_bound for S in self.systems)
+
+    @cached_property
+    def column_norms(self) -> np.ndarray:
+        """Norms of the columns of `operators`, (systems, N), or (1, 3 N) if they are coupled."""
+        return coverage.column_norms(self)
+
+    @cached_property
+    def unlit(self) -> np.ndarray:
+        """Camera pixels (M,) that no projector pixel lights; `masked` ones of a square T."""
+        if self.is_square:
+            return self.masked
+        return coverage.unlit_pixels(self)
 
     @cached_property
     def operators(self) -> tuple[Operator, ...]:
