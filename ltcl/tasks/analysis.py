@@ -74,7 +74,10 @@ class ChannelAnalysis:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Analysis:
-    """Result of `ltcl.analyze`: an analysis of each colour channel, and the verdict on T."""
+    """Result of `ltcl.analyze`: an analysis of each colour channel, and the verdict on T.
+
+    A T without S, of other camera pixels or of blocks between colours, has no `channels`.
+    """
 
     shape: tuple[int, int]
     grid: tuple[int, int]
@@ -87,19 +90,17 @@ class Analysis:
     def __repr__(self) -> str:
         height, width = self.grid
         radii = ", ".join(f"{channel.spectral_radius:.3g}" for channel in self.channels)
-        return f"<ltcl Analysis grid {height} x {width}, rho(R) {radii}>"
+        return f"<ltcl Analysis grid {height} x {width}, rho(R) {radii or 'unknown'}>"
 
     def _repr_html_(self) -> str:
-        methods = self.channels[0].products
-        head = "".join(f"<th>{name}</th>" for name in methods)
-        rows = []
+        text = ""
+        for line in (str(self), self.verdict.text, f"Products with S to rtol {self.rtol:g}:"):
+            text += f"<div>{html.escape(line)}</div>"
+        rows = ""
         for channel in self.channels:
-            cells = [f"<td>{_count_text(channel.products[name])}</td>" for name in methods]
-            rows.append(f"<tr>{''.join(cells)}</tr>")
-        table = f"<table><tr>{head}</tr>{''.join(rows)}</table>"
-        lines = [str(self), self.verdict.text, f"Products with S to rtol {self.rtol:g}:"]
-        paragraphs = [f"<div>{html.escape(line)}</div>" for line in lines]
-        return "".join([*paragraphs, table])
+            for name, products in channel.products.items():
+                rows += f"<tr><td>{name}</td><td>{_count_text(products)}</td></tr>"
+        return f"{text}<table>{rows}</table>"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; infinite or unknown numbers are None."""
@@ -112,7 +113,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     Parameters
     ----------
     T : Transport
-        A square transport.
+        Any transport; one without S gets the verdict alone.
     rtol : float
         Tolerance of the forecast, from 1.2e-7 to 1.
 
@@ -123,7 +124,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     Raises
     ------
     InputError
-        A T that is not square, or a tolerance out of range.
+        A T that is no Transport, or a tolerance out of range.
 
     Examples
     --------
@@ -132,19 +133,14 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     >>> 0.5 < a.channels[0].spectral_radius < 0.7  # m / (1 - m) = 2/3, less what diag(T) took along
     True
     """
-    check_transport(T)
+    check_transport(T, square=False)
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     channels = []
-    for matrix, F, S, negative in zip(
-        T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True
-    ):
-        channels.append(_analyze_channel(matrix, F, S, negative, rtol))
-    highest_bounces = [channel.energy.bounce_highest for channel in channels]
-    judged = verdict(
-        T,
-        negative_bounce=np.fmax.reduce(T.negative_bounces),
-        bounce_highest=np.fmax.reduce(highest_bounces),
-    )
+    if T.is_square:
+        for matrix, F, S, negative in zip(
+            T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True
+        ):
+            channels.append(_analyze_channel(matrix, F, S, negative, rtol))
     return Analysis(
         shape=T.shape,
         grid=T.grid,
@@ -152,7 +148,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
         nbytes=T.nbytes,
         masked=int(T.masked.sum()),
         channels=tuple(channels),
-        verdict=judged,
+        verdict=verdict(T),
     )
 
 

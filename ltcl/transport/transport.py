@@ -449,7 +449,9 @@ class Transport:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all S on the device; a pattern or a basis that channels share counts once."""
+        """Bytes of all S on the device, or of T if it has no S; shared patterns count once."""
+        if not self.is_square:
+            return nbytes(self.operators)
         return nbytes(self.systems)
 
     @property

@@ -163,6 +163,18 @@ class VerdictNumbers(Report):
     bounce_1: Annotated[float | None, "Relative error of bounce 1 under white, by noise."] = None
     bounce_2: Annotated[float | None, "Relative error of bounce 2 under white, by noise."] = None
     bounce_3: Annotated[float | None, "Relative error of bounce 3 under white, by noise."] = None
+    spread: Annotated[
+        float | None,
+        "Largest value of `spread_1` to `spread_3` if the first bounce is diag(T), else 0. "
+        "Good up to 0.05.",
+    ] = None
+    spread_1: Annotated[
+        float | None,
+        "Relative difference of bounce 1 under white by the first bounces diag(T) and "
+        "1 / diag(T^-1).",
+    ] = None
+    spread_2: Annotated[float | None, "The same for bounce 2."] = None
+    spread_3: Annotated[float | None, "The same for bounce 3."] = None
     other_grid: Annotated[float | None, "1 if T fits another grid better. Good: 0."] = None
     exchanged: Annotated[
         float | None, "Number of colour channels that look exchanged. Good: 0."
@@ -177,7 +189,16 @@ class VerdictNumbers(Report):
         float | None, "Number of camera pixels with one value in all patterns. Good: 0."
     ] = None
     saturated: Annotated[
-        float | None, "Number of entries of T equal to its largest direct light. Good up to 2."
+        float | None, "Number of entries of T equal to its brightest one. Good up to 2."
+    ] = None
+    quantized: Annotated[
+        float | None,
+        "Step of the codes of T over its mean indirect light; 0 without codes. Good up to 0.2.",
+    ] = None
+    row_offset: Annotated[
+        float | None,
+        "Offset of the camera's pixels, as of a dark frame, over the light under white. "
+        "Good up to 0.015.",
     ] = None
     ambient: Annotated[
         float | None,
@@ -199,16 +220,16 @@ class VerdictNumbers(Report):
         float | None, "`reciprocity_defect` beyond the part due to noise. Good up to 0.1."
     ] = None
     dark: Annotated[
-        float | None, "Share of the projector's pixels that are masked. Good up to 0.05."
+        float | None, "Share of the projector's pixels that light nothing. Good up to 0.05."
     ] = None
     gain: Annotated[
         float | None, "Brightness of a plain picture within reach, over the median under white."
     ] = None
     negative_bounce: Annotated[
-        float | None, "Largest `negative_bounce` of `channels` in `ltcl analyze`. Good up to 0.005."
+        float | None, "Share of light that one bounce takes away. Good up to 0.005."
     ] = None
     bounce_highest: Annotated[
-        float | None, "Largest `bounce_highest` of `channels` in `ltcl analyze`. Good up to 1."
+        float | None, "Share of light that a bounce returns at 98 % of pixels. Good up to 1."
     ] = None
     sum_deviation: Annotated[
         float | None, "`sum_deviation` of `ltcl acquire report`. Good up to 0.03."

@@ -64,13 +64,13 @@ class _RowPairs:
         self.bin_starts = np.arange(0, n, bin_size)
 
     def difference_below(self, width: int) -> float:
-        """Mean difference of rows one row of the grid apart; of random rows for a single row."""
+        """Median difference of rows one row of the grid apart; of random rows for a single row."""
         i = self.pixels
         if 2 * width <= self.n:
             j = np.where(i + width < self.n, i + width, i - width)
         else:
             j = self.random.permutation(self.n)[: len(i)]
-        return float(self._difference(i, j).mean())
+        return float(np.median(self._difference(i, j)))
 
     def jump_at_ends(self, width: int) -> bool:
         """True if rows differ more over the ends of a width than within."""

@@ -19,7 +19,8 @@ class Damage:
         Limits of their own for what the damage spoils.
     cause, advice : str
         Texts, whose fields are {p} the number in percent, {n} the number, {where} a place in the
-        picture, {more} a number of exposures, {which} the bounces that are uncertain.
+        picture, {more} a number of exposures, {noisy} and {spread} the bounces that are uncertain
+        by noise, or by the choice of the first bounce. A guess at a cause is called "perhaps".
     """
 
     name: str
@@ -56,7 +57,7 @@ DAMAGES = (
     Damage(
         name="exchanged",
         threshold=0.0,
-        cause="colour channels look exchanged, {where}",
+        cause="colour channels are perhaps exchanged, {where}",
         advice="put them in one order",
     ),
     Damage(
@@ -78,6 +79,12 @@ DAMAGES = (
         advice="take shorter exposures, too",
     ),
     Damage(
+        name="quantized",
+        threshold=0.2,
+        cause="T is stored in steps of {p} of its mean indirect light, and less is lost",
+        advice="store T as floats",
+    ),
+    Damage(
         name="saturation",
         threshold=0.01,
         cause="{p} of the camera saturates",
@@ -92,8 +99,15 @@ DAMAGES = (
     Damage(
         name="ambient",
         threshold=0.05,
-        cause="{p} of a bounce is ambient light left in T",
+        cause="{p} of a bounce is perhaps ambient light left in T",
         advice="subtract black",
+    ),
+    Damage(
+        name="row_offset",
+        threshold=0.015,
+        cause="camera pixels have offsets, {p} under white, perhaps errors of the dark frame",
+        advice="measure black again, and subtract it",
+        compensation_limit=0.02,
     ),
     Damage(
         name="offset",
@@ -104,7 +118,7 @@ DAMAGES = (
     Damage(
         name="flicker",
         threshold=0.02,
-        cause="the light drifted by {p} from column to column",
+        cause="the light of projector pixels differs by {p}, and perhaps drifted in the scan",
         advice="scan again",
     ),
     Damage(
@@ -124,7 +138,7 @@ DAMAGES = (
         name="irreciprocal",
         threshold=0.1,
         compensation_limit=NOISE_ALONE,
-        cause="T is not reciprocal to {p}, as of gloss",
+        cause="T is not reciprocal to {p}, perhaps by gloss",
         advice="bounces are approximate",
     ),
     Damage(
@@ -138,14 +152,21 @@ DAMAGES = (
         name="bounces",
         threshold=0.05,
         compensation_limit=NOISE_ALONE,
-        cause="{which} uncertain to {p} because of noise{where}",
+        cause="{noisy} uncertain to {p} because of noise{where}",
         advice="{more}",
+    ),
+    Damage(
+        name="spread",
+        threshold=0.05,
+        compensation_limit=NOISE_ALONE,
+        cause="the first bounce, diag(T) or 1 / diag(T^-1), makes a difference of {p} in {spread}",
+        advice="give first_bounce='exact'",
     ),
     Damage(
         name="negative_bounce",
         threshold=0.005,
         compensation_limit=NOISE_ALONE,
-        cause="{p} of a bounce is negative, as of gloss",
+        cause="{p} of a bounce is negative, perhaps by gloss",
         advice="bounces are rough",
     ),
     Damage(
@@ -153,7 +174,7 @@ DAMAGES = (
         threshold=0.0,
         compensation_limit=NOISE_ALONE,
         cause="bounces need one grid for camera and projector",
-        advice="acquire T so",
+        advice="bring T onto it by 'ltcl align', or ltcl.align(T)",
     ),
     Damage(
         name="dark",
@@ -164,7 +185,8 @@ DAMAGES = (
         advice="expose them longer",
     ),
 )
-# Relative standard deviation of a bounce that makes it uncertain.
+# Relative deviation of a bounce, by noise or by the choice of the first bounce, that makes it
+# uncertain.
 BOUNCES_THRESHOLD = 0.05
 # Damages that cause most others, which are then not named.
 OF_GEOMETRY = frozenset({"other_grid", "exchanged", "shifted"})
