@@ -175,14 +175,13 @@ def judge(record: StoreRecord | CompressedRecord, facts: FileFacts) -> Verdict:
         missing += " --grid HxW"
     if not is_square and not record.camera_grid:
         missing += " --camera-grid HxW"
-    tool = f"analyze {facts.file}" if is_square else f"convert {facts.file} OUT.npz"
     reason = ""
     if missing:
         reason = "the file does not contain the grid"
-    elif is_square and facts.nbytes > MAX_JUDGED_BYTES:
+    elif facts.nbytes > MAX_JUDGED_BYTES:
         reason = "T takes more than 256 MiB"
     if reason:
-        return Verdict(f"Unknown: {reason}: run 'ltcl {tool}{missing}'.")
+        return Verdict(f"Unknown: {reason}: run 'ltcl analyze {facts.file}{missing}'.")
     arguments = {name: value for name, value in vars(record).items() if value is not None}
     matrices = arguments.pop("matrices")
     try:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Light that T carries: norms of its columns, and camera pixels that no projector pixel lights.
 
-A camera pixel is unlit if its light under white, T 1, is not above all of: 0, a thousandth of the
-median one, and 5 standard deviations of its noise. These are of entries, or of an error that the
-whole row has in common, such as that of a dark frame, which shows in pixels below 0. A border of
-the wall beyond the projector's picture is seen so: no pattern changes it.
+A camera pixel is unlit if it has no direct light, an entry that is bright beside those of other
+pixels, and if its light under white, T 1, is not above all of: 0, a thousandth of the median one,
+and 5 standard deviations of its noise. These are of entries, or of an error that the whole row has
+in common, such as that of a dark frame, which shows in pixels below 0. A border of the wall beyond
+the projector's picture is seen so: no pattern changes it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import scipy.sparse
 
 from ltcl.errors import InputError
 from ltcl.operators import as_operator
+from ltcl.transport.first_bounce import ENTRIES
 
 if TYPE_CHECKING:
     from ltcl.transport.transport import Transport
@@ -31,6 +33,8 @@ NOISE_SIGMAS = 5.0
 # Pixels below 0, at least, whose median tells a standard deviation, and that to this median.
 MIN_NEGATIVE_PIXELS = 8
 STD_PER_MEDIAN = 1.483
+# Times the median brightest entry of lit camera pixels: what is brighter is direct light.
+DIRECT_SHARE = 0.2
 # Times the median light of lit camera pixels: what is brighter is lit, whatever the noise.
 LIT_SHARE = 0.5
 
@@ -72,13 +76,14 @@ def _squared_norms_of_rows(rows: scipy.sparse.csr_array) -> np.ndarray:
 
 def unlit_pixels(T: Transport) -> np.ndarray:
     """Camera pixels (M,) that no projector pixel lights."""
-    shape = T.grid if T.channels == 1 else (*T.grid, 3)
-    picture = T @ np.ones(shape, np.float32)
-    white = picture.reshape(T.shape[0], -1).sum(axis=1, dtype=np.float64)
-    if not (white > 0).any():
+    white, brightest = _light_of_rows(T)
+    lit_white = white[white > 0]
+    if lit_white.size == 0:
         return np.zeros(len(white), bool)
-    median = np.median(white[white > 0])
+    median = float(np.median(lit_white))
     least = UNLIT_SHARE * median
+    if brightest is None:
+        return abs(white) <= least
     is_faint = (white > least) & (white < FAINT_SHARE * median)
     if is_faint.any():
         least = np.maximum(least, NOISE_SIGMAS * _noise_without_light(T))
@@ -86,7 +91,35 @@ def unlit_pixels(T: Transport) -> np.ndarray:
     if len(below_zero) >= MIN_NEGATIVE_PIXELS:
         sigma = STD_PER_MEDIAN * np.median(below_zero)
         least = np.maximum(least, NOISE_SIGMAS * sigma)
-    return white <= np.minimum(least, LIT_SHARE * median)
+    has_direct_light = brightest > DIRECT_SHARE * np.median(brightest[white > 0])
+    return (white <= np.minimum(least, LIT_SHARE * median)) & ~has_direct_light
+
+
+def _light_of_rows(T: Transport) -> tuple[np.ndarray, np.ndarray | None]:
+    """The light of each camera pixel under white, and its brightest entry; None if not shown."""
+    matrices = list(T.matrices)
+    if T.blocks is not None:
+        matrices = [block for row in T.blocks for block in row]
+    pattern = np.ones(T.shape[1], np.float32)
+    white = np.sum([matrix @ pattern for matrix in matrices], axis=0, dtype=np.float64)
+    peaks = []
+    for matrix in matrices:
+        if hasattr(matrix, "row_blocks"):
+            blocks = [_brightest(rows) for _, rows in matrix.row_blocks()]
+            peaks.append(np.concatenate(blocks))
+        elif isinstance(matrix, ENTRIES):
+            peaks.append(_brightest(matrix))
+        else:
+            return white, None
+    return white, np.max(peaks, axis=0)
+
+
+def _brightest(rows: Any) -> np.ndarray:
+    """The largest entry of each row, by absolute value."""
+    largest = abs(rows).max(axis=1)
+    if scipy.sparse.issparse(largest):
+        return largest.toarray().ravel()
+    return largest
 
 
 def _noise_without_light(T: Transport) -> Any:

@@ -423,6 +423,17 @@ class Transport:
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
 
     @cached_property
+    def bounce_spread(self) -> tuple[float, ...]:
+        """Relative difference of bounces 1 to 3 under white with diag(T) and 1 / diag(T^-1) as F.
+
+        Values of the worst channel, NaN if no method solves with S; computed once.
+        """
+        spreads = []
+        for T, F, S in zip(self.matrices, self._require_first_bounce(), self.systems, strict=True):
+            spreads.append(diagnostics.bounce_spread_of_system(T, F, S))
+        return tuple(np.max(spreads, axis=0).tolist())
+
+    @cached_property
     def ambient_share(self) -> float:
         """Ambient light left in T, as a share of a bounce; 0 if T shows no entries, or few."""
         has_entries = all(isinstance(T, ENTRIES) for T in self.matrices)

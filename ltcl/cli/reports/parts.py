@@ -193,7 +193,7 @@ class VerdictNumbers(Report):
     ] = None
     quantized: Annotated[
         float | None,
-        "Step of the codes of T over its mean indirect light; 0 without codes. Good up to 0.2.",
+        "Step of the codes of T over its mean indirect light; 0 without codes. Good up to 0.3.",
     ] = None
     row_offset: Annotated[
         float | None,

@@ -118,6 +118,7 @@ class SeparatedPicture(Report):
 
     file: Annotated[Path, "Input file."]
     transport_error: Annotated[float, "Relative error of T itself by compression."]
+    warning: Annotated[str, "What is unknown of these bounces, and signs that T is wrong."]
     parts: Annotated[list[LightPart], "`direct`, `indirect`, `bounce_1`, ... and `rest`."]
 
 

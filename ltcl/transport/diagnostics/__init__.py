@@ -8,6 +8,7 @@ from ltcl.transport.diagnostics.bounce import (
     between_parts,
     negative_bounce,
 )
+from ltcl.transport.diagnostics.choice import bounce_spread_of_system
 from ltcl.transport.diagnostics.energy import Energy, check_energy
 from ltcl.transport.diagnostics.grid import other_grid
 from ltcl.transport.diagnostics.reciprocity import QUICK_ENTRIES, reciprocity_defect
@@ -19,6 +20,7 @@ __all__ = [
     "ambient",
     "ambient_share",
     "between_parts",
+    "bounce_spread_of_system",
     "check_energy",
     "negative_bounce",
     "other_grid",

@@ -21,10 +21,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse
 
+from ltcl.errors import ConvergenceError
+from ltcl.operators import IdentityPlus
+from ltcl.solvers import solve
+
 # Pixels whose m is computed column by column.
 MAX_EXACT_PIXELS = 256
 PROBES = 32
 BOUNCES = 3
+# Solves on the device.
+SOLVE_RTOL = 1e-3
 # m of a T is hardly smaller.
 MIN_INVERSE_DIAGONAL = 0.1
 
@@ -36,6 +42,34 @@ class SolvedSystem(NamedTuple):
     inverse: Callable[[np.ndarray], Any]
     diagonal: np.ndarray
     second_diagonal: np.ndarray | None
+
+
+def bounce_spread_of_system(T: Any, F: np.ndarray, S: IdentityPlus) -> np.ndarray:
+    """`bounce_spread` of T (N, N) with first bounce F and its S on the device; NaN if unsolved."""
+    system = S.as_it_stands()
+
+    def inverse(light: np.ndarray) -> np.ndarray:
+        return solve(system, light, rtol=SOLVE_RTOL).x
+
+    try:
+        return bounce_spread(solved_system(T, F, system.matmat, inverse), F)
+    except ConvergenceError:
+        return np.full(BOUNCES, np.nan)
+
+
+def solved_system(
+    T: Any,
+    F: np.ndarray,
+    product: Callable[[np.ndarray], Any],
+    inverse: Callable[[np.ndarray], Any],
+) -> SolvedSystem:
+    """S = T F^-1 with its diagonals; F (N,) is 0 at masked pixels, where S is the identity."""
+    is_lit = F > 0
+    inverse_F = 1.0 / np.where(is_lit, F, np.inf)
+    diagonal = np.ones(len(F))
+    if hasattr(T, "diagonal"):
+        diagonal = np.where(is_lit, np.asarray(T.diagonal()) * inverse_F, 1.0)
+    return SolvedSystem(product, inverse, diagonal, second_diagonal(T, inverse_F, diagonal))
 
 
 def second_diagonal(T: Any, inverse_F: np.ndarray, diagonal: np.ndarray) -> np.ndarray | None:
@@ -50,20 +84,21 @@ def second_diagonal(T: Any, inverse_F: np.ndarray, diagonal: np.ndarray) -> np.n
     return inverse_F * squares - 2.0 * diagonal + 1.0
 
 
-def bounce_spread(S: SolvedSystem, white: np.ndarray) -> np.ndarray:
+def bounce_spread(S: SolvedSystem, F: np.ndarray) -> np.ndarray:
     """Relative difference of bounces 1 to 3 under white by both choices, (3,).
 
-    `white`, (N,), is 0 at pixels that are masked.
+    The picture under white is S F; F, (N,), is 0 at masked pixels.
 
     Examples
     --------
     >>> matrix = np.array([[1.0, 0.2], [0.2, 1.0]])
-    >>> S = SolvedSystem(None, lambda b: np.linalg.solve(matrix, b), np.ones(2), None)
-    >>> bounce_spread(S, matrix.sum(axis=1)).round(2).tolist()
+    >>> S = SolvedSystem(matrix.dot, lambda b: np.linalg.solve(matrix, b), np.ones(2), None)
+    >>> bounce_spread(S, np.ones(2)).round(2).tolist()
     [0.13, 0.28, 0.4]
     """
     m = np.maximum(_inverse_diagonal(S), MIN_INVERSE_DIAGONAL)
-    is_lit = white != 0
+    is_lit = F > 0
+    white = np.where(is_lit, S.product(F[:, None])[:, 0], 0.0)
     # Both sequences side by side.
     scales = np.stack([1.0 / m, S.diagonal], axis=1)
     remaining = np.repeat(white[:, None], 2, axis=1).astype(np.float64)
@@ -85,13 +120,12 @@ def _inverse_diagonal(S: SolvedSystem) -> np.ndarray:
         return np.diagonal(S.inverse(np.eye(pixels)))
     z = np.random.default_rng(0).choice([-1.0, 1.0], (pixels, PROBES))
     samples = z * S.inverse(z)
-    if S.second_diagonal is None:
-        return samples.mean(axis=1)
     once = S.product(z) - z
-    twice = S.product(once) - once
-    first_control = z * once - (S.diagonal - 1.0)[:, None]
-    second_control = z * twice - S.second_diagonal[:, None]
-    controls = np.stack([first_control.ravel(), second_control.ravel()], axis=1)
+    control_samples = [z * once - (S.diagonal - 1.0)[:, None]]
+    if S.second_diagonal is not None:
+        twice = S.product(once) - once
+        control_samples.append(z * twice - S.second_diagonal[:, None])
+    controls = np.stack([control.ravel() for control in control_samples], axis=1)
     scatter = samples - samples.mean(axis=1, keepdims=True)
     factors, *_ = np.linalg.lstsq(controls, scatter.ravel())
     return (samples - (controls @ factors).reshape(samples.shape)).mean(axis=1)

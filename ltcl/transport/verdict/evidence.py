@@ -17,7 +17,7 @@ import numpy as np
 
 from ltcl.transport import diagnostics
 from ltcl.transport.covariance import channel_matrices
-from ltcl.transport.diagnostics.choice import SolvedSystem, bounce_spread, second_diagonal
+from ltcl.transport.diagnostics.choice import bounce_spread, solved_system
 from ltcl.transport.first_bounce import ENTRIES
 from ltcl.transport.transport import Transport
 from ltcl.transport.uncertainty import bounce_variances
@@ -165,17 +165,11 @@ class Evidence:
 
     def _measure_spread(self, S: HostSystem) -> Iterator[Measure]:
         """The change of bounces by the choice of F; it counts where F is diag(T)."""
-        F = S.F
-        is_lit = F > 0
-        d = np.ones(len(F))
-        if hasattr(S.T, "diagonal"):
-            d = np.where(is_lit, S.T.diagonal() * S.inverse_F, 1.0)
-        squares = second_diagonal(S.T, S.inverse_F, d)
-        system = SolvedSystem(S.matmat, S.solve, d, squares)
-        spread = bounce_spread(system, np.where(is_lit, S.matmat(F[:, None])[:, 0], 0.0))
+        system = solved_system(S.T, S.F, S.matmat, S.solve)
+        spread = bounce_spread(system, S.F)
         for k, value in enumerate(spread.tolist(), 1):
             yield Measure(f"spread_{k}", value)
-        is_diagonal = np.allclose(d, 1.0, rtol=1e-6)
+        is_diagonal = np.allclose(system.diagonal, 1.0, rtol=1e-6)
         yield Measure("spread", spread.max() if is_diagonal else 0.0)
 
     def _relative_error(

@@ -21,7 +21,8 @@ MEASURED_SHARE = 0.9
 CODED_SHARE = 0.05
 # Share of the entries of a row that are equal in a pixel that does not answer to patterns.
 STUCK_SHARE = 0.5
-# Codes of a T, at most: those of 12 bits.
+# Codes of a T, at most those of 12 bits. Fewer than the least may also be those of a plain scene.
+MIN_CODES = 4
 MAX_CODES = 1 << 12
 
 
@@ -44,7 +45,7 @@ def saturated_entries(matrix: Any) -> tuple[int, np.ndarray]:
 
 
 def quantization(matrix: Any) -> float:
-    """Step of the codes of T to its median indirect light; 0 if T has no codes.
+    """Step of the codes of T to its mean indirect light; 0 if T has no codes.
 
     Light below half a step is lost.
     """
@@ -52,7 +53,7 @@ def quantization(matrix: Any) -> float:
     if _different_share(rows) > CODED_SHARE:
         return 0.0
     codes = np.unique(rows)
-    if not 1 < len(codes) <= MAX_CODES:
+    if not MIN_CODES <= len(codes) <= MAX_CODES:
         return 0.0
     steps = np.diff(codes)
     step = float(steps.min())
@@ -61,8 +62,10 @@ def quantization(matrix: Any) -> float:
     if np.max(np.abs(multiples - np.rint(multiples))) > 1e-3 * np.sqrt(len(codes)):
         return 0.0
     without_brightest = rows.sum(axis=1, dtype=np.float64) - rows.max(axis=1)
-    mean_light = float(np.median(without_brightest)) / max(rows.shape[1] - 1, 1)
-    return step / max(mean_light, step * 1e-3)
+    mean_light = float(np.mean(without_brightest)) / max(rows.shape[1] - 1, 1)
+    if mean_light <= 0.0:
+        return 0.0
+    return step / mean_light
 
 
 def _sample_rows(matrix: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -26,8 +26,8 @@ from ltcl.errors import InputError
 from ltcl.transport.transport import Transport, check_transport
 from ltcl.transport.verdict.damages import (
     BOUNCES_THRESHOLD,
+    CAUSING_OTHERS,
     DAMAGES,
-    OF_GEOMETRY,
     OF_SURFACES,
     Damage,
 )
@@ -199,14 +199,13 @@ def _find_damages(
 ) -> list[Finding]:
     """The damages that numbers show, most important first.
 
-    Damages that an earlier one explains are left out: most by one of geometry, those of surfaces by
-    any.
+    Damages that an earlier one explains are left out: those of surfaces by any.
     """
     findings = []
     spoilers: set[str] = set()
     for damage in DAMAGES:
         value = numbers.get(damage.name, 0.0)
-        explanations = spoilers if damage.name in OF_SURFACES else spoilers & OF_GEOMETRY
+        explanations = spoilers if damage.name in OF_SURFACES else spoilers & CAUSING_OTHERS
         if value <= damage.threshold or explanations:
             continue
         finding = _describe(damage, value, places.get(damage.name, ""), uncertain)
