@@ -220,28 +220,13 @@ def task_commands() -> list[str]:
 
 def help_commands() -> list[str]:
     """Ask each command for its help."""
-    commands = [
-        "devices",
-        "doctor",
-        "demo",
-        "simulate",
-        "info",
-        "analyze",
-        "convert",
-        "compress",
-        "invert",
-        "denoise",
-        "compensate",
-        "film",
-        "separate",
-        "relight",
-        "view",
-        "play",
-        "show",
-        "acquire",
-    ]
+    import typer
+
+    from ltcl.cli.main import app
+
+    program: Any = typer.main.get_command(app)
     lines = ["--help", "acquire plan --help", "acquire run --help", "acquire report --help"]
-    return lines + [f"{command} --help" for command in commands]
+    return lines + [f"{command} --help" for command in program.commands]
 
 
 def make_inputs() -> None:

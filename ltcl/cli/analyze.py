@@ -54,9 +54,11 @@ def analyze(
         facts = analysis.analyze(T, rtol=rtol)
         analyses[file.name] = facts
         verdicts[str(file)] = facts.verdict
-        entries.append(AnalyzedFile(file=file, device=T.device.name, **facts.to_dict()))
+        entry = AnalyzedFile(file=file, device=T.device.name, **facts.to_dict())
+        entries.append(entry)
+        colours = COLOURS[T.channels]
         # A T without S has no channels to analyze.
-        for colour, channel in zip(COLOURS[T.channels], facts.channels, strict=False):
+        for colour, channel in zip(colours, facts.channels, strict=False):
             label = {"file": str(file), "channel": colour}
             spectra.append({**label, **_spectrum(channel)})
             forecasts.append({**label, **channel.products})

@@ -59,7 +59,8 @@ def info(
             entries.append(BadFile(file=file, **failure.document()))
             continue
         if F is not None:
-            grid = facts.grid or (1, facts.shape[1])
+            _, pixels = facts.shape
+            grid = (1, pixels) if facts.grid is None else facts.grid
             first_bounces[file.name] = (F, grid)
         verdicts[str(file)] = verdict
         entries.append(GoodFile(**vars(facts), verdict=VerdictReport.from_verdict(verdict)))

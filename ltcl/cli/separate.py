@@ -54,7 +54,8 @@ def separate(
         has_folders=len(photographs) > 1,
     )
     with pictures.fill(out) as folder:
-        for name, path in zip(context.progress.each([*photographs]), picture, strict=True):
+        names = context.progress.each([*photographs])
+        for name, path in zip(names, picture, strict=True):
             photograph = photographs[name]
             result = separation.separate(T, photograph, bounces, **settings)
             entry = writer.write(folder, name, path, photograph, result)
@@ -95,30 +96,26 @@ class PartsWriter:
         parts = []
         shown = [panels.linear_panel(photograph, name, self.factor)]
         shown_std = []
-        for part, picture in light.items():
-            place = f"{name}/{part}" if self.has_folders else part
-            panel = panels.linear_panel(picture, part, self.factor)
+        for label, picture in light.items():
+            place = f"{name}/{label}" if self.has_folders else label
+            panel = panels.linear_panel(picture, label, self.factor)
             shown.append(panel)
             files = panels.write(folder, place, picture, panel)
             entry = LightPart(
-                part=part,
+                part=label,
                 exr=files.exr,
                 png=files.png,
                 lowest=float(picture.min()),
-                share=None,
-                channels=[],
+                share=_mean(picture) / whole if whole else None,
+                channels=solves(solved.get(label, ())),
             )
-            if whole:
-                entry.share = _mean(picture) / whole
-            if part in solved:
-                entry.channels = solves(solved[part])
-            if part in deviations:
-                entry.std, panel = panels.write_std(folder, place, deviations[part], self.factor)
+            if label in deviations:
+                std = deviations[label]
+                entry.std, panel = panels.write_std(folder, place, std, self.factor)
                 shown_std.append(panel)
             parts.append(entry)
-        for row in (shown[:3], shown[3:], self._amplified_panels(light), shown_std):
-            if row:
-                self.sheet.append(row)
+        rows = [shown[:3], shown[3:], self._amplified_panels(light), shown_std]
+        self.sheet += filter(None, rows)
         return SeparatedPicture(
             file=path,
             transport_error=result.transport_error,
@@ -129,8 +126,8 @@ class PartsWriter:
     def _amplified_panels(self, light: dict[str, np.ndarray]) -> list[Image.Image]:
         """Draw dim parts once more, amplified."""
         amplified = []
-        for part, picture in light.items():
-            times, panel = panels.amplified_panel(picture, part, self.factor)
+        for label, picture in light.items():
+            times, panel = panels.amplified_panel(picture, label, self.factor)
             if times >= MIN_AMPLIFICATION:
                 amplified.append(panel)
         return amplified
@@ -138,14 +135,20 @@ class PartsWriter:
 
 def _solved_names(result: Any) -> list[str]:
     """Name the parts that are solved for."""
-    return ["direct", *(f"bounce_{k}" for k in range(1, len(result.bounces) + 1))]
+    return ["direct", *_bounces(result)]
 
 
 def _parts(result: Any) -> dict[str, np.ndarray]:
-    parts = {"direct": result.direct, "indirect": result.indirect}
-    for number, bounce in enumerate(result.bounces, 1):
-        parts[f"bounce_{number}"] = bounce
-    return {**parts, "rest": result.rest}
+    return {
+        "direct": result.direct,
+        "indirect": result.indirect,
+        **_bounces(result),
+        "rest": result.rest,
+    }
+
+
+def _bounces(result: Any) -> dict[str, np.ndarray]:
+    return {f"bounce_{number}": bounce for number, bounce in enumerate(result.bounces, 1)}
 
 
 def _deviations(result: Any) -> dict[str, np.ndarray]:
@@ -162,15 +165,9 @@ def _table_rows(report: SeparateReport) -> list[list[Any]]:
     for picture in report.pictures:
         for part in picture.parts:
             products = sum(solve.products for solve in part.channels)
-            rows.append(
-                [
-                    picture.file.name,
-                    part.part,
-                    percent(part.share, 4),
-                    products if products else None,
-                    _largest_residual(part.channels),
-                ]
-            )
+            row = [picture.file.name, part.part, percent(part.share, 4)]
+            row += [products or None, _largest_residual(part.channels)]
+            rows.append(row)
     return rows
 
 

@@ -42,10 +42,11 @@ SHORT_DASHES = (0, (2, 2))
 def convergence(
     solutions: Mapping[str, Solution] | Solution, rtol: float, title: str = "Convergence"
 ) -> Figure:
-    """Relative residual of solves of one system, by name, against the products they took.
+    """Relative residual of several solves of one system against the products they took.
 
-    Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level
-    line. InputError if there is nothing to draw, or rtol is outside (0, 1).
+    They are named, or one is given alone. Solve with ``throw=False``, so that a divergence shows as
+    well. A direct solve becomes a level line. InputError if there is nothing to draw, or rtol is
+    outside (0, 1).
 
     Examples
     --------
@@ -55,22 +56,22 @@ def convergence(
     >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     ['jacobi', 'richardson', 'tolerance']
     """
-    if isinstance(solutions, Solution):
-        solutions = {solutions.method: solutions}
-    _check_named("solutions", solutions, Solution)
     figure = figure_of(900, 560)
     heading(figure, 34, 26, title, 17)
     axes = figure.add_axes((0.09, 0.13, 0.73, 0.72))
+    if isinstance(solutions, Solution):
+        solutions = {solutions.method: solutions}
+    _check_named("solutions", solutions, Solution)
     _draw_convergence(axes, solutions, rtol)
     return figure
 
 
 def analysis(analyses: Mapping[str, Analysis] | Analysis) -> Figure:
-    """Bounds on rho(R) of transports by name, per channel, and their forecasts per method.
+    """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
 
-    On the left is the interval that holds rho(R), with the 1 beyond which the paper's series
-    diverges; on the right are the products of each method, where there is a forecast. InputError if
-    there is nothing to draw.
+    One may be given without a name. On the left is the interval that holds rho(R), with the 1
+    beyond which the paper's series diverges; on the right are the products of each method, where
+    there is a forecast. InputError if there is nothing to draw.
 
     Examples
     --------
@@ -97,20 +98,21 @@ def analysis(analyses: Mapping[str, Analysis] | Analysis) -> Figure:
     return figure
 
 
-def _check_named(argument: str, results: Any, kind: type) -> None:
-    """Refuse all but results of one kind by name, at least one of them."""
-    if not isinstance(results, Mapping):
-        raise InputTypeError(
-            f"{argument} is a {type(results).__name__}; it must be a {kind.__name__}, or a "
-            "dictionary of them by name"
-        )
-    for name, result in results.items():
-        if not isinstance(result, kind):
-            raise InputTypeError(
-                f"{argument}[{name!r}] is a {type(result).__name__}; it must be a {kind.__name__}"
-            )
-    if not results:
-        raise InputError(f"{argument} is empty; there must be at least one to draw")
+def _check_named(name: str, values: Any, kind: type) -> None:
+    """Refuse anything but a dictionary with values of a kind."""
+    _check_mapping(name, values)
+    if not values:
+        raise InputError(f"{name} is empty; there must be at least one to draw")
+    for key, value in values.items():
+        if not isinstance(value, kind):
+            problem = f"{name}[{key!r}] is a {type(value).__name__}"
+            raise InputTypeError(f"{problem}; it must be a {kind.__name__}")
+
+
+def _check_mapping(name: str, values: Any) -> None:
+    if not isinstance(values, Mapping):
+        problem = f"{name} is a {type(values).__name__}"
+        raise InputTypeError(f"{problem}; it must be a dictionary by names")
 
 
 def _named_channels(analyses: Mapping[str, Analysis]) -> dict[str, ChannelAnalysis]:
@@ -186,12 +188,8 @@ def pictures(
     >>> [text.get_text() for text in figure.texts if text.get_text()]
     ['A corner', 'seen', 'too bright', 'three times']
     """
-    for number, row in enumerate(rows):
-        if not isinstance(row, Mapping):
-            raise InputTypeError(
-                f"rows[{number}] is a {type(row).__name__}; it must be a dictionary of pictures "
-                "by name"
-            )
+    for row in rows:
+        _check_mapping("rows", row)
     rows = tuple(row for row in rows if row)
     width = checks.count("width", width, least=100)
     if not rows:

@@ -188,6 +188,35 @@ def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, 
     np.testing.assert_allclose(patterns(done), patterns(whole), atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["pattern_000003.png", "appearance/appearance_000002.png"])
+@pytest.mark.parametrize("damage", ["empty", "other", "cut", "flipped", "removed"])
+def test_a_damaged_pattern_is_made_again(T, source, tmp_path, name, damage):
+    common: dict[str, Any] = {"batch": 4, "frames": 5, "appearance": True}
+    done = compensate_frames(T, source, tmp_path, **common)
+    file = tmp_path / name
+    before = everything(tmp_path)
+    good = file.read_bytes()
+    if damage == "removed":
+        file.unlink()
+    else:
+        middle = len(good) // 2
+        flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+        file.write_bytes(
+            {"empty": b"", "other": b"damaged", "cut": good[:-20], "flipped": flipped}[damage]
+        )
+    again = compensate_frames(T, source, tmp_path, resume=True, **common)
+    assert (again.solved, len(again.records)) == (1, len(done.records))
+    np.testing.assert_allclose(images.read(file), _read(good, file.suffix, tmp_path), atol=1e-3)
+    assert everything(tmp_path).keys() == before.keys()
+
+
+def _read(data: bytes, suffix: str, folder: Path) -> np.ndarray:
+    """The picture in these bytes."""
+    file = folder.with_suffix(suffix)
+    file.write_bytes(data)
+    return images.read(file)
+
+
 class Projector:
     """A curve as a bound method, which has no identity of its own."""
 

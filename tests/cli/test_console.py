@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import io
+import json
 import logging
 import re
 import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -16,6 +19,7 @@ import pytest
 
 import ltcl
 from ltcl.cli import command, doctor
+from ltcl.cli.main import main
 from ltcl.cli.progress import Progress
 from ltcl.device import Device, discovery
 from ltcl.solvers import METHODS
@@ -23,6 +27,9 @@ from tests import json_schema
 
 from .conftest import Program
 
+# Writing there fails as on a full disk; Linux and FreeBSD have it.
+FULL_DEVICE = Path("/dev/full")
+needs_full_device = pytest.mark.skipif(not FULL_DEVICE.exists(), reason="there is no /dev/full")
 COMMANDS = [
     "devices",
     "doctor",
@@ -107,6 +114,63 @@ def test_an_error_is_a_line_a_code_and_json(program, monkeypatch, error, code, p
     assert failed["exit_code"] == code
     has_traceback = "Traceback" in program("devices", "--verbose").err
     assert has_traceback == (code == command.INTERNAL)
+
+
+@needs_full_device
+@pytest.mark.parametrize(
+    ("line", "code", "text"),
+    [
+        ("--help", 1, "stdout: "),
+        ("--version", 1, "stdout: "),
+        ("info --help", 1, "stdout: "),
+        ("devices", 1, "stdout: "),
+        ("devices --json", 1, "stdout: "),
+        ("info {transport}", 1, "stdout: "),
+        ("relight missing.npz p.png --json --out x", 1, "missing.npz: "),
+        ("nothing --json", 2, "'nothing'"),
+    ],
+)
+def test_stdout_on_a_full_disk_is_one_error(transport, monkeypatch, capsys, line, code, text):
+    words = line.format(transport=transport).split()
+    with FULL_DEVICE.open("w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert main(words) == code
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.startswith("ltcl: error: ")
+    assert text in error
+
+
+@needs_full_device
+def test_stderr_on_a_full_disk_loses_lines_only(transport, tmp_path, monkeypatch):
+    """The note on the lost grid cannot be printed, and the file is written."""
+    with FULL_DEVICE.open("w") as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        assert main(["convert", str(transport), str(tmp_path / "T.npy")]) == 0
+        assert main(["info", "missing.npz"]) == 1
+    assert (tmp_path / "T.npy").exists()
+
+
+def test_a_closed_stdout_is_an_error(transport, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert main(["info", str(transport)]) == 1
+    assert "stdout: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "latin-1"])
+@pytest.mark.parametrize("name", ["H\udcf6he", "Höhe", "漢字", "\U0001d11e"])
+def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, name, encoding):
+    """Single surrogates stand for bytes that are not UTF-8."""
+    path = tmp_path / f"{name}.npz"
+    path.write_bytes(Path(transport).read_bytes())
+    printed = {}
+    for options in ([], ["--json"]):
+        stdout = io.TextIOWrapper(io.BytesIO(), encoding, errors="strict")
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert main(["info", str(path), *options]) == 0
+        stdout.seek(0)
+        printed[len(options)] = stdout.read()
+    assert ".npz" in printed[0]
+    assert json.loads(printed[1])[0]["file"] == str(path)
 
 
 def test_quiet_and_verbose(program, transport, tmp_path):

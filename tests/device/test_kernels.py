@@ -212,7 +212,7 @@ def test_a_bound_launch_refuses_names_that_its_kernel_has_not(device):
     launch = device.kernel("vector", "vector_fill").bind(
         3, 1, count=3, value=1.0, out=device.empty(3)
     )
-    with pytest.raises(InputTypeError, match="vector_fill has no argument x; it has count"):
+    with pytest.raises(InputTypeError, match=r"vector_fill .* x; .*count"):
         launch.set(x=1.0)
 
 
@@ -237,7 +237,7 @@ def test_arguments_that_the_driver_refuses_are_errors_of_ltcl(device):
         lambda: kernel(1, 1, count=1, value=0.5, out=local),
         lambda: kernel.bind(1, 1, count=1, value=0.5, out=device.empty(3)).set(out=local),
     ):
-        with pytest.raises(DeviceError, match="vector_fill"):
+        with pytest.raises(DeviceError, match=r"vector_fill"):
             act()
 
 

@@ -167,7 +167,7 @@ LISTS = [json.dumps({"format": "ltcl shooting list 1", "shots": shots}) for shot
 @pytest.mark.parametrize("content", BROKEN + LISTS)
 def test_a_damaged_list_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "shots.json").write_text(content, encoding="utf-8")
-    with pytest.raises(FileError, match=r"shots\.json: is not a shooting list") as error:
+    with pytest.raises(FileError, match=r"shots\.json: ") as error:
         FolderRig(tmp_path, GRID)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 400 + len(str(tmp_path))
