@@ -71,7 +71,11 @@ def show(
     context: Context,
     folder: Annotated[
         Path,
-        argument("FOLDER", "A picture, a folder of pictures, or the folder of an acquisition."),
+        argument(
+            "FOLDER",
+            "A picture, a folder of pictures, the folder of an acquisition, or the results of "
+            "'ltcl compensate'.",
+        ),
     ],
     display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
     every: Annotated[
