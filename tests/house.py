@@ -28,7 +28,7 @@ from ltcl.device import Device
 LAYERS: list[set[str]] = [
     {"errors"},
     {"checks"},
-    {"files"},
+    {"files", "batch.main_guard"},
     {"images", "device"},
     {"operators", "transport.frames", "transport.matrices", "batch.cluster"},
     {"theory"},

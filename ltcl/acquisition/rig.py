@@ -3,7 +3,9 @@
 
 `Shots` checks codes before they go into a rig and images that come from it, counts the
 photographs, and scales their codes:
-    value = code / full scale,    full scale = 2^bits - 1 of an integer camera, 1 of a float one.
+    value = code / full scale,    full scale = 2^bits - 1 of an integer camera, 1 of a float one,
+
+or the white level of a camera that is full below that.
 """
 
 from __future__ import annotations
@@ -43,6 +45,8 @@ class Rig(Protocol):
         Seconds that the camera offers, ascending; without it any from 1e-4 to 30.
     bits : int
         Bits in use in a uint16 image; without it 16.
+    white_level : float
+        Code from which on a pixel may be saturated, if that is below full scale.
     prepare(shots)
         Called with the (codes, seconds) that come next.
     describe()
@@ -338,17 +342,25 @@ def to_unit(
     `name`, for an image that cannot be used.
     """
     _check_image(name, image, camera.channels)
+    white_level = _white_level(image.dtype, camera)
     if expected is not None and expected != (image.shape, image.dtype):
         shape, dtype = expected
         raise AcquisitionError(f"{name} is {image.dtype} {image.shape}; it must be {dtype} {shape}")
-    levels = _code_levels(image.dtype, camera)
-    if levels is None:
-        return _finite_image(name, image)
-    if image.max() >= levels:
-        raise AcquisitionError(
-            f"{name} reaches {image.max()}; by rig.bits the largest code is {levels - 1}"
-        )
-    return image * np.float32(1.0 / (levels - 1))
+    if image.dtype.kind == "f":
+        image = _finite_image(name, image)
+        if white_level is None:
+            return image
+    else:
+        largest = _largest_code(image.dtype, camera)
+        if image.max() > largest:
+            raise AcquisitionError(
+                f"{name} reaches {image.max()}; by rig.bits the largest code is {largest}"
+            )
+        if white_level is None:
+            white_level = largest
+    if white_level < image.max():
+        image = np.minimum(image, image.dtype.type(white_level))
+    return image * np.float32(1.0 / white_level)
 
 
 def _check_image(name: str, image: np.ndarray, channels: int) -> None:
@@ -379,12 +391,30 @@ def _code_levels(dtype: np.dtype, camera: Any) -> int | None:
     """Number of codes of photographs of `dtype`; None for floats."""
     if dtype.kind == "f":
         return None
+    white_level = _white_level(dtype, camera)
+    if white_level is not None:
+        return int(white_level) + 1
+    return _largest_code(dtype, camera) + 1
+
+
+def _largest_code(dtype: np.dtype, camera: Any) -> int:
+    """The largest code that photographs of integers can have."""
     if dtype == np.uint8:
-        return 256
+        return 255
     bits = getattr(camera, "bits", None)
     if bits is None:
-        return 1 << 16
-    return 1 << checks.count("rig.bits", bits, least=8, most=16)
+        return 65535
+    return (1 << checks.count("rig.bits", bits, least=8, most=16)) - 1
+
+
+def _white_level(dtype: np.dtype, camera: Any) -> float | None:
+    """White level of a camera whose photographs have this type; None for full scale."""
+    level = getattr(camera, "white_level", None)
+    if level is None:
+        return None
+    if dtype.kind == "f":
+        return checks.number("rig.white_level", level, above=0.0)
+    return checks.count("rig.white_level", level, most=_largest_code(dtype, camera))
 
 
 def require_members(name: str, value: Any, *members: str) -> None:

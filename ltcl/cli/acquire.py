@@ -46,8 +46,8 @@ Overhead = Annotated[
 Card = Annotated[
     Path | None,
     file_option(
-        "Folder with the camera's own files; they are copied, in the order of "
-        "their numbers, in place of the missing photographs.",
+        "Folder with the camera's own files; they are copied, in the order in which they were "
+        "taken, in place of the missing photographs.",
         metavar="FOLDER",
     ),
 ]

@@ -12,7 +12,7 @@ import inspect
 import logging
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -22,7 +22,8 @@ from typer.models import ArgumentInfo
 from ltcl.cli.progress import Progress
 from ltcl.cli.reports.parts import ErrorReport
 from ltcl.cli.reports.report import document
-from ltcl.errors import LtclError
+from ltcl.cli.streams import print_line, print_result
+from ltcl.errors import FileError, LtclError
 from ltcl.tasks import report
 
 FAILED = 1
@@ -146,11 +147,11 @@ def _is_argument(parameter: inspect.Parameter) -> bool:
 
 def _print_answer(answer: Answer, json: bool) -> None:
     if json:
-        typer.echo(report.dumps(document(answer.data)))
+        print_result(report.dumps(document(answer.data)))
         return
     for line in answer.lines:
         if line is not None:
-            typer.echo(line)
+            print_result(line)
 
 
 def fail(error: BaseException, json: bool = False, verbose: bool = False) -> ErrorReport:
@@ -170,11 +171,12 @@ def fail(error: BaseException, json: bool = False, verbose: bool = False) -> Err
         code = INTERNAL
         message = f"internal error: {kind}: {message}; --verbose prints where it occurred"
         if verbose:
-            typer.echo("".join(traceback.format_exception(error)), err=True)
-    typer.echo(f"ltcl: error: {message}", err=True)
+            print_line("".join(traceback.format_exception(error)))
+    print_line(f"ltcl: error: {message}")
     failure = ErrorReport(error=message, type=kind, exit_code=code)
     if json:
-        typer.echo(report.dumps(failure.document()))
+        with suppress(FileError):
+            print_result(report.dumps(failure.document()))
     return failure
 
 
@@ -191,7 +193,7 @@ class _StderrHandler(logging.Handler):
         if record.levelno >= logging.WARNING:
             level = f"{record.levelname.lower()}: "
         message = " ".join(record.getMessage().split())
-        typer.echo(f"ltcl: {level}{message}", err=True)
+        print_line(f"ltcl: {level}{message}")
 
 
 @contextmanager

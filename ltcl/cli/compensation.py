@@ -36,7 +36,7 @@ def parse_gain(text: str) -> float | str:
 Gain = Annotated[
     str | None,
     projector_option(
-        "Factor between the picture and what the scene shall show; auto: the "
+        "Factor between the picture and what the scene will show; auto: the "
         "largest within reach. Default: 1; auto if T was measured.",
         parser=parse_gain,
         metavar="FACTOR",
@@ -57,12 +57,15 @@ def target_options(
     clamp: Annotated[
         bool,
         projector_option(
-            "Clamp light beyond that range, instead of the best pattern within it.", "--clamp"
+            "Cut off light beyond that range, instead of finding the best pattern within it.",
+            "--clamp",
         ),
     ] = False,
     background: Annotated[
         Path | None,
-        projector_file("Picture of the light that stays. Default: as measured, else none."),
+        projector_file(
+            "Picture of the light without the projector. Default: as measured, else none."
+        ),
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -109,8 +112,9 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
     resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
     caveat = loading.compression_caveat("errors are", T, asked["exact"])
     notes = [caveat]
-    if settings["weights"] is None and T.masked.any():
-        notes.append("masked pixels do not count in errors")
+    if settings["weights"] is None and T.unlit.any():
+        unlit = f"{T.unlit.sum()} camera pixels that the projector does not light"
+        notes.append(f"{unlit} do not count in errors")
     if setup is not None:
         notes.append(
             "pattern .png holds the codes of the measured projector; 'ltcl show' shows it there"

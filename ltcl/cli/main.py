@@ -29,6 +29,7 @@ from ltcl.cli import (
     view,
 )
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
+from ltcl.cli.streams import checked_stdout, print_result
 from ltcl.errors import LtclError
 
 app = typer.Typer(
@@ -71,7 +72,7 @@ def _program_options(
     version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
     if version:
-        typer.echo(f"ltcl {__version__}")
+        print_result(f"ltcl {__version__}")
         raise typer.Exit
 
 
@@ -89,11 +90,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(words: list[str]) -> int:
     """Run the program in this process."""
     try:
-        return app(args=words, prog_name="ltcl", standalone_mode=False) or 0
+        # Help is printed by typer.
+        with checked_stdout():
+            return app(args=words, prog_name="ltcl", standalone_mode=False) or 0
     except UsageError as error:
         return _refuse_usage(error, words)
     except (LtclError, KeyboardInterrupt) as error:
-        # The command has not begun yet.
+        # The command has not begun yet, or stdout cannot be written.
         return fail(error, "--json" in words).exit_code
     except SystemExit as end:
         # The pipe that reads stdout was closed.

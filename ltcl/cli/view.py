@@ -8,12 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from ltcl.cli import loading, options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option
 from ltcl.cli.reports.program import ViewReport
+from ltcl.cli.streams import print_line
 from ltcl.device import open_device
 from ltcl.errors import InputError
 
@@ -36,6 +35,12 @@ def address_options(
             max=65535,
         ),
     ] = 0,
+    url: Annotated[
+        str,
+        address_option(
+            "URL of the page behind a proxy or on a forwarded port, such as http://localhost:9000."
+        ),
+    ] = "",
     no_browser: Annotated[
         bool, address_option("Print the URL, and open no browser.", "--no-browser")
     ] = False,
@@ -48,6 +53,7 @@ def address(context: Context) -> dict[str, Any]:
     return {
         "host": context.options["host"],
         "port": context.options["port"],
+        "url": context.options["url"],
         "open_browser": not context.options["no_browser"],
     }
 
@@ -72,7 +78,7 @@ def view(
     paths = [] if picture is None else picture
     scene = _make_scene(context, transport, paths)
     with Viewer(scene, **address(context)) as viewer:
-        typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
+        print_line(f"{viewer.url} shows {transport}; Ctrl-C ends it")
         context.progress(f"showing {transport}")
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()

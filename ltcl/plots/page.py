@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ltcl.plots.shown_figure import ShownFigure
+
 DPI = 100
 PAPER = "#15171b"
 INK = "#f1efea"
@@ -33,14 +35,11 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
         figure.savefig(temporary, dpi=DPI, facecolor=figure.get_facecolor())
 
 
-def figure_of(width: int, height: int) -> Figure:
+def figure_of(width: int, height: int) -> ShownFigure:
     """An empty page of so many pixels, drawn by Agg."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from ltcl.plots.shown_figure import ShownFigure
 
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
-    FigureCanvasAgg(figure)
-    return figure
+    return ShownFigure(width, height, DPI, PAPER)
 
 
 def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:

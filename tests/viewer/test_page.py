@@ -6,6 +6,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -777,3 +778,16 @@ def test_nothing_serious_stands_in_the_way_of_access(
         assert [
             each["id"] for each in violations if each["impact"] in ("serious", "critical")
         ] == []
+
+
+def test_the_file_that_the_browser_is_given_leads_to_the_page(
+    browser: Browser, T: ltcl.Transport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", arguments.append)
+    with ltcl.view(T) as viewer:
+        page = browser.new_page()
+        page.goto(arguments[0])
+        page.wait_for_url(f"{viewer.url}**")
+        page.wait_for_selector("body[data-state=ready]")
+        page.close()

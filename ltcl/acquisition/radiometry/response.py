@@ -71,7 +71,7 @@ class Response:
 
     def linear(self, image: Any) -> np.ndarray:
         """Linear values of codes (..., [3]) in [0, 1]; float32, same shape."""
-        return self._map_channels(_interpolate, image)
+        return self._map_channels(interpolate, image)
 
     def derivative(self, image: Any) -> np.ndarray:
         """Linear value per code, at codes (..., [3]) in [0, 1]; float32, same shape."""
@@ -99,7 +99,7 @@ class Response:
         return np.stack(planes, axis=-1).astype(np.float32)
 
 
-def _interpolate(codes: np.ndarray, table: np.ndarray) -> np.ndarray:
+def interpolate(codes: np.ndarray, table: np.ndarray) -> np.ndarray:
     """Values at codes, which may lie beyond the ends of the table."""
     place, interval = _intervals(codes, table)
     step = np.diff(table)[interval]

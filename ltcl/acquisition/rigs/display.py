@@ -21,6 +21,7 @@ import numpy as np
 from ltcl import checks, images
 from ltcl.acquisition.rig import Closing, as_codes, load_extra
 from ltcl.acquisition.rigs.folder import FolderRig, enlarge
+from ltcl.acquisition.rigs.memory_card import number_key
 from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.files import as_path
@@ -28,6 +29,14 @@ from ltcl.images.frames import open_frames
 
 # Seconds between two looks for a key or a photograph.
 POLL_SECONDS = 0.05
+
+# Drivers of SDL whose display nobody sees, which it takes without a desktop, and the variables that
+# ask for a driver.
+INVISIBLE_DRIVERS = ("dummy", "offscreen", "evdev")
+DRIVER_VARIABLES = ("SDL_VIDEODRIVER", "SDL_VIDEO_DRIVER")
+
+# The report of 'ltcl compensate', in whose folder some pictures are patterns, and others not.
+COMPENSATION_REPORT = "compensate.json"
 
 
 class Display(Closing):
@@ -114,6 +123,7 @@ class Display(Closing):
     def _open(self, index: int | None) -> None:
         display = self._pygame.display
         display.init()
+        _check_visible(display.get_driver())
         sizes = display.get_desktop_sizes()
         self.index = _choose_display(index, sizes)
         w, h = sizes[self.index]
@@ -131,6 +141,17 @@ class Display(Closing):
             )
         self._pygame.mouse.set_visible(False)
         display.set_allow_screensaver(False)
+
+
+def _check_visible(driver: str) -> None:
+    """Refuse a driver without a display, unless the environment asks for it."""
+    drivers = ",".join(os.environ.get(variable, "") for variable in DRIVER_VARIABLES)
+    is_asked_for = driver.lower() in drivers.lower().split(",")
+    if driver.lower() in INVISIBLE_DRIVERS and not is_asked_for:
+        raise AcquisitionError(
+            f"no display can be opened: there is no desktop, and SDL's driver {driver!r} shows "
+            "nothing; start it on the desktop, or use --browser"
+        )
 
 
 def _choose_display(index: int | None, sizes: list[tuple[int, int]]) -> int:
@@ -161,7 +182,7 @@ def show(
     folder : path
         Folder of a `FolderRig`, whose patterns come in the order of the shooting list, without
         those that are photographed already; or a folder of pictures, in the order of the numbers in
-        their names; or one picture.
+        their names, of which only the patterns if 'ltcl compensate' wrote it; or one picture.
     display : int or object
         Number of the display, from 0; or an open one, or any object with `show(codes)` and
         `key_pressed()`.
@@ -187,7 +208,7 @@ def show(
     --------
     >>> show("nowhere")
     Traceback (most recent call last):
-    ltcl.errors.FileError: nowhere: has no shooting list, which 'ltcl acquire run' writes
+    ltcl.errors.FileError: nowhere: no such file or folder
     """
     folder = as_path(folder)
     if not isinstance(advance, str):
@@ -222,10 +243,17 @@ def _shots_to_show(rig: FolderRig, advance: str | float) -> list[Shot]:
     if rig.shots:
         return [rig.shots[number - 1] for number in rig.missing()]
     folder: Path = rig.folder
+    if not folder.exists():
+        raise FileError(f"{folder}: no such file or folder")
     has_project = (folder / "acquisition.toml").exists()
     if advance == "arrival" or not folder.is_dir() or has_project:
         raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
     shots = []
+    if (folder / COMPENSATION_REPORT).exists():
+        patterns = sorted(folder.glob("*_pattern.png"), key=number_key)
+        for number, path in enumerate(patterns, start=1):
+            shots.append(Shot(number, path.name, 0.0, ""))
+        return shots
     for frame in open_frames(folder):
         shots.append(Shot(frame.number, frame.name, 0.0, ""))
     return shots

@@ -23,6 +23,7 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition.rig import as_exposures, as_shot, shot_key
+from ltcl.acquisition.rigs.memory_card import in_order_of_capture
 from ltcl.acquisition.rigs.photographs import (
     PHOTOGRAPH_KINDS,
     PHOTOGRAPH_SUFFIXES,
@@ -56,6 +57,8 @@ class FolderRig:
         Bits of the pattern files.
     camera_bits : int, optional
         Bits in use in photographs of 16 bits; None for all.
+    white_level : float, optional
+        Code of photographs from which on pixels are saturated; None for the largest code.
     exposures : sequence of float, optional
         Seconds that the camera offers, ascending; None for any.
     projector : (int, int), optional
@@ -95,6 +98,7 @@ class FolderRig:
         *,
         pattern_bits: int = 8,
         camera_bits: int | None = None,
+        white_level: float | None = None,
         exposures: Any = None,
         projector: tuple[int, int] | None = None,
     ) -> None:
@@ -106,6 +110,9 @@ class FolderRig:
         self.bits = camera_bits
         if camera_bits is not None:
             self.bits = checks.count("camera_bits", camera_bits, least=9, most=16)
+        self.white_level = white_level
+        if white_level is not None:
+            checks.number("white_level", white_level, above=0.0)
         self.exposures = as_exposures("exposures", exposures)
         self.number = 0
         self._pattern_bits = checks.one_of("pattern_bits", pattern_bits, (8, 16))
@@ -159,7 +166,9 @@ class FolderRig:
         self._save()
         path = self._find_photograph(shot)
         name = f"photograph {shot.number} ({path.name})"
-        image = read_photograph(name, path, self.channels, shot.seconds)
+        image = read_photograph(
+            name, path, self.channels, shot.seconds, white_level=self.white_level
+        )
         self._photographed[key] += 1
         self.number = shot.number
         return image
@@ -179,8 +188,9 @@ class FolderRig:
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in place of those that are missing.
 
-        They are taken in the order of the numbers in their names. Files that were copied before are
-        left out: a memory card need not be emptied. Nothing is copied on an error.
+        They are taken in the order in which they were photographed (`memory_card`). Files that were
+        copied before are left out: a memory card need not be emptied. Nothing is copied on an
+        error.
 
         Parameters
         ----------
@@ -190,13 +200,13 @@ class FolderRig:
         Raises
         ------
         InputError
-            The number of files is another.
+            The number of files is another, or their order is not known.
         FileError
             One is not a photograph.
         """
         numbers = self.missing()
         unique_files = dict.fromkeys(map(input_file, files))
-        paths = self._new_files(sorted(unique_files, key=_number_order))
+        paths = self._new_files(unique_files)
         if len(paths) != len(numbers):
             missing = f"{len(numbers)} are missing"
             if numbers:
@@ -219,6 +229,7 @@ class FolderRig:
             "projector": self._projector,
             "pattern_bits": self._pattern_bits,
             "camera_bits": self.bits,
+            "white_level": self.white_level,
             "exposures": self.exposures,
             "channels": self.channels,
         }
@@ -284,13 +295,14 @@ class FolderRig:
         )
         return PhotographMissing(text, shot.number, shot, len(missing))
 
-    def _new_files(self, files: list[Path]) -> list[Path]:
-        """Files that were not copied before; FileError for one that is not a photograph."""
+    def _new_files(self, files: Iterable[Path]) -> list[Path]:
+        """Files that were not copied before, in order; FileError for one of another kind."""
         copied = [path for paths in self._files.values() for path in paths]
-        new = []
         for path in files:
             if path.suffix.lower() not in PHOTOGRAPH_SUFFIXES:
                 raise FileError(f"{path}: is not a photograph; it must be {PHOTOGRAPH_KINDS}")
+        new = []
+        for path in in_order_of_capture(list(files)):
             twin = _find_equal(path, copied)
             if twin is None:
                 new.append(path)
@@ -318,11 +330,6 @@ def _margins(pixels: int) -> tuple[int, int]:
     """Margins before and after a centred picture."""
     before = pixels // 2
     return before, pixels - before
-
-
-def _number_order(path: Path) -> str:
-    """Key to sort by: numbers in names compare as numbers."""
-    return re.sub("[0-9]+", lambda digits: digits[0].zfill(20), path.name)
 
 
 def _find_equal(path: Path, files: list[Path]) -> Path | None:

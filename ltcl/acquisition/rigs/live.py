@@ -75,7 +75,8 @@ class LiveRig(Closing):
         frames come by themselves and may wait in a queue; `expose(seconds)`; and `frame()`, which
         returns uint8, uint16 or float, (H, W) or (H, W, 3). Optional members: `exposures`, seconds,
         ascending (else any within `limits`, else 1e-4 to 30); `bits` of uint16 (else 16);
-        `describe()`, a dict of plain JSON; `close()`.
+        `white_level`, the code of saturated pixels (else the largest); `describe()`, a dict of
+        plain JSON; `close()`.
     display : object
         `Display`, or any object with `grid`, `period` and `show(codes)`.
     period : "display", float or None
@@ -111,6 +112,7 @@ class LiveRig(Closing):
         self.projector_grid = checks.grid("display.grid", display.grid)
         self.channels = checks.one_of("camera.channels", camera.channels, (1, 3))
         self.bits = getattr(camera, "bits", None)
+        self.white_level = getattr(camera, "white_level", None)
         exposures = getattr(camera, "exposures", None)
         self.exposures = as_exposures("camera.exposures", exposures)
         self._period = _check_period(period, display)

@@ -8,7 +8,9 @@ Codes x (h, w[, 3]) in [0, 1], channels c and d, projector curve g with light b 
     v    = max(sensitivity seconds L, 0)     linear value; 1 fills a pixel of E electrons
     n    = Poisson(E v) / E + Normal(0, r)   photons, and read noise r
     c    = o + (1 - o) f(min(n, 1))          offset o and camera curve f; -f(-n) for n < 0
-    code = round(c (2^bits - 1))             in [0, 2^bits - 1]; or c itself for a float camera
+    code = round(c F)                        in [0, F], F = 2^bits - 1; c for a float camera
+
+or F the white level of a camera that is full below its largest code.
 """
 
 from __future__ import annotations
@@ -74,6 +76,8 @@ class Sensor:
         Curve of the projector, from code to light.
     bits : int or "float"
         8 gives uint8, 9 to 16 uint16, "float" float32.
+    white_level : float, optional
+        Code of a full pixel; None for the largest code, or 1 of floats.
     black : float
         Offset of the codes, of full scale.
     projector_black : float
@@ -96,6 +100,7 @@ class Sensor:
     response: Any = "srgb"
     projector_response: Any = "srgb"
     bits: int | str = 8
+    white_level: float | None = None
     black: float = 0.004
     projector_black: float = 0.0
     gain: float | None = 10000.0
@@ -107,6 +112,9 @@ class Sensor:
         is_whole = type(self.bits) is int and self.bits in range(8, 17)
         if self.bits != "float" and not is_whole:
             raise InputError(f'bits is {self.bits!r}; it must be 8 to 16, or "float"')
+        if self.white_level is not None:
+            most = (1 << int(self.bits)) - 1 if is_whole else np.inf
+            checks.number("white_level", self.white_level, above=0.0, most=most)
         for name in ("black", "projector_black", "read"):
             checks.number(name, getattr(self, name), least=0.0, below=1.0)
         if self.gain is not None:
@@ -133,6 +141,7 @@ class SimulatedRig(abc.ABC):
         self.bits: int | None = None
         if isinstance(self.sensor.bits, int):
             self.bits = self.sensor.bits
+        self.white_level = self.sensor.white_level
         camera = _curves("response", self.sensor.response, channels)
         projector = _curves("projector_response", self.sensor.projector_response, channels)
         self._encoders = [curve.encode for curve in camera]
@@ -160,10 +169,11 @@ class SimulatedRig(abc.ABC):
         encoded = _apply(self._encoders, np.minimum(value, 1.0))
         code = black + (1.0 - black) * encoded
         if self.bits is None:
-            return code.astype(np.float32)
-        largest_code = (1 << self.bits) - 1
+            full = 1.0 if self.white_level is None else self.white_level
+            return (code * full).astype(np.float32)
+        full = (1 << self.bits) - 1 if self.white_level is None else self.white_level
         dtype = np.uint8 if self.bits == 8 else np.uint16
-        return np.rint(np.clip(code, 0.0, 1.0) * largest_code).astype(dtype)
+        return np.rint(np.clip(code, 0.0, 1.0) * full).astype(dtype)
 
     def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
         """Skip the noise of a photograph that was taken in an earlier session."""
