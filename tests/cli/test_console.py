@@ -38,6 +38,7 @@ COMMANDS = [
     "info",
     "analyze",
     "convert",
+    "align",
     "compress",
     "denoise",
     "invert",
