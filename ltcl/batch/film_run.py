@@ -70,6 +70,7 @@ class BatchSolver:
         numbers, pictures = batch
         try:
             self._survey()
+            pictures = _unambiguous(pictures, self.T)
             solved = compensate(self.T, pictures, gain=self.gain, **self.options)
         except LtclError as error:
             error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
@@ -210,9 +211,9 @@ class FilmRun:
         for frame in islice(self.source, max(numbers)):
             if frame.number in numbers:
                 sample += self._read(frame)
-        pictures = stack(sample or first)
-        options = self.solver.options
-        return compensate(self.solver.T, pictures, gain=gain, loss=loss, **options).gain
+        T = self.solver.T
+        pictures = _unambiguous(stack(sample or first), T)
+        return compensate(T, pictures, gain=gain, loss=loss, **self.solver.options).gain
 
     def _batches(self) -> Iterator[list[ReadFrame]]:
         """The frames that no earlier run has done, without broken ones."""
@@ -329,3 +330,10 @@ def stack(batch: Sequence[ReadFrame]) -> np.ndarray:
     pictures = [np.atleast_3d(read.picture) for read in batch]
     stacked = np.stack(np.broadcast_arrays(*pictures))
     return stacked if stacked.shape[-1] == 3 else stacked[..., 0]
+
+
+def _unambiguous(pictures: np.ndarray, T: Transport) -> np.ndarray:
+    """Pictures of frames; three grey ones in colour, as (3, h, w) may be the colours of one."""
+    if T.channels == 3 and pictures.ndim == 3 and len(pictures) == 3:
+        return np.repeat(pictures[..., None], 3, axis=-1)
+    return pictures

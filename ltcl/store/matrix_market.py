@@ -80,7 +80,8 @@ def read_mtx(path: Path) -> StoreRecord:
         _check_kinds(file.readline(1000))
     # An entry takes 6 bytes of text or more.
     checks.fits_host("the matrix", 8 * path.stat().st_size)
-    rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(path)
+    data = path.read_bytes() + b"\n"
+    rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(io.BytesIO(data))
     header = Header(
         rows=rows,
         columns=columns,
@@ -89,7 +90,6 @@ def read_mtx(path: Path) -> StoreRecord:
         field=field,
         symmetry=symmetry,
     )
-    data = path.read_bytes() + b"\n"
     head = _check_lines(header, data)
 
     def read() -> Any:
@@ -148,6 +148,6 @@ def write_mtx(path: Path, record: StoreRecord) -> None:
         comment += f"ltcl grid {record.grid[0]} x {record.grid[1]}"
     if record.camera_grid:
         comment += f", camera grid {record.camera_grid[0]} x {record.camera_grid[1]}"
-    # SciPy does not notice that a disk is full, but Python does.
+    # SciPy does not notice that a disk is full, and takes names in UTF-8 alone.
     with path.open("wb") as file:
         scipy.io.mmwrite(file, record.matrices[0], comment=comment, symmetry="general")

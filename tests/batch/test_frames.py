@@ -84,6 +84,17 @@ def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batc
     assert (done.solved, done.worst.error < 1e-4, done.most_clipped.clipped) == (COUNT, True, 0)
 
 
+@pytest.mark.parametrize("gain", [1.0, "auto"])
+def test_three_grey_frames_in_a_batch_are_no_colours(device, source, tmp_path, gain):
+    T = ltcl.Transport([SCENE.T] * 3, GRID, device=device)
+    common: dict[str, Any] = {"format": "exr", "rtol": 1e-4, "frames": 3, "gain": gain}
+    together = compensate_frames(T, source, tmp_path / "three", batch=3, **common)
+    apart = compensate_frames(T, source, tmp_path / "two", batch=2, **common)
+    if gain == 1.0:
+        np.testing.assert_allclose(patterns(together), patterns(apart), rtol=1e-3)
+    assert np.shape(patterns(together)) == (3, *GRID, 3)
+
+
 def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, tmp_path):
     common: dict[str, Any] = {"bounds": (0.0, 2.0), "appearance": True, "gain": 0.5, "frames": 5}
     png = compensate_frames(T, source, tmp_path / "png", **common)

@@ -111,6 +111,9 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
                 user_cblack=[0, 0, 0, 0],
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
+            if codes.shape[2] == 1:
+                # A monochrome camera.
+                codes = codes[..., 0]
             return codes, raw.other.shutter_speed
     except (rawpy.LibRawError, rawpy.NotSupportedError, ValueError) as error:
         text = str(error)

@@ -115,6 +115,7 @@ class SeparatedPicture(Report):
 
     file: Annotated[Path, "Input file."]
     transport_error: TransportError
+    warning: Annotated[str, "What T leaves unknown of the bounces."]
     parts: Annotated[list[LightPart], "Direct light, bounces and the rest."]
 
 

@@ -293,6 +293,15 @@ def test_raw_is_linear_keeps_its_black_and_depends_on_nothing_else(
         raw[10:14, 10:14] = 4000
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_raw_of_a_monochrome_camera_is_grey(tmp_path: Path, channels: int) -> None:
+    raw = random.integers(500, 4000, (64, 96)).astype(np.uint16)
+    path = place(tmp_path, ".dng")
+    camera_files.write_dng(path, raw, 1 / 30, photometric=34892)
+    codes = photograph(tmp_path, channels)
+    np.testing.assert_allclose(codes, raw * (65535 / 4095), atol=1.5)
+
+
 def test_raw_without_rawpy_and_of_a_size_beyond_memory_is_refused(
     tmp_path: Path, monkeypatch: Any
 ) -> None:
