@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Help, exit codes, errors, notes and progress; `ltcl doctor` and `devices`."""
+"""Help, exit codes, errors, notes and progress; `ltcl devices`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ import logging
 import re
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -21,11 +19,8 @@ import ltcl
 from ltcl.cli import command, doctor
 from ltcl.cli.main import main
 from ltcl.cli.progress import Progress
-from ltcl.device import Device, discovery
-from ltcl.solvers import METHODS
+from ltcl.device import discovery
 from tests import json_schema
-
-from .conftest import Program
 
 # Writing there fails as on a full disk; Linux and FreeBSD have it.
 FULL_DEVICE = Path("/dev/full")
@@ -61,7 +56,6 @@ CODES = [
     command.INTERRUPTED,
 ]
 EXIT_CODES = (json_schema.PAGES / "exit-codes.md").read_text(encoding="utf-8")
-KERNELS = {"csr", "dense", "tile", "wavelet", "form_factor", "southwell", "walk", "vector"}
 
 
 def test_version(program):
@@ -205,85 +199,6 @@ def test_progress_is_a_bar_with_elapsed_time_and_time_left(capsys, monkeypatch, 
     is_shown = is_terminal and not quiet
     for part in ("frames", "0:00:0", "left"):
         assert (part in err) == is_shown
-
-
-def failed_checks(program: Program, *arguments: str) -> list[dict[str, Any]]:
-    """Run `ltcl doctor`, and return the checks that fail."""
-    outcome = program("doctor", *arguments, "--json")
-    assert outcome.code == 1
-    assert outcome.document["passed"] is False
-    return [check for check in outcome.document["checks"] if not check["passed"]]
-
-
-def test_doctor_tries_every_solver_and_product(program, device, monkeypatch):
-    kernel = Device.kernel
-    files = set()
-
-    def record(self: Device, file: str, *arguments: Any, **defines: Any) -> Any:
-        files.add(file)
-        return kernel(self, file, *arguments, **defines)
-
-    monkeypatch.setattr(Device, "kernel", record)
-    report = program("doctor", "--json").json
-    assert report["passed"] is True
-    names = {check["check"] for check in report["checks"]}
-    assert {f"solve, {method}" for method in METHODS} <= names
-    assert files >= KERNELS
-
-
-def test_a_compiler_prints_nothing(device, capfd):
-    """Remarks on a kernel of constants; a define of its own keeps the driver's cache out."""
-    device.kernel("form_factor", "form_factor_matvec", K=1, LANES=8, BLOCKS=0, FRESH=time.time_ns())
-    assert capfd.readouterr() == ("", "")
-
-
-def test_each_failed_check_has_a_fix(program, monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    monkeypatch.setenv("LTCL_CACHE", str(tmp_path / "file"))
-    monkeypatch.setitem(doctor.LIMITS, "product", 0.0)
-    cache, *products = failed_checks(program)
-    assert cache["check"] == "cache folder"
-    assert "LTCL_CACHE" in cache["fix"]
-    assert products != []
-    for check in products:
-        assert check["check"].startswith("product,")
-        assert "NumPy" in check["found"]
-
-
-def test_an_unknown_device_fails_a_check(program):
-    printed = program("doctor", "--device", "nonsense").out
-    for word in ("FAILED", "nonsense", "fix: ", "ltcl devices", "1 of "):
-        assert word in printed
-
-
-def test_a_missing_driver_fails_a_check(program, monkeypatch):
-    monkeypatch.setattr(discovery, "list_devices", list)
-    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    (check,) = failed_checks(program)
-    assert "OCL_ICD_VENDORS=/nowhere" in check["found"]
-
-
-@pytest.mark.slow
-def test_a_driver_that_crashes_or_hangs_is_named(program, monkeypatch, tmp_path):
-    """The trial runs the file of a driver, as the loader would load it."""
-    trial = "import os, time; exec(open(os.environ['OCL_ICD_VENDORS']).read())"
-    monkeypatch.setattr(doctor, "TRIAL", trial)
-    monkeypatch.setattr(doctor, "SECONDS", 2)
-    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
-    actions = {
-        "crash": "os.abort()",
-        "hang": "time.sleep(60)",
-        "good": "",
-        "odd": "raise RuntimeError",
-    }
-    for name, action in actions.items():
-        (tmp_path / f"{name}.icd").write_text(action)
-    (check,) = failed_checks(program)
-    crashing, working = check["found"].split("working")
-    # The driver of the wheel is there, too.
-    assert re.findall(r"(\w+)\.icd", crashing) == ["crash", "hang"]
-    assert {"good", "odd"} <= {*re.findall(r"(\w+)\.icd", working)}
-    assert "OCL_ICD_VENDORS" in check["fix"]
 
 
 def test_devices_mark_the_one_that_would_be_chosen(program, device):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 import math
 import re
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -263,3 +264,9 @@ def test_status_codes_say_what_to_do(device, monkeypatch, name, kind, advice):
     for act in (x.get, lambda: vectors.fill(x, 1.0)):
         with pytest.raises(kind, match=f"{device.name}: .*{name}.*{advice}|{name}.*{advice}"):
             act()
+
+
+def test_a_compiler_prints_nothing(device, capfd):
+    """Remarks on a kernel of constants; a define of its own keeps the driver's cache out."""
+    device.kernel("form_factor", "form_factor_matvec", K=1, LANES=8, BLOCKS=0, FRESH=time.time_ns())
+    assert capfd.readouterr() == ("", "")
