@@ -33,6 +33,7 @@ COMMANDS = [
     "info",
     "analyze",
     "convert",
+    "align",
     "compress",
     "denoise",
     "invert",
