@@ -34,6 +34,7 @@ COMMANDS = [
     "info",
     "analyze",
     "convert",
+    "align",
     "compress",
     "denoise",
     "invert",
