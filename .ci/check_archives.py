@@ -28,15 +28,17 @@ def checkout(*folders: str) -> set[str]:
 def missing(archive: Path) -> set[str]:
     """Names that `archive` should hold and does not."""
     if archive.suffix == ".whl":
-        wanted = checkout("ltcl") | {f"ltcl/{name}" for name in checkout("kernels")}
+        required = checkout("ltcl") | {f"ltcl/{name}" for name in checkout("kernels")}
         with zipfile.ZipFile(archive) as wheel:
-            return wanted - set(wheel.namelist())
-    wanted = checkout("ltcl", "kernels", "tests", "bench", "docs/tutorials", "docs/examples", ".ci")
-    wanted |= {"pyproject.toml", "LICENSE", "CITATION.cff"}
+            return required - set(wheel.namelist())
+    required = checkout(
+        "ltcl", "kernels", "tests", "bench", "docs/tutorials", "docs/examples", ".ci"
+    )
+    required |= {"pyproject.toml", "LICENSE", "CITATION.cff"}
     pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / ".github").rglob("*.md")]
-    wanted |= {path.relative_to(ROOT).as_posix() for path in pages}
+    required |= {path.relative_to(ROOT).as_posix() for path in pages}
     with tarfile.open(archive) as sdist:
-        return wanted - {name.partition("/")[2] for name in sdist.getnames()}
+        return required - {name.partition("/")[2] for name in sdist.getnames()}
 
 
 def broken_links(wheel: Path) -> list[str]:

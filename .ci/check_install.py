@@ -36,14 +36,14 @@ assert importlib.metadata.version("ltcl") == ltcl.__version__
 
 def interpreter(version: str) -> str | None:
     """The Python of that version on PATH, if there is one that can make virtual environments."""
-    found = shutil.which(f"python{version}")
-    if found is None:
+    python = shutil.which(f"python{version}")
+    if python is None:
         return None
     # Version managers put a command of every version there, most of which only say that they are
     # not active.
     code = "import ensurepip, sys, venv; print(sys.version.split()[0])"
-    answer = subprocess.run([found, "-c", code], capture_output=True, text=True, check=False)  # noqa: S603
-    return found if answer.returncode == 0 and answer.stdout.startswith(f"{version}.") else None
+    answer = subprocess.run([python, "-c", code], capture_output=True, text=True, check=False)  # noqa: S603
+    return python if answer.returncode == 0 and answer.stdout.startswith(f"{version}.") else None
 
 
 def use(python: str, archive: Path, folder: Path) -> str | None:
@@ -87,10 +87,10 @@ def main() -> int:
     parser.add_argument("archives", nargs="+", type=Path)
     parser.add_argument("--python", action="append", choices=NAMED, help="these versions only")
     parser.add_argument("--all", action="store_true", help="a Python that is missing is an error")
-    given = parser.parse_args()
-    archives = [path.resolve(strict=True) for path in given.archives]
+    arguments = parser.parse_args()
+    archives = [path.resolve(strict=True) for path in arguments.archives]
     failed, missing = 0, []
-    for version in given.python or NAMED:
+    for version in arguments.python or NAMED:
         python = interpreter(version)
         if python is None:
             missing.append(version)
@@ -106,7 +106,9 @@ def main() -> int:
     if missing:
         print(f"NOT TESTED, since PATH has no such Python with venv: {', '.join(missing)}")
     return int(
-        failed > 0 or (given.all and bool(missing)) or len(missing) == len(given.python or NAMED)
+        failed > 0
+        or (arguments.all and bool(missing))
+        or len(missing) == len(arguments.python or NAMED)
     )
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -57,7 +58,8 @@ def bounce(scene: Scene, light: np.ndarray) -> np.ndarray:
 
 def all_bounces(scene: Scene, l_d: np.ndarray) -> np.ndarray:
     """Return l_out = (I - A)^-1 l_d of (channels, N) in float64 (eq. 5)."""
-    system = np.eye(l_d.shape[-1]) - scene.albedo[:, :, None] * scene.form_factors
+    bounced = scene.albedo[:, :, None] * scene.form_factors
+    system = np.eye(l_d.shape[-1]) - bounced
     return np.linalg.solve(system, l_d[..., None])[..., 0]
 
 
@@ -69,7 +71,7 @@ def terms(systems: Sequence[Any], l_out: np.ndarray, count: int) -> np.ndarray:
     powers = [l_out]
     for _ in range(count):
         power = powers[-1]
-        products = [S @ light for S, light in zip(systems, power, strict=True)]
+        products = list(map(operator.matmul, systems, power))
         powers.append(power - np.stack(products))
     return np.stack(powers)
 
@@ -125,7 +127,8 @@ def race(name: str, n: int, sides: int, albedo: float, device: ltcl.Device) -> R
     """Undo the bounces in a box under light that is constant on each wall."""
     scene = box(n, sides=sides, albedo=albedo)
     l_d = albedo * light_on_walls(n, sides)
-    transport = scene.transport(first_bounce=scene.first_bounce, device=device)
+    F = scene.first_bounce
+    transport = scene.transport(first_bounce=F, device=device)
     (S,) = transport.systems
     (l_out,) = all_bounces(scene, l_d[None])
     jacobi = ltcl.solve(S, l_out, "jacobi", rtol=1e-5, throw=False)

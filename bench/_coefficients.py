@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,11 @@ def analysis(W: Wavelet) -> Callable[[np.ndarray], np.ndarray]:
     return analyze
 
 
+def norms(arrays: Iterable[np.ndarray]) -> np.ndarray:
+    """The norm of each array."""
+    return np.array([np.linalg.norm(array) for array in arrays])
+
+
 def relative_error(approximation: np.ndarray, exact: np.ndarray) -> float:
     """Error of (N,) or (N, k) in the norm over pixels, of the worst column."""
     error_norms = np.linalg.norm(approximation - exact, axis=0)
@@ -58,8 +63,8 @@ def keep_largest(matrix: Any, x: np.ndarray, y: np.ndarray, error: float) -> sci
 
     largest = float(max(matrix.max(), -matrix.min()))
     threshold = bisect(product_error, error, largest)
-    remaining = [drop_below(matrix[rows], threshold)[0] for rows in blocks]
-    return scipy.sparse.csr_array(scipy.sparse.vstack(remaining, format="csr"))
+    rest = [drop_below(matrix[rows], threshold)[0] for rows in blocks]
+    return scipy.sparse.csr_array(scipy.sparse.vstack(rest, "csr"))
 
 
 def bisect(error: Callable[[float], float], max_error: float, high: float) -> float:

@@ -65,8 +65,8 @@ class Bounce:
         columns = waves.view(np.float64)
         on_left = self._spectrum @ columns[:, n:]
         on_right = self._spectrum.transpose(0, 2, 1) @ columns[:, :n]
-        received = np.concatenate([on_left, on_right], axis=1).view(np.complex128)
-        bounced = np.fft.irfft(received, 2 * n, axis=0)[:n]
+        received = np.concatenate([on_left, on_right], axis=1)
+        bounced = np.fft.irfft(received.view(np.complex128), 2 * n, axis=0)[:n]
         return self.albedo * bounced.reshape(np.shape(x))
 
 
@@ -79,8 +79,9 @@ def _form_factors(n: int) -> np.ndarray:
     offsets = np.broadcast_arrays(p + 0.5 - n, q + 0.5, d)
     layers = []
     for distance in range(n):
-        places = np.stack([offset[distance] for offset in offsets], axis=-1).reshape(-1, 3)
-        layers.append(exchange.exchange(left_wall, right_wall, places).reshape(n, n))
+        places = np.stack([offset[distance] for offset in offsets], axis=-1)
+        offset_factors = exchange.exchange(left_wall, right_wall, places.reshape(-1, 3))
+        layers.append(offset_factors.reshape(n, n))
     return np.stack(layers)
 
 
@@ -90,7 +91,8 @@ def interreflection(n: int, albedo: float, progress: Callable[[str], object]) ->
     half = n // 2
     size = n * n // 2
     # 1. Form factors of the upper left quarter, and of its three mirror images, as it sees them.
-    upper = A.rows(0, A.shape[0] // 2).reshape(half, 2 * n, n, 2 * n)[:, :n]
+    left_wall_rows = A.rows(0, A.shape[0] // 2)
+    upper = left_wall_rows.reshape(half, 2 * n, n, 2 * n)[:, :n]
     quarters = _quarters(n)
     views = [upper[:, :, v, h].reshape(size, size) for v, h in quarters]
     images = np.stack(views) / albedo
@@ -105,9 +107,9 @@ def interreflection(n: int, albedo: float, progress: Callable[[str], object]) ->
     # 3. Blocks of R: a quarter and its image see each other by the sum over all classes.
     R = np.empty((n, 2 * n, n, 2 * n), np.float32)
     for image, class_signs in enumerate(signs):
-        block = np.tensordot(class_signs / 4, interreflections, 1).reshape(half, n, half, n)
+        block = np.tensordot(class_signs / 4, interreflections, 1)
         for receiver in range(4):
-            R[(*quarters[receiver], *quarters[receiver ^ image])] = block
+            R[(*quarters[receiver], *quarters[receiver ^ image])] = block.reshape(half, n, half, n)
     return R.reshape(A.shape)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +81,11 @@ def conclude(
         raise SystemExit(1)
 
 
+def values(rows: Iterable[Any], attribute: str) -> np.ndarray:
+    """One attribute of all rows, stacked."""
+    return np.array([getattr(row, attribute) for row in rows])
+
+
 def page(height: int, title: str, *subtitle: str) -> Figure:
     """Make a page with a title and lines below it: 80 pixels, and 22 more for each further line."""
     figure = figure_of(WIDTH, height)
@@ -106,11 +111,13 @@ def picture(
     """
     left, top, width = place
     height = width * image.shape[0] / image.shape[1]
-    label_at(figure, left, top - 6, label, size=10.5, fontweight="bold", va="bottom")
+    style = {"size": 10.5, "fontweight": "bold", "va": "bottom"}
+    label_at(figure, left, top - 6, label, **style)
     axes = axes_at(figure, (left, top, width, height))
     axes.imshow(image, interpolation="antialiased", aspect="auto")
     axes.axis("off")
-    label_at(figure, left, top + height + 5, note, size=9.5, color=FAINT, linespacing=1.35)
+    below = top + height + 5
+    label_at(figure, left, below, note, size=9.5, color=FAINT, linespacing=1.35)
 
 
 def pictures(figure: Figure, top: float, images: Sequence[tuple[Any, ...]], gap: int = 14) -> None:
@@ -136,6 +143,12 @@ def graph(
     axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
     return axes
+
+
+def legend(axes: Axes, size: float = 10, labelcolor: str = "linecolor", **place: Any) -> None:
+    """Name the curves, each in its own colour by default."""
+    style = {"frameon": False, "fontsize": size, "labelcolor": labelcolor}
+    axes.legend(**style, **place)
 
 
 def light(scene: Scene, values: np.ndarray, gain: float = 1.0) -> np.ndarray:

@@ -12,6 +12,7 @@ import json
 import platform
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -120,7 +121,7 @@ def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> di
     action runs until the processor is awake, and once more, which counts: in a solve a product
     follows a product.
     """
-    times: dict[str, list[float]] = {name: [] for name in actions}
+    times = defaultdict(list)
     for _ in range(repeats):
         for name, action in actions.items():
             time.sleep(_rest_seconds)
@@ -131,7 +132,18 @@ def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> di
             start = time.perf_counter()
             action()
             times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}
+    return medians(times)
+
+
+def milliseconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:
+    """Median milliseconds of each action, by `seconds`."""
+    times = seconds(actions, repeats)
+    return {name: 1e3 * spent for name, spent in times.items()}
+
+
+def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
+    """Median of each list of samples."""
+    return {name: statistics.median(values) for name, values in samples.items()}
 
 
 def product(A: Operator, x: np.ndarray) -> Callable[[], None]:
@@ -265,7 +277,8 @@ def _bars(title: str, rows: list[Row]) -> Any:
     axes.barh(heights, ratios, color="#3b6ea5", label="measured")
     for height, row in zip(heights, rows, strict=True):
         if row.target is not None:
-            axes.plot([row.target] * 2, [height - 0.4, height + 0.4], color="#c0392b", lw=2)
+            ends = [height - 0.4, height + 0.4]
+            axes.plot([row.target] * 2, ends, color="#c0392b", lw=2)
     labels = [f"{row.question}\nagainst {row.competitor}" for row in rows]
     axes.set_yticks(heights, labels, fontsize=7)
     axes.set_xscale("log")

@@ -40,6 +40,7 @@ import ltcl
 from _coefficients import relative_error
 from _figures import Claim
 from _harness import parse_options
+from ltcl import Transport
 from ltcl.acquisition import Report, VirtualRig, acquire
 from ltcl.device import Device
 from ltcl.store import BlockStore
@@ -98,9 +99,9 @@ class Scan:
 def corner(n: int, albedo: float = ALBEDO) -> np.ndarray:
     """T of two walls of n x n / 2 pixels, from exact form factors of squares joined in pairs."""
     G = np.asarray(ltcl.scenes.dihedral(n).form_factors, np.float64)
-    joined = G.reshape(n, n, 2, n, n, 2).sum(axis=5).mean(axis=2)
-    pairs = joined.reshape(n * n, n * n)
-    return albedo * np.linalg.inv(np.eye(n * n) - albedo * pairs)
+    pairs = G.reshape(n, n, 2, n, n, 2).sum(axis=5).mean(axis=2)
+    absorbed = np.eye(n * n) - albedo * pairs.reshape(n * n, n * n)
+    return albedo * np.linalg.inv(absorbed)
 
 
 def held_patterns(n: int) -> np.ndarray:
@@ -151,11 +152,11 @@ class Truth:
         return np.moveaxis(np.array(channels), 0, -1)
 
 
-def measured_pictures(T: ltcl.Transport, patterns: np.ndarray) -> np.ndarray:
+def measured_pictures(T: Transport, patterns: np.ndarray) -> np.ndarray:
     """Pictures (N, k, channels) of a measured T."""
     N, k, channels = patterns.shape
-    frames = np.moveaxis(patterns, 1, 0).reshape(k, *T.grid, channels)
-    frames = frames.astype(np.float32)
+    frames = np.moveaxis(patterns, 1, 0).astype(np.float32)
+    frames = frames.reshape(k, *T.grid, channels)
     if channels == 1:
         frames = frames[..., 0]
     pictures = np.asarray(T @ frames, np.float64)
@@ -210,7 +211,7 @@ def run_scan(truth: Truth, camera: str, strategy: str, device: Device, name: str
 class Judge:
     """Errors of a measured T in the camera's unit of light, `unit` in each channel."""
 
-    def __init__(self, T: ltcl.Transport, truth: Truth) -> None:
+    def __init__(self, T: Transport, truth: Truth) -> None:
         self.T = T
         self.truth = truth
         self.channels = truth.channels
@@ -222,13 +223,12 @@ class Judge:
 
     def row_sum_error(self) -> float:
         """Largest relative error of a row sum."""
-        ratio = self.unit * self._white / self._true_white
-        return float(np.max(np.abs(ratio - 1)))
+        ratios = self.unit * self._white / self._true_white
+        return float(np.max(np.abs(ratios - 1)))
 
     def pattern_error(self) -> float:
         """Relative error of T p of held patterns."""
-        grey = held_patterns(self.truth.n)[..., None]
-        patterns = np.repeat(grey, self.channels, axis=-1)
+        patterns = self._grey(held_patterns(self.truth.n))
         ours = self.unit * measured_pictures(self.T, patterns)
         return relative_error(ours, self.truth.pictures(patterns))
 
@@ -238,21 +238,21 @@ class Judge:
         place = np.arange(n) // (n // TILES)
         tile = (place[:, None] * TILES + place).ravel()[:, None]
         tiles = np.arange(TILES**2)
-        patterns = np.repeat((tile == tiles)[..., None], self.channels, axis=-1)
+        patterns = self._grey(tile == tiles)
         row, column = np.divmod(tile, TILES)
-        lit_row, lit_column = np.divmod(tiles, TILES)
-        distance = np.maximum(abs(row - lit_row), abs(column - lit_column))
+        other_row, other_column = np.divmod(tiles, TILES)
+        row_distance = abs(row - other_row)
+        distance = np.maximum(row_distance, abs(column - other_column))
         is_far = (distance > 1)[..., None]
-        pictures = self.unit * measured_pictures(self.T, patterns)
-        ours = np.sum(is_far * pictures, axis=1)
+        measured = self.unit * measured_pictures(self.T, patterns)
+        ours = np.sum(is_far * measured, axis=1)
         exact = np.sum(is_far * self.truth.pictures(patterns), axis=1)
         total_errors = np.abs(ours.sum(axis=0) / exact.sum(axis=0) - 1)
         return relative_error(ours, exact), float(np.max(total_errors))
 
     def bounce_errors(self) -> tuple[list[float], float]:
         """Root mean square errors over their deviations, of bounces 0 to 3; share within three."""
-        smooth = held_patterns(self.truth.n)[:, 4]
-        pattern = np.repeat(smooth[:, None, None], self.channels, axis=-1)
+        pattern = self._grey(held_patterns(self.truth.n)[:, 4:5])
         image = self.truth.pictures(pattern)[:, 0]
         picture = image.reshape(*self.T.grid, self.channels).astype(np.float32)
         if self.channels == 1:
@@ -264,9 +264,12 @@ class Judge:
         mean_square = np.mean(error**2, axis=(1, 2))
         variance = np.mean(deviation.astype(np.float64) ** 2, axis=(1, 2))
         ratios = np.sqrt(mean_square / variance)
-        is_within = np.abs(error) < 3 * deviation
-        shares_within = np.mean(is_within, axis=(1, 2))
+        shares_within = np.mean(np.abs(error) < 3 * deviation, axis=(1, 2))
         return ratios.tolist(), float(np.min(shares_within))
+
+    def _grey(self, patterns: np.ndarray) -> np.ndarray:
+        """Patterns (N, k) in each channel, (N, k, channels)."""
+        return np.repeat(patterns[..., None], self.channels, axis=-1)
 
     def _all_bounces(self, separation: Any) -> np.ndarray:
         """Direct light and bounces, (4, N, channels)."""
@@ -284,15 +287,18 @@ class Judge:
         if self.channels == 1:
             target = target[..., 0]
         pattern = ltcl.compensate(self.T, target, rtol=1e-3).pattern
-        light = np.asarray(pattern, np.float64).reshape(-1, 1, self.channels)
-        picture = self.truth.pictures(light)[:, 0]
+        light = np.asarray(pattern, np.float64)
+        picture = self.truth.pictures(light.reshape(-1, 1, self.channels))[:, 0]
         error = picture - desired.reshape(-1, self.channels)
         return float(10 * np.log10(desired.max() ** 2 / np.mean(error**2)))
 
 
 def claims(scans: list[Scan], costs: list[Scan], largest: int) -> list[Claim]:
     """Check costs, those of `largest` pixels first, and the errors of all scans."""
-    photographs = {cost.strategy: cost.photographs for cost in costs if cost.pixels == largest}
+    photographs = {}
+    for cost in costs:
+        if cost.pixels == largest:
+            photographs[cost.strategy] = cost.photographs
     adaptive = photographs["adaptive"]
     by_pixel = photographs["pixel"]
     fifth = Claim(
@@ -301,7 +307,8 @@ def claims(scans: list[Scan], costs: list[Scan], largest: int) -> list[Claim]:
         wanted="at most 1 / 5",
         holds=5 * adaptive <= by_pixel,
     )
-    over_plan = max(cost.photographs / cost.planned for cost in costs)
+    planned_photographs = figures.values(costs, "planned")
+    over_plan = (figures.values(costs, "photographs") / planned_photographs).max()
     planned = Claim(
         text="photographs over what the plan said, at most",
         measured=f"{over_plan:.3f}",
@@ -316,24 +323,6 @@ def claims(scans: list[Scan], costs: list[Scan], largest: int) -> list[Claim]:
 
 def scan_claims(scan: Scan) -> list[Claim]:
     """Check the errors of one scan."""
-    patterns = Claim(
-        text=f"{scan.name}: T p of held patterns",
-        measured=f"{scan.pattern_error:.2%}",
-        wanted="at most 2 %",
-        holds=scan.pattern_error <= MAX_ERROR,
-    )
-    row_sums = Claim(
-        text=f"{scan.name}: row sum furthest off",
-        measured=f"{scan.row_sum_error:.2%}",
-        wanted="at most 2 %",
-        holds=scan.row_sum_error <= MAX_ERROR,
-    )
-    far_light = Claim(
-        text=f"{scan.name}: far light, all",
-        measured=f"{scan.far_total_error:.2%} off",
-        wanted="at most 2 %",
-        holds=scan.far_total_error <= MAX_ERROR,
-    )
     compensated = Claim(
         text=f"{scan.name}: compensated",
         measured=f"{scan.decibels:.1f} dB",
@@ -348,7 +337,17 @@ def scan_claims(scan: Scan) -> list[Claim]:
         wanted="at most 2",
         holds=max(later) <= MAX_DEVIATIONS,
     )
-    return [patterns, row_sums, far_light, compensated, bounces]
+    return [
+        error_claim(f"{scan.name}: T p of held patterns", scan.pattern_error),
+        error_claim(f"{scan.name}: row sum furthest off", scan.row_sum_error),
+        error_claim(f"{scan.name}: far light, all", scan.far_total_error, " off"),
+        compensated,
+        bounces,
+    ]
+
+
+def error_claim(text: str, error: float, suffix: str = "") -> Claim:
+    return Claim(text, f"{error:.2%}{suffix}", "at most 2 %", error <= MAX_ERROR)
 
 
 def collect_facts(scans: list[Scan], costs: list[Scan], pixels: int) -> dict[str, Any]:
@@ -375,12 +374,15 @@ def draw(costs: list[Scan]) -> Figure:
         "What it takes to measure a transport",
         "A corner of n x n pixels, a camera of 12 bits. Dashed: what plans said.",
     )
-    photographs = figures.graph(figure, (70, 140, 260, 230), "photographs", "pixels", "")
+    box = (70, 140, 260, 230)
+    photographs = figures.graph(figure, box, "photographs", "pixels", "")
     plot_costs(photographs, costs, "photographs", "planned")
-    photographs.legend(frameon=False, labelcolor=figures.FAINT, fontsize=9.5)
-    exposure = figures.graph(figure, (390, 140, 260, 230), "hours of exposure", "pixels", "")
+    figures.legend(photographs, 9.5, figures.FAINT)
+    box = (390, 140, 260, 230)
+    exposure = figures.graph(figure, box, "hours of exposure", "pixels", "")
     plot_costs(exposure, costs, "exposure", "planned_exposure", unit=3600)
-    seconds = figures.graph(figure, (710, 140, 260, 230), "seconds of computing", "pixels", "")
+    box = (710, 140, 260, 230)
+    seconds = figures.graph(figure, box, "seconds of computing", "pixels", "")
     plot_costs(seconds, costs, "seconds")
     return figure
 
@@ -401,12 +403,15 @@ def plot_costs(
             values.append(getattr(cost, quantity) / unit)
             if planned is not None:
                 planned_values.append(getattr(cost, planned) / unit)
-        axes.plot(pixels, values, "o-", ms=4, lw=width, color=colour, label=label)
+        style = {"ms": 4, "lw": width, "color": colour, "label": label}
+        axes.plot(pixels, values, "o-", **style)
         if planned is not None:
             axes.plot(pixels, planned_values, "--", lw=1, color=colour)
     axes.set_xscale("log")
-    axes.set_xticks([n * n for n in sides], [f"{n}\u00b2" for n in sides])
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+    squares = np.array(sides) ** 2
+    axes.set_xticks(squares, [f"{n}\u00b2" for n in sides])
+    decades = LogLocator(subs=(1.0, 2.0, 5.0), numticks=20)
+    axes.yaxis.set_major_locator(decades)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.minorticks_off()
 
@@ -432,7 +437,8 @@ def main() -> None:
         smaller = Truth([corner(n)])
         costs.append(run(smaller, "film, 12 bits", strategy, name=f"{strategy}, {n}"))
     costs += [scan for scan in scans if "film" in scan.name]
-    coloured = Truth([corner(colour_side, albedo) for albedo in COLOURS], MIXING)
+    matrices = [corner(colour_side, albedo) for albedo in COLOURS]
+    coloured = Truth(matrices, MIXING)
     for strategy in STRATEGIES[:2]:
         scans.append(run(coloured, "srgb, 8 bits", strategy, name=f"{strategy}, colours"))
     facts = collect_facts(scans, costs, largest**2)

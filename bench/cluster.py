@@ -28,6 +28,7 @@ from distributed import Client, LocalCluster
 
 import ltcl
 from _harness import Row, parse_options, report
+from ltcl import Transport
 
 # Frames in a batch, and tolerance of their solves.
 BATCH = 4
@@ -81,7 +82,7 @@ def process_ids(client: Client) -> list[int]:
     return [*answers.values()]
 
 
-def film(T: ltcl.Transport, folder: Path, frames: int) -> Path:
+def film(T: Transport, folder: Path, frames: int) -> Path:
     """Write pictures of a light that drifts, within the projector's range."""
     light = 0.3 + 0.2 * np.random.default_rng(0).random(T.grid, np.float32)
     for number in range(frames):
@@ -93,7 +94,7 @@ def film(T: ltcl.Transport, folder: Path, frames: int) -> Path:
 class Film:
     """A film of `frames` pictures in the folder `source`, and the transport of its scene."""
 
-    T: ltcl.Transport
+    T: Transport
     source: Path
     frames: int
 
@@ -174,11 +175,11 @@ def measure_memory(client: Client, folder: Path, frames: int, is_smoke: bool) ->
 
     def weigh(step: str, done: int, total: int | None) -> None:
         if done % (10 * BATCH) == 0:
-            processes = [this_process]
-            processes += [psutil.Process(process) for process in process_ids(client)]
-            megabytes.append(max(process.memory_info().rss for process in processes) / 1e6)
+            processes = [this_process, *map(psutil.Process, process_ids(client))]
+            nbytes = [process.memory_info().rss for process in processes]
+            megabytes.append(max(nbytes) / 1e6)
 
-    T = ltcl.Transport(np.eye(64), (8, 8))
+    T = Transport(np.eye(64), (8, 8))
     small = Film(T=T, source=film(T, folder / "small", frames), frames=frames)
     small.compensate(folder / "many", client=client, progress=weigh, resize=True)
     quarter = max(1, len(megabytes) // 4)

@@ -10,6 +10,7 @@ largest loss of appearance, direct light and compensating pattern, over the stat
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ import ltcl
 from _coefficients import relative_error
 from _figures import Claim
 from _harness import parse_options
-from ltcl import scenes
+from ltcl import Transport, scenes
 from ltcl.scenes.landscape import landscape
 from scenes import tracing
 
@@ -62,7 +63,7 @@ def box(n: int) -> np.ndarray:
     return T.to_numpy()[np.ix_(order, order)]
 
 
-def measure(T: np.ndarray, grid: tuple[int, int]) -> list[ltcl.Transport]:
+def measure(T: np.ndarray, grid: tuple[int, int]) -> list[Transport]:
     """Two measurements with independent noise."""
     F = np.diagonal(T).astype(np.float64)
     identity = np.eye(len(F))
@@ -72,7 +73,7 @@ def measure(T: np.ndarray, grid: tuple[int, int]) -> list[ltcl.Transport]:
     for seed in (1, 2):
         noisy = np.random.default_rng(seed).poisson(counts * R) / counts
         entries = ((identity + noisy) * F).astype(np.float32)
-        measurements.append(ltcl.Transport(entries, grid))
+        measurements.append(Transport(entries, grid))
     return measurements
 
 
@@ -88,7 +89,8 @@ def held_pictures(grid: tuple[int, int], count: int) -> np.ndarray:
         page = _page(grid, random)
         if not page.any():
             page = board
-        pixel = np.eye(1, page.size, int(random.integers(page.size))).reshape(grid)
+        pixel = np.zeros(page.size)
+        pixel[random.integers(page.size)] = 1.0
         kinds = (part, page, board, pixel)
         pictures.append(kinds[number % 4].ravel())
     return np.stack(pictures, axis=1)
@@ -122,7 +124,7 @@ def _page(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
     return page / 255.0
 
 
-def picture_loss(T: ltcl.Transport, C: ltcl.Transport, count: int) -> float:
+def picture_loss(T: Transport, C: Transport, count: int) -> float:
     """Largest error of any held picture: of its light on the scene, and of light that shows it."""
     (S,) = T.systems
     approximate = C.systems[0].as_it_stands()
@@ -131,21 +133,21 @@ def picture_loss(T: ltcl.Transport, C: ltcl.Transport, count: int) -> float:
     appearance = S @ direct
     # Direct light that shows the pictures, by both systems.
     needed = ltcl.solve(S, pictures, rtol=ACCURATE).x
-    approximately_needed = ltcl.solve(approximate, pictures, rtol=ACCURATE).x
+    shown = ltcl.solve(approximate, pictures, rtol=ACCURATE).x
     undone = ltcl.solve(approximate, appearance, rtol=ACCURATE).x
-    errors = [
-        relative_error(np.asarray(approximate @ direct), np.asarray(appearance)),
-        relative_error(np.asarray(undone), np.asarray(direct)),
-        relative_error(np.asarray(approximately_needed), np.asarray(needed)),
-        relative_error(np.asarray(S @ approximately_needed), np.asarray(pictures)),
+    pairs = [
+        (approximate @ direct, appearance),
+        (undone, direct),
+        (shown, needed),
+        (S @ shown, pictures),
     ]
-    return max(errors)
+    return max(itertools.starmap(relative_error, pairs))
 
 
 class Case:
     """Compression of the first of two measurements, judged by the second."""
 
-    def __init__(self, name: str, pair: list[ltcl.Transport], pictures: int) -> None:
+    def __init__(self, name: str, pair: list[Transport], pictures: int) -> None:
         self.name = name
         self.T, self.second = pair
         self.pictures = pictures
@@ -174,18 +176,19 @@ class Case:
             if rtol == "noise":
                 self._claim_accuracy(error / exact_error)
 
-    def pattern_error(self, T: ltcl.Transport) -> float:
+    def pattern_error(self, T: Transport) -> float:
         """Relative error of T p, beside the second measurement."""
         ours = np.asarray(T.operators[0] @ self.patterns).ravel()
         exact = np.asarray(self.second.operators[0] @ self.patterns).ravel()
         return relative_error(ours, exact)
 
-    def _add_facts(self, limit: str, C: ltcl.Transport, bytes_a_row: float, error: float) -> None:
+    def _add_facts(self, limit: str, C: Transport, bytes_a_row: float, error: float) -> None:
         worst = picture_loss(self.T, C, self.pictures)
+        sizes = f"{bytes_a_row:.4g} bytes a row of {4 * self.pixels}"
+        errors = f"stated {C.error:.3%}, bound {C.error_bound:.3%}, measured {error:.3%}"
+        seconds = f"{C.compression.seconds:.3g} s"
         self.facts[f"{self.name}: {limit}"] = (
-            f"{bytes_a_row:.4g} bytes a row of {4 * self.pixels}, stated {C.error:.3%}, "
-            f"bound {C.error_bound:.3%}, measured {error:.3%}, worst held picture {worst:.3%}, "
-            f"{C.compression.seconds:.3g} s"
+            f"{sizes}, {errors}, worst held picture {worst:.3%}, {seconds}"
         )
         self.facts[f"{OVER}{self.name}, {limit}"] = worst / C.error
 
@@ -208,13 +211,16 @@ class Case:
         self.claims.append(claim)
 
 
-def measured_pairs(n: int, why_not_traced: str) -> dict[str, list[ltcl.Transport]]:
+def measured_pairs(n: int, why_not_traced: str) -> dict[str, list[Transport]]:
     """Two measurements of a simulated box, and of a path-traced one if it can be traced."""
     pairs = {"simulated": measure(box(n), (2 * n, 2 * n))}
     if not why_not_traced:
         grid = (64, 64)
-        traced = [tracing.trace("blocks", grid, PATHS, seed).sum(axis=0) for seed in (1, 2)]
-        pairs["path-traced"] = [ltcl.Transport(T, grid) for T in traced]
+        transports = []
+        for seed in (1, 2):
+            T = tracing.trace("blocks", grid, PATHS, seed).sum(axis=0)
+            transports.append(Transport(T, grid))
+        pairs["path-traced"] = transports
     return pairs
 
 
@@ -263,7 +269,8 @@ def main() -> None:
         holds=largest <= 1.5,
     )
     claims.append(claim)
-    figures.conclude(options, "Compression to what pictures need", claims, facts, Figure)
+    title = "Compression to what pictures need"
+    figures.conclude(options, title, claims, facts, Figure)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, parse_options, product, report, seconds, triad
+from _harness import Options, Row, milliseconds, parse_options, product, report, triad
 from _peers import sparse_products
 from ltcl.operators import CSR
 
@@ -51,16 +51,16 @@ def compare(options: Options, name: str, A: Any) -> list[Row]:
     """Compare on one matrix; everything is timed in turn, so that all ratios are of one moment."""
     run_triad, triad_bytes = triad(options.device, options.smoke)
     actions = {"triad": run_triad} | product_actions(options, name, A)
-    milliseconds = {action: 1e3 * spent for action, spent in seconds(actions).items()}
+    ms = milliseconds(actions)
     rows = []
     for k in SIDES:
-        rows += peer_rows(f"{name}, k = {k}", k, milliseconds)
+        rows += peer_rows(f"{name}, k = {k}", k, ms)
         if k == 1:
-            bandwidth = triad_bytes / milliseconds["triad"] / 1e6
-            rate = 8 * A.nnz / milliseconds["ours 1"] / 1e6
+            bandwidth = triad_bytes / ms["triad"] / 1e6
+            rate = 8 * A.nnz / ms["ours 1"] / 1e6
             rows.append(bandwidth_row(name, bandwidth, rate))
         elif k in SIDE_TARGET:
-            rows.append(side_row(name, k, milliseconds))
+            rows.append(side_row(name, k, ms))
     return rows
 
 
@@ -82,13 +82,13 @@ def product_actions(options: Options, name: str, A: Any) -> dict[str, Callable[[
     return actions
 
 
-def peer_rows(question: str, k: int, milliseconds: dict[str, float]) -> list[Row]:
+def peer_rows(question: str, k: int, ms: dict[str, float]) -> list[Row]:
     """Compare with all peers that are installed."""
     targets = {"scipy": SCIPY_TARGET.get(k), "cupy": CUSPARSE_TARGET}
-    ours = milliseconds[f"ours {k}"]
+    ours = ms[f"ours {k}"]
     rows = []
     for peer, competitor in PEERS.items():
-        theirs = milliseconds.get(f"{peer} {k}")
+        theirs = ms.get(f"{peer} {k}")
         if theirs is not None:
             target = targets.get(peer)
             rows.append(Row.from_times(question, competitor, theirs, ours, "ms", target))
@@ -108,10 +108,10 @@ def bandwidth_row(name: str, bandwidth: float, rate: float) -> Row:
     )
 
 
-def side_row(name: str, k: int, milliseconds: dict[str, float]) -> Row:
+def side_row(name: str, k: int, ms: dict[str, float]) -> Row:
     """Compare the time a side with that of one side alone."""
-    alone = milliseconds["ours 1"]
-    share = milliseconds[f"ours {k}"] / k
+    alone = ms["ours 1"]
+    share = ms[f"ours {k}"] / k
     question = f"{name}, k = {k}"
     return Row.from_times(question, "k = 1", alone, share, "ms a side", SIDE_TARGET[k])
 

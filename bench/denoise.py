@@ -26,8 +26,10 @@ from rich.table import Table
 
 import _figures as figures
 import ltcl
+from _coefficients import norms
 from _figures import Claim
 from _harness import parse_options
+from ltcl import Transport
 from ltcl.plots.page import OTHERS
 from ltcl.tasks.denoising.multiwavelets import multiwavelets
 from ltcl.tasks.denoising.problem import DenoisingProblem
@@ -73,31 +75,33 @@ def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     waves = random.uniform(0.0, 2.0 * np.pi, (3, 10, 1, 1))
     top = random.integers(0, h - side + 1, (10, 1, 1))
     left = random.integers(0, w - side + 1, (10, 1, 1))
-    patch = (y >= top) & (y < top + side) & (x >= left) & (x < left + side)
+    is_in_rows = (y >= top) & (y < top + side)
+    patch = is_in_rows & (x >= left) & (x < left + side)
     smooth = 1.0 + np.cos(waves[0] * y / h + waves[1] * x / w + waves[2])
     binary = random.integers(0, 2, (10, h, w))
     return [binary.astype(float), smooth, patch.astype(float)]
 
 
-def oracle(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
+def oracle(T: Transport, exact: np.ndarray) -> Transport:
     """T denoised by Wiener factors and folds of the truth."""
     Y = T.to_numpy()
     problem = DenoisingProblem.from_entries(Y, T.noise, 0, T.grid, T.grid)
-    thresholded = threshold_coefficients(problem, multiwavelets(problem.grids), ignore_progress)
+    bases = multiwavelets(problem.grids)
+    thresholded = threshold_coefficients(problem, bases, ignore_progress)
     pilot = (exact * problem.gauge).astype(np.float32)
     np.fill_diagonal(pilot, np.diag(thresholded))
     estimate = refine(problem, pilot, ignore_progress)
-    return ltcl.Transport(problem.restore_entries(estimate.Z, Y), T.grid)
+    return Transport(problem.restore_entries(estimate.Z, Y), T.grid)
 
 
 def ignore_progress(share: float) -> None:
     """Ignore the progress of a step."""
 
 
-def truth_with_measured_first_bounce(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
+def truth_with_measured_first_bounce(T: Transport, exact: np.ndarray) -> Transport:
     """Replace the first bounce of the truth by that of T."""
     error = np.diag(T.to_numpy() - exact)
-    return ltcl.Transport(exact + np.diag(error), T.grid)
+    return Transport(exact + np.diag(error), T.grid)
 
 
 def measured(scene: str, n: int, level: float, photons: float) -> Case:
@@ -107,7 +111,7 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
     binary, smooth, _ = kinds
     picture = exact @ np.stack([binary[0], smooth[0]])
 
-    def quantities(T: ltcl.Transport) -> list[np.ndarray]:
+    def quantities(T: Transport) -> list[np.ndarray]:
         bounces = ltcl.separate(T, picture, 3, method="direct").bounces
         return [T @ kind for kind in kinds] + list(bounces)
 
@@ -115,18 +119,16 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
     true = quantities(exact)
     entries = exact.to_numpy()
 
-    def errors(approximation: ltcl.Transport) -> np.ndarray:
-        pairs = zip(quantities(approximation), true, strict=True)
-        return np.array([np.linalg.norm(light - exact_light) for light, exact_light in pairs])
+    def errors(approximation: Transport) -> np.ndarray:
+        return norms(map(np.subtract, quantities(approximation), true))
 
     raw = errors(T)
-    true_norms = [np.linalg.norm(light) for light in true]
     return Case(
         scene=scene,
         pixels=n,
         level=level,
         photons=photons,
-        raw=raw / true_norms,
+        raw=raw / norms(true),
         left=errors(ltcl.denoise(T)) / raw,
         bound=errors(oracle(T, entries)) / raw,
         first=errors(truth_with_measured_first_bounce(T, entries)) / raw,
@@ -135,9 +137,9 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
 
 def claims(cases: Sequence[Case]) -> list[Claim]:
     """Never worse; at most half if the bound allows it, else near the bound."""
-    left = np.stack([case.left for case in cases])
-    bound = np.stack([case.bound for case in cases])
-    first = np.stack([case.first for case in cases])
+    left = figures.values(cases, "left")
+    bound = figures.values(cases, "bound")
+    first = figures.values(cases, "first")
     is_reachable = bound <= REACHABLE
     reached = left[is_reachable]
     ratios = (left / bound)[left > GOAL]
@@ -169,8 +171,8 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
     )
     result = [never_worse, half, near_bound, no_limit]
     for level in LEVELS:
-        is_level = [case.level == level for case in cases]
-        result.append(claim_of_level(level, left[is_level], bound[is_level]))
+        rows = figures.values(cases, "level") == level
+        result.append(claim_of_level(level, left[rows], bound[rows]))
     return result
 
 
@@ -195,45 +197,53 @@ def tables(cases: Sequence[Case]) -> list[Table]:
     """Tables, one a level: error of the raw T, share left (both bounds)."""
     result = []
     for level in LEVELS:
-        table = Table("scene", *QUANTITIES, title=f"noise {level:g}: raw error, left (bounds)")
+        title = f"noise {level:g}: raw error, left (bounds)"
+        table = Table("scene", *QUANTITIES, title=title)
         for case in cases:
             if case.level == level:
-                table.add_row(f"{case.scene} {case.pixels}, {case.photons:g}", *cells(case))
+                scene = f"{case.scene} {case.pixels}, {case.photons:g}"
+                table.add_row(scene, *cells(case))
         result.append(table)
     return result
 
 
 def cells(case: Case) -> list[str]:
     """Errors of a case as text, one a quantity."""
-    errors = zip(case.raw, case.left, case.bound, case.first, strict=True)
-    return [
-        f"{raw:.2g}, {left:.2f} ({bound:.2f}; {first:.2f})" for raw, left, bound, first in errors
-    ]
+    texts = []
+    for raw, left, bound, first in errors_of(case).T:
+        texts.append(f"{raw:.2g}, {left:.2f} ({bound:.2f}; {first:.2f})")
+    return texts
 
 
 def draw(cases: Sequence[Case]) -> Any:
     """Draw the mean share of the error that is left, over the noise, at the largest size."""
-    page = figures.page(470, "ltcl.denoise against the truth", "Dashed: the bound of its wavelets.")
+    title = "ltcl.denoise against the truth"
+    page = figures.page(470, title, "Dashed: the bound of its wavelets.")
     title = f"Errors, {cases[-1].pixels} pixels a side"
     xlabel = "noise, in median first bounces"
-    axes = figures.graph(page, (80, 130, 880, 270), title, xlabel, "share left", "linear")
+    box = (80, 130, 880, 270)
+    axes = figures.graph(page, box, title, xlabel, "share left", "linear")
     axes.set_xscale("log")
     names = dict.fromkeys(case.scene for case in cases)
     for name, colour in zip(names, OTHERS, strict=False):
         cases_of_scene = [case for case in cases if case.scene == name]
         largest = cases_of_scene[-len(LEVELS) :]
-        left = [case.left.mean() for case in largest]
-        bound = [case.bound.mean() for case in largest]
+        left = figures.values(largest, "left").mean(axis=1)
+        bound = figures.values(largest, "bound").mean(axis=1)
         axes.plot(LEVELS, left, color=colour, label=name)
         axes.plot(LEVELS, bound, "--", color=colour)
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=9)
+    figures.legend(axes, 9)
     return page
 
 
+def errors_of(case: Case) -> np.ndarray:
+    """Raw error, share left and both bounds, (4, quantities)."""
+    return np.stack([case.raw, case.left, case.bound, case.first])
+
+
 def facts_of(case: Case) -> dict[str, list[float]]:
-    """Raw error, share left and both bounds of each quantity."""
-    shares = np.stack([case.raw, case.left, case.bound, case.first], axis=1)
-    rounded = shares.astype(float).round(5).tolist()
+    """Rounded errors of each quantity."""
+    rounded = errors_of(case).T.astype(float).round(5).tolist()
     return dict(zip(QUANTITIES, rounded, strict=True))
 
 

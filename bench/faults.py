@@ -274,8 +274,9 @@ def run_scan(
         path = Path(folder) / "T.zarr"
         T = acquire(rig, strategy=strategy, store=path, device=open_device_once())
         patterns = held_patterns(T.grid)
-        pictures = np.asarray(T @ patterns, np.float64).reshape(len(patterns), -1)
-        return pictures, ~np.asarray(T.masked).ravel(), rig.number
+        pictures = np.asarray(T @ patterns, np.float64)
+        is_known = ~np.asarray(T.masked).ravel()
+        return pictures.reshape(len(patterns), -1), is_known, rig.number
 
 
 def held_patterns(grid: tuple[int, int]) -> np.ndarray:
@@ -321,7 +322,8 @@ def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
     try:
         clean, is_known, photographs = run_scan(scan)
     except AcquisitionError as error:
-        return [Outcome(kind=None, scan=name, refused=True, message=str(error))]
+        message = str(error)
+        return [Outcome(kind=None, scan=name, refused=True, message=message)]
     outcomes = [Outcome(kind=None, scan=name, photographs=photographs)]
     for kind in kinds:
         random = np.random.default_rng((scan, KINDS.index(kind)))
@@ -333,8 +335,9 @@ def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
             continue
         columns = is_known & is_seen
         change = relative_error(pictures[:, columns].T, clean[:, columns].T)
-        outcome = Outcome(kind=kind, scan=name, at=at, photographs=photographs, change=change)
-        outcomes.append(outcome)
+        outcomes.append(
+            Outcome(kind=kind, scan=name, at=at, photographs=photographs, change=change)
+        )
     return outcomes
 
 
@@ -349,7 +352,8 @@ def refusal(error: AcquisitionError, kind: str, scan: str, at: int, photographs:
     # A ScanRefused comes at the end, after batches were kept.
     is_early = not isinstance(error, ScanRefused)
     message = str(error)
-    is_named = any(first <= number <= last for number in named_photographs(message))
+    numbers = named_photographs(message)
+    is_named = not numbers.isdisjoint(range(first, last + 1))
     return Outcome(
         kind=kind,
         scan=scan,
@@ -399,7 +403,8 @@ class KindSummary:
         """Faults that were kept or misnamed."""
         kept = [f"{outcome.where}: {outcome.change:.1%}" for outcome in self.missed]
         misnamed = [f"{outcome.where}: {outcome.message}" for outcome in self.misnamed]
-        return {f"{self.kind}, kept": kept, f"{self.kind}, another named": misnamed}
+        prefix = f"{self.kind}, "
+        return {prefix + "kept": kept, prefix + "another named": misnamed}
 
     def shares(self) -> tuple[float, float]:
         """Shares of all faults that were refused, and named."""
@@ -410,7 +415,8 @@ class KindSummary:
 def run_all(jobs: Sequence[tuple[int, Sequence[str]]]) -> list[Outcome]:
     """Run jobs in processes, with a bar on a terminal."""
     outcomes = []
-    with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(PROCESSES, context) as pool:
         results = pool.map(run, jobs)
         is_quiet = not sys.stderr.isatty()
         for result in track(results, "scans", total=len(jobs), disable=is_quiet):
@@ -428,7 +434,9 @@ def main() -> None:
         kinds = KINDS[:1]
         faults = 1
         clean = 1
-    jobs = [(number, kinds if number < faults else ()) for number in range(clean)]
+    jobs = []
+    for number in range(clean):
+        jobs.append((number, kinds if number < faults else ()))
     outcomes = run_all(jobs)
     facts: dict[str, Any] = {
         "scans": len(outcomes),
@@ -442,8 +450,13 @@ def main() -> None:
         claims += summary.claims()
         facts |= summary.facts()
         shares[kind] = summary.shares()
-    wrong = [outcome for outcome in outcomes if outcome.kind is None and outcome.refused]
-    facts["refused without a fault"] = [f"{outcome.scan}: {outcome.message}" for outcome in wrong]
+    wrong = []
+    messages = []
+    for outcome in outcomes:
+        if outcome.kind is None and outcome.refused:
+            wrong.append(outcome)
+            messages.append(f"{outcome.scan}: {outcome.message}")
+    facts["refused without a fault"] = messages
     none_refused = Claim(
         text="scans without a fault, refused",
         measured=f"{len(wrong)} of {clean}",
@@ -453,7 +466,8 @@ def main() -> None:
     claims.append(none_refused)
     # Empty lists say nothing.
     facts = {name: value for name, value in facts.items() if value}
-    figures.conclude(options, "Faults of photographs", claims, facts, partial(draw, shares))
+    draw_shares = partial(draw, shares)
+    figures.conclude(options, "Faults of photographs", claims, facts, draw_shares)
 
 
 def draw(shares: dict[str, tuple[float, float]]) -> Figure:

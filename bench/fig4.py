@@ -142,8 +142,9 @@ def bleeding_claims(series: Series) -> list[Claim]:
 def colour_claim(series: Series) -> Claim:
     before = colour_cast(series.scene, series.sums[0])
     after = colour_cast(series.scene, series.sums[-1])
+    text = "in the end no colour bleeds"
     measured = f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}"
-    return Claim("in the end no colour bleeds", measured, "below 1e-3", after < 1e-3 < before)
+    return Claim(text, measured, "below 1e-3", after < 1e-3 < before)
 
 
 def removal_claim(series: Series) -> Claim:
@@ -157,7 +158,8 @@ def removal_claim(series: Series) -> Claim:
         expected.append(np.tensordot(contents(n, EXPANSION_BOUNCES), bounces, 1))
         if contents(n, n)[1:].any():
             is_absent = False
-    deviations = np.linalg.norm(series.sums[1 : ORDERS + 1] - expected, axis=(1, 2))
+    sums = series.sums[1 : ORDERS + 1]
+    deviations = np.linalg.norm(sums - expected, axis=(1, 2))
     error = deviations.max() / np.linalg.norm(series.l_d)
     prefix = "" if is_absent else "not "
     measured = f"coefficients {prefix}0; sums off their expansion in A by {error:.1g}"
@@ -216,7 +218,8 @@ def draw_terms(figure: Figure, series: Series) -> None:
         scale = 1 / np.quantile(np.abs(series.terms[n]), 0.999)
         image = figures.signed(scene, scene.picture(series.terms[n]), scale)
         note = f"shown \u00d7 {scale:.2g}"
-        figures.picture(figure, (left, 340, width), image, f"${term_formula(n)}$", note)
+        formula = f"${term_formula(n)}$"
+        figures.picture(figure, (left, 340, width), image, formula, note)
     note = "Even terms are light\nthat bled: red, green.\nOdd ones take light\naway: cyan, magenta."
     label_at(figure, lefts[-1], 350, note, size=10, color=FAINT, linespacing=1.5)
 
@@ -242,7 +245,7 @@ def draw_errors(figure: Figure, series: Series) -> None:
     draw_channel_error(axes, series, 1, "green", color="#8bd17c", ls="-")
     draw_channel_error(axes, series, 0, "red", color="#ff5d5d", ls="--")
     draw_channel_error(axes, series, 2, "blue", color="#5c9cff", ls="-")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
     axes.set_xlim(0, TERMS)
 
 
@@ -258,10 +261,12 @@ def draw_contents(figure: Figure) -> None:
     title = "How often each bounce of light is in the sum"
     label_at(figure, 30, 572, title, size=11, fontweight="bold", va="bottom")
     axes = axes_at(figure, (130, 580, 430, 220))
-    axes.imshow(np.arcsinh(table), cmap="RdBu_r", vmin=-6, vmax=6, aspect="auto")
+    scale = {"vmin": -6, "vmax": 6, "aspect": "auto"}
+    axes.imshow(np.arcsinh(table), cmap="RdBu_r", **scale)
+    style = {"ha": "center", "va": "center", "fontsize": 10}
     for (n, j), value in np.ndenumerate(table):
         colour = "#15171b" if value else "#b9bdc4"
-        axes.text(j, n, str(value), ha="center", va="center", fontsize=10, color=colour)
+        axes.text(j, n, str(value), color=colour, **style)
     columns = ["direct", *map(str, range(1, BOUNCES + 1))]
     rows = ["picture", *map(terms_label, range(1, ORDERS + 1))]
     axes.set_xticks(range(BOUNCES + 1), columns, color=INK, fontsize=9.5)
@@ -274,10 +279,11 @@ def main() -> None:
     options = parse_options(__doc__)
     n = 4 if options.smoke else 16
     series = measure(n, options.device)
+    errors = [float(f"{error:.3g}") for error in series.errors]
     facts = {
         "patches": series.l_d.shape[1],
         "largest albedo": float(series.scene.albedo.max()),
-        "relative error after n terms": [float(f"{error:.3g}") for error in series.errors],
+        "relative error after n terms": errors,
     }
     title = "Figure 4: terms of the inverse series"
     figures.conclude(options, title, claims(series), facts, lambda: draw(series))

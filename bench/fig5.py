@@ -46,8 +46,7 @@ SHADES = ("#8bd17c", "#5cc8ff", "#c792ea", "#ffd166", "#ffb347", "#ff5d5d")
 
 def error_bounds(albedo: float) -> np.ndarray:
     """Bounds of eq. 16 for 1 .. ORDERS terms."""
-    bounds = [inverse_error_bound(albedo, k) for k in range(1, ORDERS + 1)]
-    return np.array(bounds)
+    return np.array([inverse_error_bound(albedo, k) for k in range(1, ORDERS + 1)])
 
 
 def swings(n: int, device: ltcl.Device) -> dict[str, np.ndarray]:
@@ -97,7 +96,8 @@ def measure(n: int, device: ltcl.Device) -> Measurements:
     """All boxes have n x n patches a wall, those of the norms half as many along it."""
     closed = {}
     for albedo in CLOSED_ALBEDOS:
-        closed[albedo] = race(f"closed, albedo {albedo}", n, 6, albedo, device)
+        name = f"closed, albedo {albedo}"
+        closed[albedo] = race(name, n, 6, albedo, device)
     opened = {}
     for sides in SIDES:
         name = f"{sides} side(s), albedo {OPEN_ALBEDO}"
@@ -123,8 +123,8 @@ def claims(measured: Measurements) -> list[Claim]:
 
 def swing_claim(swings: Mapping[str, np.ndarray]) -> Claim:
     """Signs of the first 8 terms, and the share of the swing that the last 4 of them leave."""
-    signs = np.array([np.sign(swing[:9] - 1) for swing in swings.values()])
-    alternates = (signs == (-1.0) ** np.arange(9)).all()
+    excesses = np.array(list(swings.values()))[:, :9] - 1
+    alternates = (np.sign(excesses) == (-1.0) ** np.arange(9)).all()
     remaining = {}
     for name, swing in swings.items():
         remaining[name] = abs(swing[8] - 1) / abs(swing[4] - 1)
@@ -189,8 +189,9 @@ def open_claims(opened: Mapping[int, Race], below_limit: Race) -> list[Claim]:
     listed = ", ".join(map(str, fewer))
     is_falling = fewer == sorted(set(fewer), reverse=True)
     limit = (
-        "its form factors have the eigenvalue 0.82, not the 4/5 of one patch a wall: "
-        "the limit is albedo 0.61, and at 0.62 it diverges very slowly"
+        "its form factors have the eigenvalue 0.82, not the 4/5 "
+        "of one patch a wall: the limit is albedo 0.61, "
+        "and at 0.62 it diverges very slowly"
     )
     return [
         divergence_claim("(d) 6 sides diverge", opened[6]),
@@ -250,11 +251,12 @@ def draw(measured: Measurements) -> Figure:
 
 def draw_swings(figure: Figure, box: figures.Box, swings: Mapping[str, np.ndarray]) -> None:
     title = "(a) The series swings alike everywhere"
-    axes = figures.graph(figure, box, title, "terms n", "sum / direct light", "linear")
+    ylabel = "sum / direct light"
+    axes = figures.graph(figure, box, title, "terms n", ylabel, "linear")
     axes.axhline(1, color=FAINT, lw=1, ls=":")
     for (name, swing), shade in zip(swings.items(), SHADES, strict=False):
         axes.plot(swing, "o-", color=shade, lw=2, ms=5, label=f"{name} of the floor")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
 
 
 def draw_norms(figure: Figure, box: figures.Box, norms: Mapping[float, np.ndarray]) -> None:
@@ -267,7 +269,7 @@ def draw_norms(figure: Figure, box: figures.Box, norms: Mapping[float, np.ndarra
         visible = np.where(norm > MIN_NORM, norm, np.nan)
         axes.plot(n, visible, "o", color=shade, ms=5, label=f"albedo {albedo:g}")
     axes.plot([], [], color=INK, lw=1.5, ls=":", label="bound, eq. 16")
-    axes.legend(frameon=False, labelcolor=INK, fontsize=10)
+    figures.legend(axes, labelcolor=INK)
 
 
 def draw_races(figure: Figure, box: figures.Box, title: str, races: Mapping[float, Race]) -> None:
@@ -276,18 +278,20 @@ def draw_races(figure: Figure, box: figures.Box, title: str, races: Mapping[floa
     axes = figures.graph(figure, box, title, "iteration", "relative residual")
     axes.set_xlim(0, DRAWN_STEPS)
     axes.set_ylim(low, high)
+    dashed = {"color": INK, "lw": 1.2, "ls": (0, (3, 2))}
     for (name, box_race), shade in zip(races.items(), SHADES, strict=True):
-        axes.plot(box_race.chebyshev.residuals, color=INK, lw=1.2, ls=(0, (3, 2)))
+        axes.plot(box_race.chebyshev.residuals, **dashed)
         draw_jacobi(axes, f"{name:g}", box_race, shade)
     axes.plot([], [], color=FAINT, lw=2, label="the paper's iteration")
-    axes.plot([], [], color=INK, lw=1.2, ls=(0, (3, 2)), label="Chebyshev's, all six")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10, loc="upper right")
+    axes.plot([], [], label="Chebyshev's, all six", **dashed)
+    figures.legend(axes, loc="upper right")
 
 
 def draw_jacobi(axes: Axes, name: str, box_race: Race, shade: str) -> None:
     low, high = axes.get_ylim()
     # The last residual of one wall is 0.
-    residuals = np.maximum(box_race.jacobi.residuals[: DRAWN_STEPS + 1], low / 10)
+    residuals = box_race.jacobi.residuals[: DRAWN_STEPS + 1]
+    residuals = np.maximum(residuals, low / 10)
     is_outside = (residuals <= low) | (residuals >= high)
     last = len(residuals) - 1
     if is_outside.any():
@@ -303,7 +307,8 @@ def draw_jacobi(axes: Axes, name: str, box_race: Race, shade: str) -> None:
     label = f" {name}"
     if box_race.diverged:
         label += " diverges"
-    axes.text(last, height, label, color=shade, fontsize=10, fontweight="bold", va=alignment)
+    style = {"fontsize": 10, "fontweight": "bold", "va": alignment}
+    axes.text(last, height, label, color=shade, **style)
 
 
 def main() -> None:
@@ -312,7 +317,8 @@ def main() -> None:
     facts = {}
     for box_race in measured.races:
         products = box_race.chebyshev.products
-        facts[box_race.name] = f"{box_race.outcome}; Chebyshev 1e-5 in {products} products"
+        outcome = f"{box_race.outcome}; Chebyshev 1e-5 in {products} products"
+        facts[box_race.name] = outcome
     title = "Figure 5: convergence"
     figures.conclude(options, title, claims(measured), facts, lambda: draw(measured))
 

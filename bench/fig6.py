@@ -25,6 +25,7 @@ import _boxes as boxes
 import _figures as figures
 import ltcl
 from _boxes import ALBEDO, RTOL
+from _coefficients import norms
 from _figures import Claim
 from _harness import Options, parse_options
 from ltcl.plots.page import FAINT
@@ -78,8 +79,9 @@ class Recovery:
     def errors(self) -> np.ndarray:
         """Relative error of each sum, in the picture."""
         truth = self.to_picture(self.l_d)
-        deviations = [np.linalg.norm(self.to_picture(l) - truth) for l in self.sums]
-        return np.array(deviations) / np.linalg.norm(truth)
+        pictures = np.array([self.to_picture(l) for l in self.sums])
+        deviations = norms(pictures - truth)
+        return deviations / np.linalg.norm(truth)
 
     @functools.cached_property
     def rho(self) -> float:
@@ -179,7 +181,8 @@ def claims(shade: Recovery, gloss: Recovery, camera_radius: float) -> list[Claim
 
 def steps_claim(name: str, recovery: Recovery, limit: int) -> Claim:
     text = f"{name}: direct light in {limit} iterations"
-    return Claim(text, f"1 % after {recovery.steps}", f"{limit}", recovery.steps <= limit)
+    measured = f"1 % after {recovery.steps}"
+    return Claim(text, measured, f"{limit}", recovery.steps <= limit)
 
 
 def darkness_claim(shade: Recovery) -> Claim:
@@ -196,7 +199,8 @@ def rate_claim(name: str, recovery: Recovery) -> Claim:
     rate = recovery.errors[16] / recovery.errors[15]
     is_due = abs(rate / recovery.rho - 1) < 0.02
     text = f"{name}: each iteration leaves rho(R) of the error"
-    return Claim(text, f"{rate:.3f}, rho(R) = {recovery.rho:.3f}", "within 2%", is_due)
+    measured = f"{rate:.3f}, rho(R) = {recovery.rho:.3f}"
+    return Claim(text, measured, "within 2%", is_due)
 
 
 def chebyshev_claim(shade: Recovery, gloss: Recovery) -> Claim:
@@ -220,7 +224,8 @@ def draw_row(
     views = [view(recovery.sums[0], name, f"error {recovery.errors[0]:.2g}")]
     for n in drawn:
         label = "1 iteration" if n == 1 else f"{n} iterations"
-        views.append(view(recovery.sums[n], label, f"error {recovery.errors[n]:.2g}"))
+        note = f"error {recovery.errors[n]:.2g}"
+        views.append(view(recovery.sums[n], label, note))
     views.append(view(recovery.l_d, r"direct light $l_d$", "the truth"))
     figures.pictures(figure, top, views, gap=20)
 
@@ -231,20 +236,21 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
         "Figure 6: the inverse series undoes shadowed and glossy scenes alike",
         "Above: a lamp, a block, and light that bounces into its shadows. "
         "Below: glossy walls in even light.",
-        "Iterations take the bounces out, until shadows and highlights are as they were; "
-        "below 0 is black.",
+        "Iterations take the bounces out, "
+        "until shadows and highlights are as they were; below 0 is black.",
     )
     draw_row(figure, shade, 130, DRAWN_SHADOWS, "lamp and block")
     draw_row(figure, gloss, 370, DRAWN_GLOSS, "glossy walls")
     box = (85, 620, 860, 210)
     title = "Error of the direct light"
     axes = figures.graph(figure, box, title, "iteration", "relative error")
-    for recovery, name, colour in ((shade, "shadows", "#5cc8ff"), (gloss, "gloss", "#ffb347")):
+    curves = ((shade, "shadows", "#5cc8ff"), (gloss, "gloss", "#ffb347"))
+    for recovery, name, colour in curves:
         label = f"{name}: rho(R) = {recovery.rho:.2f}, 1 % after {recovery.steps}"
         axes.plot(recovery.errors, color=colour, lw=2, label=label)
     axes.axhline(RTOL, color=FAINT, lw=1, ls=":")
     axes.set_xlim(0, ITERATIONS)
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
     return figure
 
 

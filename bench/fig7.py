@@ -418,13 +418,15 @@ def error_claim(points: list[Point]) -> Claim:
     errors = [point.way.error for point in points]
     measured = f"{min(errors):.2%} to {max(errors):.2%}"
     limit = f"at most {ERROR:.0%}"
-    return Claim("all methods run to 1 % error", measured, limit, max(errors) <= ERROR)
+    text = "all methods run to 1 % error"
+    return Claim(text, measured, limit, max(errors) <= ERROR)
 
 
 def slope_claim(method: Method, fitted: Law) -> Claim:
     low, high = method.slopes
-    measured = f"{fitted.slope:.2f}, of {fitted.count} sizes from N = {fitted.start} on"
+    sizes = f"{fitted.count} sizes from N = {fitted.start} on"
     is_due = low <= fitted.slope <= high
+    measured = f"{fitted.slope:.2f}, of {sizes}"
     return Claim(f"{method.label}: slope", measured, f"{low} to {high}", is_due)
 
 
@@ -458,7 +460,8 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
         "Dotted: launch floor and a power of N.",
     )
     box = (85, 150, 880, 375)
-    axes = figures.graph(figure, box, "Time", "resolution of light transport, N", "seconds")
+    xlabel = "resolution of light transport, N"
+    axes = figures.graph(figure, box, "Time", xlabel, "seconds")
     axes.set_xscale("log")
     for name, method in METHODS.items():
         pixels, times = curve(points, name)
@@ -467,11 +470,13 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
             label += f": slope {laws[name].slope:.2f}"
             fitted = np.geomspace(laws[name].start, pixels[-1])
             axes.plot(fitted, laws[name](fitted), ":", color=method.colour, lw=1.5)
-        axes.plot(pixels, times, "o" + method.line, color=method.colour, lw=2, ms=5, label=label)
-        label_end(axes, method, (pixels[-1], times[-1]), LABEL_OFFSETS.get(name, 0))
+        style = {"color": method.colour, "lw": 2, "ms": 5}
+        axes.plot(pixels, times, "o" + method.line, label=label, **style)
+        offset = LABEL_OFFSETS.get(name, 0)
+        label_end(axes, method, (pixels[-1], times[-1]), offset)
     axes.minorticks_off()
     axes.margins(x=0.1)
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10.5, loc="upper left")
+    figures.legend(axes, 10.5, loc="upper left")
     return figure
 
 

@@ -119,7 +119,7 @@ def draw(inversion: Inversion, errors: dict[str, np.ndarray]) -> Figure:
         axes.loglog(COUNTS, (values**2).mean(axis=1), color=colour, lw=2, label=kind)
     axes.set_xticks(COUNTS, [str(count) for count in COUNTS])
     axes.minorticks_off()
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    figures.legend(axes)
     return figure
 
 

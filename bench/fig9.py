@@ -97,7 +97,8 @@ def with_board(n: int, smoke: bool, device: ltcl.Device) -> Parts:
     pattern[:, :n] = GREEN
     pattern[:, 2 * n :] = 0.22
     T = scene.transport(scene.first_bounce, device, on_dark="mask")
-    return separate_picture(scene.matte, T, pattern, scene.bounces(pattern, BOUNCES))
+    truth = scene.bounces(pattern, BOUNCES)
+    return separate_picture(scene.matte, T, pattern, truth)
 
 
 def separate_picture(
@@ -138,8 +139,10 @@ def claims(plain: Parts, board: Parts) -> list[Claim]:
 
 def sum_claim(plain: Parts) -> Claim:
     total = plain.light.sum(axis=0) + plain.separation.rest
-    deviation = float(np.abs(total - plain.picture).max() / plain.picture.max())
-    return Claim("they add up to the picture", f"to {deviation:.1g}", "1e-6", deviation <= 1e-6)
+    brightest = plain.picture.max()
+    deviation = float(np.abs(total - plain.picture).max() / brightest)
+    text = "they add up to the picture"
+    return Claim(text, f"to {deviation:.1g}", "1e-6", deviation <= 1e-6)
 
 
 def highlight_claim(board: Parts) -> Claim:
@@ -194,7 +197,8 @@ def draw_parts(figure: Figure, parts: Parts, top: float, text: str) -> None:
         bounce_gain = 0.9 / np.quantile(bounce, 0.999)
         times = float(f"{bounce_gain / gain:.2g}")
         note = f"\u00d7 {times:g}, error {parts.errors[k]:.1g}"
-        views.append((figures.light(scene, bounce, bounce_gain), f"bounce {k}", note))
+        image = figures.light(scene, bounce, bounce_gain)
+        views.append((image, f"bounce {k}", note))
     figures.pictures(figure, top + 196, views, gap=24)
 
 

@@ -26,6 +26,7 @@ import _figures as figures
 import ltcl
 from _figures import Claim
 from _harness import Options, parse_options
+from ltcl import Transport
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.tasks.plausibility import LARGEST_NEGATIVE
@@ -92,11 +93,11 @@ def norms(light: np.ndarray) -> np.ndarray:
     return np.linalg.norm(light.reshape(len(light), -1), axis=1)
 
 
-def separate_light(T: ltcl.Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]:
+def separate_light(T: Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]:
     """Direct light and bounces, (BOUNCES + 1, h, w), and whether section 8.4 was warned of."""
     separation = ltcl.separate(T, picture, BOUNCES, method="direct")
     light = np.concatenate([separation.direct[None], separation.bounces])
-    return light, bool(separation.warning)
+    return light, "section 8.4" in separation.warning
 
 
 def series_iterations(R: np.ndarray, l_out: np.ndarray, l_d: np.ndarray) -> int | None:
@@ -121,12 +122,12 @@ def measure(
     truth_norms = norms(truth)
 
     (matrix,) = scene.matrices()
-    T = ltcl.Transport(matrix, scene.grid, F, device=device)
+    T = Transport(matrix, scene.grid, F, device=device)
     picture = T @ pattern
     light, warned = separate_light(T, picture)
     deviations = norms(light - truth)
     negative = -np.minimum(light, 0).sum(axis=(1, 2))
-    diagonal_T = ltcl.Transport(matrix, scene.grid, device=device)
+    diagonal_T = Transport(matrix, scene.grid, device=device)
     diagonal_light, _ = separate_light(diagonal_T, picture)
 
     l_in = pattern.ravel()
@@ -203,10 +204,10 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
 
 
 def exactness_claims(cases: Sequence[Case], matte: Sequence[Case]) -> list[Claim]:
-    matte_error = max(max(case.off) for case in matte)
-    direct_error = max(case.off[0] for case in cases)
-    compensation_error = max(case.compensation for case in cases)
-    clipped = max(case.clipped for case in cases)
+    matte_error = figures.values(matte, "off").max()
+    direct_error = figures.values(cases, "off")[:, 0].max()
+    compensation_error = figures.values(cases, "compensation").max()
+    clipped = figures.values(cases, "clipped").max()
     return [
         limit_claim("without gloss all bounces are exact", matte_error, 1e-4),
         limit_claim("the direct light is exact of any gloss, F = PFQ given", direct_error, 1e-3),
@@ -216,8 +217,9 @@ def exactness_claims(cases: Sequence[Case], matte: Sequence[Case]) -> list[Claim
 
 
 def first_bounce_claim(moderate: Sequence[Case]) -> Claim:
-    error = max(case.off[1] for case in moderate)
-    return limit_claim(f"bounce 1 is about right at gloss {MODERATE_GLOSS:g}", error, 0.3)
+    error = figures.values(moderate, "off")[:, 1].max()
+    text = f"bounce 1 is about right at gloss {MODERATE_GLOSS:g}"
+    return limit_claim(text, error, 0.3)
 
 
 def limit_claim(text: str, value: float, most: float) -> Claim:
@@ -225,7 +227,8 @@ def limit_claim(text: str, value: float, most: float) -> Claim:
 
 
 def decay_claim(moderate: Sequence[Case]) -> Claim:
-    worse = sum(case.off[2] > case.off[1] for case in moderate)
+    off = figures.values(moderate, "off")
+    worse = np.count_nonzero(off[:, 2] > off[:, 1])
     return Claim(
         "later bounces are no worse: specular effects decay (section 8.4)",
         f"bounce 2 is worse in {worse} of {len(moderate)} scenes of gloss up to {MODERATE_GLOSS:g}",
@@ -248,8 +251,8 @@ def iterations_claim(moderate: Sequence[Case]) -> Claim:
 
 def warning_claims(cases: Sequence[Case], matte: Sequence[Case]) -> list[Claim]:
     wrong = [case for case in cases if case.off[1] > 0.1]
-    true_warnings = sum(case.warned for case in wrong)
-    false_warnings = sum(case.warned for case in matte)
+    true_warnings = np.count_nonzero(figures.values(wrong, "warned"))
+    false_warnings = np.count_nonzero(figures.values(matte, "warned"))
     return [
         Claim(
             "the warning of section 8.4 comes where bounce 1 is off by more than 10%",
@@ -267,9 +270,10 @@ def warning_claims(cases: Sequence[Case], matte: Sequence[Case]) -> list[Claim]:
 
 
 def negative_claim(moderate: Sequence[Case]) -> Claim:
-    ratios = [case.negative[1] / case.off[1] for case in moderate]
-    least = min(ratios)
-    most = max(ratios)
+    negative = figures.values(moderate, "negative")[:, 1]
+    ratios = negative / figures.values(moderate, "off")[:, 1]
+    least = ratios.min()
+    most = ratios.max()
     return Claim(
         "negative light in bounce 1 tells how far it is off",
         f"it is {least:.2f} to {most:.2f} times the error, at gloss up to {MODERATE_GLOSS:g}",
@@ -303,7 +307,7 @@ def draw_bounce(figure: Figure, box: figures.Box, cases: Sequence[Case], k: int)
     draw_curves(axes, cases, lambda case: case.off[k])
     axes.set_ylim(3e-3, 30)
     axes.axhline(1, color=FAINT, lw=1, ls=":")
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=9, loc="lower right")
+    figures.legend(axes, 9, loc="lower right")
 
 
 def draw_indicators(figure: Figure, box: figures.Box, cases: Sequence[Case]) -> None:

@@ -20,9 +20,9 @@ import dataclasses
 import os
 import resource
 import shutil
-import statistics
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -35,7 +35,8 @@ import scipy.sparse
 
 import ltcl
 from _coefficients import note
-from _harness import Options, Row, parse_options, product, report, seconds
+from _harness import Options, Row, medians, parse_options, product, report, seconds
+from ltcl import Transport
 from ltcl.device import Device
 from ltcl.operators import Dense, MultiDevice, Streamed
 
@@ -124,7 +125,7 @@ class Scene:
 
     def speeds(self, actions: dict[str, Callable[[], object]]) -> dict[str, float]:
         """Median GB a second that each action reads, in turn, the file not cached."""
-        rates: dict[str, list[float]] = {name: [] for name in actions}
+        rates = defaultdict(list)
         gigabytes = self.file.stat().st_size / 1e9
         for _ in range(REPEATS):
             for name, action in actions.items():
@@ -134,7 +135,7 @@ class Scene:
                 rate = gigabytes / (time.perf_counter() - start)
                 rates[name].append(rate)
                 note(f"{name}: {rate:.3g} GB/s")
-        return {name: statistics.median(values) for name, values in rates.items()}
+        return medians(rates)
 
 
 def compare_speeds(scene: Scene, A: Streamed) -> tuple[list[Row], dict[str, Any]]:
@@ -157,7 +158,7 @@ def compare_speeds(scene: Scene, A: Streamed) -> tuple[list[Row], dict[str, Any]
     return rows, {"reading alone, GB/s": alone}
 
 
-def near_transport(scene: Scene, whole: ltcl.Transport, device: Device) -> ltcl.Transport:
+def near_transport(scene: Scene, whole: Transport, device: Device) -> Transport:
     """The diagonals of T around the main one, as a sparse transport."""
     offsets: Any = range(-NEAR_DIAGONALS, NEAR_DIAGONALS + 1)
     diagonals = []
@@ -166,7 +167,7 @@ def near_transport(scene: Scene, whole: ltcl.Transport, device: Device) -> ltcl.
         diagonals.append(np.full(scene.pixels - abs(k), value))
     S: Any = scipy.sparse.diags_array(diagonals, offsets=offsets)
     T = S @ scipy.sparse.diags_array(scene.F)
-    return ltcl.Transport(scipy.sparse.csr_array(T), whole.grid, whole.first_bounce, device=device)
+    return Transport(scipy.sparse.csr_array(T), whole.grid, whole.first_bounce, device=device)
 
 
 def solve_tasks(options: Options, scene: Scene, T: np.ndarray) -> dict[str, str]:
@@ -174,10 +175,10 @@ def solve_tasks(options: Options, scene: Scene, T: np.ndarray) -> dict[str, str]
     grid = (scene.side, scene.side)
     light = np.random.default_rng(0).uniform(0.3, 0.7, (FRAMES, *grid)).astype(np.float32)
     pictures = scene.relight(light).astype(np.float32)
-    whole = ltcl.Transport(T, grid, device=options.device)
+    whole = Transport(T, grid, device=options.device)
     near = near_transport(scene, whole, options.device)
 
-    def compensate(T: ltcl.Transport, **settings: Any) -> tuple[int, float]:
+    def compensate(T: Transport, **settings: Any) -> tuple[int, float]:
         answer: Any = ltcl.compensate(T, pictures, **settings)
         return answer.solution.products, residual(scene, answer.pattern, pictures)
 

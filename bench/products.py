@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 from _coefficients import ROWS, analysis, keep_largest, note, relative_error
 from _corner import interreflection
-from _harness import Options, Row, parse_options, product, report, seconds, triad
+from _harness import Options, Row, milliseconds, parse_options, product, report, triad
 from _peers import missing, sparse_products
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
@@ -116,11 +116,13 @@ def forms(options: Options, scene: Problem) -> list[Form]:
     note(FORMATS["pixels"])
     pixels = Form(name="pixels", matrix=scene.R, out=None, into=None, x=scene.x, y=scene.y)
     note(FORMATS["rows"])
-    row_core = coefficients(source("R", scene.R), None, transform, drop=drop).core
+    rows_of_R = source("R", scene.R)
+    row_core = coefficients(rows_of_R, None, transform, drop=drop).core
     x = W.matvec(scene.x)
     rows = Form(name="rows", matrix=row_core, out=None, into=W, x=x, y=scene.y)
     note(FORMATS["both"])
-    core = coefficients(source("R", scene.R), transform, transform, drop=drop).core
+    rows_of_R = source("R", scene.R)
+    core = coefficients(rows_of_R, transform, transform, drop=drop).core
     both = Form(name="both", matrix=core, out=W, into=W, x=x, y=W.matvec(scene.y))
     return [pixels, rows, both]
 
@@ -141,7 +143,8 @@ def measure(
     operators = {}
     kept = {}
     for form in formats:
-        numbers = keep_largest(form.matrix, form.x, form.y, DROPPED_SHARE * target_error)
+        drop_error = DROPPED_SHARE * target_error
+        numbers = keep_largest(form.matrix, form.x, form.y, drop_error)
         kept[form.name] = numbers.nnz / len(scene.x)
         operators[form.name] = form.operators(options, numbers)
         if form.name == "pixels" and peers:
@@ -151,7 +154,7 @@ def measure(
         core_x = np.resize(scene.x, core.shape[1])
         actions[f"ours, {name}"] = product(A, scene.x)
         actions[f"core, {name}"] = product(core, core_x)
-    ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
+    ms = milliseconds(actions)
     points = []
     for name, (_, A) in operators.items():
         point = Point(
@@ -171,11 +174,16 @@ def compare(scene: Problem, sparse: Point, best: Point, ms: dict[str, float]) ->
     """Ours at 1 %, beside every other way to the same error."""
     others = {"our own sparse rows": sparse.pixels} | ms
     rows = []
-    for setting, ours in (("with transforms", best.pixels), ("in a solve", best.core)):
+    settings = {"with transforms": best.pixels, "in a solve": best.core}
+    for setting, ours in settings.items():
         question = f"1 % of R l, {setting}"
         for name, theirs in others.items():
-            rows.append(Row.from_times(question, name, theirs, ours, "ms", TARGETS.get(name)))
-    sizes = {"thresholded rows of any peer": sparse.nbytes, "dense numpy": scene.R.nbytes}
+            target = TARGETS.get(name)
+            rows.append(Row.from_times(question, name, theirs, ours, "ms", target))
+    sizes = {
+        "thresholded rows of any peer": sparse.nbytes,
+        "dense numpy": scene.R.nbytes,
+    }
     for name, size in sizes.items():
         rows.append(Row.from_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
     return rows
@@ -187,25 +195,29 @@ def draw(
     figure = figures.page(
         470,
         "What a product with a smooth R takes",
-        "Thresholding drops the far field, which is weak at every place and strong together; "
-        "wavelets on",
+        "Thresholding drops the far field, which is weak at every place "
+        "and strong together; wavelets on",
         "both sides keep it in a few numbers.",
         "Dashed: with a transform at each end, which solves do without.",
     )
     lefts, width = figures.columns(2, gap=50)
     left, right = ((start + 50, 168, width - 50, 210) for start in lefts)
-    memory = figures.graph(figure, left, "Memory", "megabytes", "relative error of R l")
+    ylabel = "relative error of R l"
+    memory = figures.graph(figure, left, "Memory", "megabytes", ylabel)
     time = figures.graph(figure, right, "Time", "milliseconds", "")
     for form in COLOURS:
-        draw_form(memory, time, form, [point for point in points if point.form == form])
+        points_of_form = [point for point in points if point.form == form]
+        draw_form(memory, time, form, points_of_form)
     draw_peers(time, ms)
     fewer = f"{sparse.nbytes / best.nbytes:.0f} times less"
-    draw_gain(memory, scene.R.nbytes / 1e6, (sparse.nbytes / 1e6, best.nbytes / 1e6), fewer)
+    pair = (sparse.nbytes / 1e6, best.nbytes / 1e6)
+    draw_gain(memory, scene.R.nbytes / 1e6, pair, fewer)
     in_solve = sparse.pixels / best.core
     with_transforms = sparse.pixels / best.pixels
     faster = f"{in_solve:.0f} times less,\n{with_transforms:.0f} with transforms"
     draw_gain(time, ms["dense numpy"], (sparse.pixels, best.core), faster)
-    figure.legend(loc="lower center", ncols=6, frameon=False, labelcolor="linecolor", fontsize=9.5)
+    style = {"frameon": False, "labelcolor": "linecolor", "fontsize": 9.5}
+    figure.legend(loc="lower center", ncols=6, **style)
     return figure
 
 
@@ -237,7 +249,8 @@ def draw_peers(time: Axes, ms: dict[str, float]) -> None:
     for name, marker in zip(peers, "v^<>", strict=False):
         style = {"color": PEER_COLOUR, "ms": 7, "zorder": 4, "ls": "none"}
         time.plot(ms[name], TARGET_ERROR, marker, label=name, **style)
-    time.plot([], [], ":", color=PEER_COLOUR, lw=1, label="NumPy, dense: no error")
+    label = "NumPy, dense: no error"
+    time.plot([], [], ":", color=PEER_COLOUR, lw=1, label=label)
 
 
 def draw_gain(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> None:
@@ -246,7 +259,8 @@ def draw_gain(axes: Axes, dense: float, pair: tuple[float, float], text: str) ->
     bottom = min(ERRORS) / 1.3
     axes.vlines(dense, bottom, max(ERRORS), color=PEER_COLOUR, lw=1, ls=":")
     arrow = {"arrowstyle": "->", "color": INK, "shrinkA": 4, "shrinkB": 4}
-    axes.annotate("", (ours, TARGET_ERROR), (theirs, TARGET_ERROR), arrowprops=arrow)
+    ends = ((ours, TARGET_ERROR), (theirs, TARGET_ERROR))
+    axes.annotate("", *ends, arrowprops=arrow)
     middle = (ours * theirs**2) ** (1 / 3)
     style = {"color": INK, "fontsize": 9, "ha": "center", "va": "bottom"}
     axes.text(middle, TARGET_ERROR * 1.1, text, **style)
@@ -281,9 +295,9 @@ def main() -> None:
     facts: dict[str, Any] = {"pixels": len(scene.x), "triad, GB/s": bandwidth}
     facts |= point_facts(points)
     facts["not installed"] = ", ".join(missing()) or "none"
-    at_target = {point.form: point for point in points if point.target_error == TARGET_ERROR}
-    sparse = at_target["pixels"]
-    best = at_target["both"]
+    at_target = [point for point in points if point.target_error == TARGET_ERROR]
+    (sparse,) = [point for point in at_target if point.form == "pixels"]
+    (best,) = [point for point in at_target if point.form == "both"]
     rows = compare(scene, sparse, best, ms)
     title = "Products with a smooth R"
     report(options, title, rows, facts, lambda: draw(scene, points, sparse, best, ms))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, parse_options, product, report, seconds
+from _harness import Options, Row, milliseconds, parse_options, product, report
 from csr import matrix
 from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.operators.relaxation import Sweeps, relaxation
@@ -63,8 +63,8 @@ class SweepTimer:
         sweeps.sweep()
         self.device.finish()
 
-    def milliseconds(self, pyamg_sweep: Callable | None) -> dict[str, float]:
-        """Median times of a product and of sweeps, in turn."""
+    def measure(self, pyamg_sweep: Callable | None) -> dict[str, float]:
+        """Median milliseconds of a product and of sweeps, in turn."""
         actions: dict[str, Callable[[], object]] = {
             "product": product(self.S.R, self.b),
             "sweep": lambda: self.sweep(self.sweeps),
@@ -72,7 +72,7 @@ class SweepTimer:
         }
         if pyamg_sweep is not None:
             actions["pyamg"] = self.checked_pyamg(pyamg_sweep)
-        return {key: 1e3 * spent for key, spent in seconds(actions, repeats=15).items()}
+        return milliseconds(actions, repeats=15)
 
     def checked_pyamg(self, pyamg_sweep: Callable) -> Callable[[], object]:
         """PyAMG's sweep, after the first ones of both were compared."""
@@ -87,7 +87,7 @@ class SweepTimer:
 
 def compare(options: Options, name: str, R: Any, pyamg_sweep: Callable | None) -> list[Row]:
     timer = SweepTimer(options, R)
-    ms = timer.milliseconds(pyamg_sweep)
+    ms = timer.measure(pyamg_sweep)
 
     def row(question: str, competitor: str, key: str, ours: str, target: float) -> Row:
         return Row.from_times(question, competitor, ms[key], ms[ours], "ms", target)

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import json
 import os
-import statistics
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ import scipy.optimize
 import scipy.sparse
 
 import ltcl
-from _harness import Row, parse_options, report, triad
+from _harness import Row, medians, parse_options, report, triad
 from ltcl.operators import CSR, Dense, Distributed, IdentityPlus
 
 # Pixels and entries a row; as many of both: a dense matrix.
@@ -154,7 +154,8 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
     b = np.random.default_rng(1).random(n, np.float32)
     own_rows = matrix(comm.rank * half, (comm.rank + 1) * half, n, entries)
     operators = rank_operators(comm, alone, n, entries, own_rows)
-    triad_of_half, _ = triad(operators["2 ranks"].device, n * entries < 1 << 20, 2)
+    is_small = n * entries < 1 << 20
+    triad_of_half, _ = triad(operators["2 ranks"].device, is_small, 2)
     actions: Actions = {"exchange": exchange_halves(comm, n)}
     actions |= operator_actions(operators, b)
     actions |= memory_actions(comm, "reading the same", partial(read_numbers, own_rows))
@@ -254,7 +255,7 @@ def matrix(start: int, stop: int, n: int, entries: int) -> Any:
 
 def median_seconds(comm: Any, actions: Actions) -> dict[str, float]:
     """Median seconds of each in turn; a rank sleeps while others have something to do alone."""
-    times: dict[str, list[float]] = {name: [] for name in actions}
+    times = defaultdict(list)
     # The first round warms up.
     for turn in range(ROUNDS + 1):
         for name, action in actions.items():
@@ -266,7 +267,7 @@ def median_seconds(comm: Any, actions: Actions) -> dict[str, float]:
                 action()
             if turn > 0:
                 times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}
+    return medians(times)
 
 
 def main() -> None:

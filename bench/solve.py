@@ -20,7 +20,7 @@ from scipy.sparse.linalg import gmres
 
 import ltcl
 from _coefficients import relative_error
-from _harness import Options, Row, parse_options, report, seconds
+from _harness import Options, Row, milliseconds, parse_options, report
 from csr import matrix
 from ltcl.operators import CSR, IdentityPlus
 
@@ -142,7 +142,7 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
         "neumann": lambda: neumann(problem),
         "gmres": lambda: scipy_gmres(problem, full),
     }
-    ms = {action: 1e3 * spent for action, spent in seconds(actions, repeats=REPEATS).items()}
+    ms = milliseconds(actions, REPEATS)
 
     has_one_column = problem.b.ndim == 1
     rows = []

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,11 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
+from _coefficients import norms
 from _figures import Claim
 from _harness import parse_options
 from denoise import QUANTITIES, patterns
+from ltcl import Transport
 from scenes import tracing
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -77,22 +79,22 @@ class Judgement:
     row_nbytes: float
 
 
-def traced_measurements(scene: str) -> tuple[list[ltcl.Transport], dict[str, float]]:
+def traced_measurements(scene: str) -> tuple[list[Transport], dict[str, float]]:
     """All measurements, and how far the bounces of their mean are from those traced."""
     traced = [tracing.trace(scene, GRID, PATHS, seed) for seed in range(1, SEEDS + 1)]
     mean = np.mean(traced, axis=0, dtype=np.float64)
     bounces = mean.sum(axis=2).reshape(-1, *GRID)[:4]
     deviations = {}
     for first_bounce in ("diagonal", "exact"):
-        T = ltcl.Transport(mean.sum(axis=0), GRID, first_bounce=first_bounce)
+        T = Transport(mean.sum(axis=0), GRID, first_bounce=first_bounce)
         separation = ltcl.separate(T, T @ np.ones(GRID), 3, rtol=1e-5)
         off = norms(separation_light(separation) - bounces) / norms(bounces[:1])
         deviations[first_bounce] = float(off.max())
-    transports = [ltcl.Transport(T.sum(axis=0), GRID) for T in traced]
+    transports = [Transport(T.sum(axis=0), GRID) for T in traced]
     return transports, deviations
 
 
-def simulated_measurements() -> list[ltcl.Transport]:
+def simulated_measurements() -> list[Transport]:
     """Measurements for --smoke, which need no Mitsuba."""
     T = truth("corner", 6)
     noise = noise_of(T, 1e-3)
@@ -104,12 +106,7 @@ def separation_light(separation: Any) -> np.ndarray:
     return np.stack([separation.direct, *separation.bounces])
 
 
-def norms(arrays: Iterable[np.ndarray]) -> np.ndarray:
-    """The norm of each array."""
-    return np.array([np.linalg.norm(array) for array in arrays])
-
-
-def deviation_ratios(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
+def deviation_ratios(T: Transport, true: Transport) -> np.ndarray:
     """`.std` over errors of `PARTS`, under white."""
     white = true @ np.ones(true.grid)
     separation = ltcl.separate(T, white, 3, rtol=1e-5)
@@ -123,29 +120,28 @@ def deviation_ratios(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
     return norms(deviations) / norms([*light_errors, pattern_error, appearance_error])
 
 
-def quantities(T: ltcl.Transport, images: np.ndarray) -> list[np.ndarray]:
+def quantities(T: Transport, images: np.ndarray) -> list[np.ndarray]:
     """`QUANTITIES` of T: T p of ten patterns of each kind; bounces of `images`."""
     relit = [T @ kind for kind in patterns(T.grid)]
     return [*relit, *ltcl.separate(T, images, 3).bounces]
 
 
-def relative_errors(T: ltcl.Transport, true: ltcl.Transport) -> np.ndarray:
+def relative_errors(T: Transport, true: Transport) -> np.ndarray:
     """Relative errors of `QUANTITIES`; bounces are of pictures of one pattern of each kind."""
     images = true @ np.stack([kind[0] for kind in patterns(T.grid)])
     exact = quantities(true, images)
-    deviations = []
-    for value, exact_value in zip(quantities(T, images), exact, strict=True):
-        deviations.append(value - exact_value)
+    deviations = map(np.subtract, quantities(T, images), exact)
     return norms(deviations) / norms(exact)
 
 
-def judge(T: ltcl.Transport, true: ltcl.Transport) -> Judgement:
+def judge(T: Transport, true: Transport) -> Judgement:
     compressed = ltcl.compress(T, "noise")
     errors = relative_errors(T, true)
 
-    def error_ratio(better: ltcl.Transport) -> np.ndarray:
+    def error_ratio(better: Transport) -> np.ndarray:
         squares = (relative_errors(better, true) / errors) ** 2
-        return np.sqrt(np.maximum(squares - TRUTH_VARIANCE, 0.0) / (1.0 - TRUTH_VARIANCE))
+        own_squares = np.maximum(squares - TRUTH_VARIANCE, 0.0)
+        return np.sqrt(own_squares / (1.0 - TRUTH_VARIANCE))
 
     nbytes = compressed.compression.channels[0].nbytes
     return Judgement(
@@ -157,7 +153,7 @@ def judge(T: ltcl.Transport, true: ltcl.Transport) -> Judgement:
     )
 
 
-def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
+def judge_scene(measured: list[Transport]) -> dict[str, list[Judgement]]:
     """Judge some measurements, by the noise model they are options."""
     alone = []
     with_second = []
@@ -165,33 +161,28 @@ def judge_scene(measured: list[ltcl.Transport]) -> dict[str, list[Judgement]]:
         first, second, *others = measured[k:] + measured[:k]
         matrix = first.to_numpy()
         mean = np.mean([T.to_numpy() for T in others], axis=0)
-        true = ltcl.Transport(mean, first.grid)
-        alone.append(judge(ltcl.Transport(matrix, first.grid), true))
-        twice = ltcl.Transport(matrix, first.grid, noise=second)
+        true = Transport(mean, first.grid)
+        alone.append(judge(Transport(matrix, first.grid), true))
+        twice = Transport(matrix, first.grid, noise=second)
         with_second.append(judge(twice, true))
     return {"noise by T alone": alone, "noise by two measurements": with_second}
 
 
 def way_claims(name: str, judgements: list[Judgement]) -> list[Claim]:
-    deviations = []
-    denoised = []
-    compressed = []
-    for judgement in judgements:
-        deviations.append(judgement.deviations)
-        denoised.append(judgement.denoised)
-        compressed.append(judgement.compressed)
+    deviations = figures.values(judgements, "deviations")
+    denoised = figures.values(judgements, "denoised")
+    compressed = figures.values(judgements, "compressed")
     return [
-        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", np.array(deviations)),
-        DENOISED_LIMITS.claim(f"{name}: denoised", np.array(denoised)),
-        COMPRESSED_LIMITS.claim(f"{name}: compressed", np.array(compressed)),
+        DEVIATION_LIMITS.claim(f"{name}: deviations over errors", deviations),
+        DENOISED_LIMITS.claim(f"{name}: denoised", denoised),
+        COMPRESSED_LIMITS.claim(f"{name}: compressed", compressed),
     ]
 
 
 def list_errors(judgements: list[Judgement]) -> str:
     """Largest relative errors of T, by the quantity."""
-    largest = np.max([judgement.errors for judgement in judgements], axis=0)
-    cells = [f"{name} {error:.2%}" for name, error in zip(QUANTITIES, largest, strict=True)]
-    return ", ".join(cells)
+    largest = figures.values(judgements, "errors").max(axis=0)
+    return ", ".join(map("{} {:.2%}".format, QUANTITIES, largest))
 
 
 def main() -> None:
@@ -218,12 +209,14 @@ def main() -> None:
         for way, judgements in judge_scene(measured).items():
             name = f"{scene}, {way}"
             facts[f"{scene}: relative errors"] = list_errors(judgements)
-            facts[f"{name}: bytes a row"] = max(judgement.row_nbytes for judgement in judgements)
+            row_nbytes = figures.values(judgements, "row_nbytes")
+            facts[f"{name}: bytes a row"] = float(row_nbytes.max())
             for judgement in judgements:
-                is_halved += [bool(ratio <= 0.5) for ratio in judgement.denoised]
+                is_halved.extend(judgement.denoised <= 0.5)
             claims += way_claims(name, judgements)
     halved = f"{sum(is_halved)} of {len(is_halved)}"
-    claims.append(Claim("denoised: at most half is left", halved, "all", all(is_halved)))
+    text = "denoised: at most half is left"
+    claims.append(Claim(text, halved, "all", all(is_halved)))
     if options.smoke:
         claims = []
     figures.conclude(options, "Path-traced transports", claims, facts, Figure)

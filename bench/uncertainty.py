@@ -24,6 +24,7 @@ import _figures as figures
 import ltcl
 from _figures import Claim
 from _harness import parse_options, seconds
+from ltcl import Transport
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
@@ -91,7 +92,7 @@ def costs(n: int, smoke: bool) -> dict[str, float]:
     return one | cost_ratios(T, "eight pictures", T @ light, repeats)
 
 
-def cost_ratios(T: ltcl.Transport, name: str, image: np.ndarray, repeats: int) -> dict[str, float]:
+def cost_ratios(T: Transport, name: str, image: np.ndarray, repeats: int) -> dict[str, float]:
     tasks: dict[str, Callable[[], Any]] = {
         "separate": lambda: ltcl.separate(T, image, 3),
         "compensate": lambda: ltcl.compensate(T, image),

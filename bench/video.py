@@ -20,6 +20,7 @@ import scipy.sparse
 import _coefficients
 import ltcl
 from _harness import Options, Row, parse_options, report, seconds
+from ltcl import Transport
 from ltcl.images import from_srgb, to_srgb
 from ltcl.operators import Compressed, Wavelet
 from ltcl.scenes import landscape
@@ -45,7 +46,7 @@ def to_codes(light: np.ndarray) -> np.ndarray:
 TO_CODES = to_codes(np.linspace(0, 1, LIGHT_STEPS + 1, dtype=np.float32))
 
 
-def transport(options: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> ltcl.Transport:
+def transport(options: Options, grid: tuple[int, int], coarse: tuple[int, int]) -> Transport:
     """T = (I + R) F with R symmetric in the `coarse` wavelet coefficients.
 
     The norm of R is m / (1 - m) at most.
@@ -69,13 +70,14 @@ def symmetric_core(grid: tuple[int, int], coarse: tuple[int, int]) -> Any:
     shifts = random.integers(-4 * ROW_NUMBERS, 4 * ROW_NUMBERS, rows.size)
     columns = (rows + shifts) % len(places)
     numbers = random.uniform(0.0, 1.0, rows.size)
-    half = scipy.sparse.csr_array((numbers, (places[rows], places[columns])), shape=(n, n))
+    place = (places[rows], places[columns])
+    half = scipy.sparse.csr_array((numbers, place), shape=(n, n))
     core = scipy.sparse.csr_array(half + half.T)
     core *= 1.0 / abs(core).sum(axis=1).max()
     return core
 
 
-def film(T: ltcl.Transport, frames: int) -> np.ndarray:
+def film(T: Transport, frames: int) -> np.ndarray:
     """A landscape that drifts, in codes, (frames, h, w, 3) uint8, within the projector's reach."""
     h, w = T.grid
     picture = np.asarray(landscape(h, w), np.float32).reshape(h, w, -1)[..., :3]
@@ -84,15 +86,16 @@ def film(T: ltcl.Transport, frames: int) -> np.ndarray:
     return np.stack([np.roll(codes, 2 * k, axis=1) for k in range(frames)])
 
 
-def projector_codes(T: ltcl.Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
+def projector_codes(T: Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
     """The projector's codes under which the scene looks like these."""
-    compensation = ltcl.compensate(T, TO_LINEAR[codes], rtol=RTOL, clamp=True, **settings)
+    rules = {"rtol": RTOL, "clamp": True, **settings}
+    compensation = ltcl.compensate(T, TO_LINEAR[codes], **rules)
     levels = (LIGHT_STEPS * compensation.pattern + 0.5).astype(np.int16)
     return TO_CODES[levels]
 
 
 def measure(
-    options: Options, T: ltcl.Transport, inverse: ltcl.Inverse, frames: np.ndarray
+    options: Options, T: Transport, inverse: ltcl.Inverse, frames: np.ndarray
 ) -> dict[str, float]:
     """Seconds of BATCH frames, in all ways."""
 
@@ -131,7 +134,7 @@ def rate_row(name: str, spent: float) -> Row:
     return Row(name, f"{target:g} frames/s", target, rate, "frames/s", ratio, least)
 
 
-def frame_facts(T: ltcl.Transport) -> dict[str, Any]:
+def frame_facts(T: Transport) -> dict[str, Any]:
     """Method, products and error of one frame."""
     (codes,) = film(T, 1)
     compensation = ltcl.compensate(T, TO_LINEAR[codes], rtol=RTOL, clamp=True)

@@ -89,7 +89,8 @@ def reason_against(importer: str, target: str) -> str | None:
     other = unit_of(target)
     if other == unit:
         return None
-    if unit in house.WITHOUT_DEVICE and other in house.DEVICE_UNITS:
+    is_free = unit in house.WITHOUT_DEVICE and (importer, target) not in house.OPENS_DEVICE
+    if is_free and other in house.DEVICE_UNITS:
         return f"{unit} stays free of {other}"
     if RANK[other] >= RANK[unit] and (unit, other) not in house.SIDEWAYS:
         return f"{other} (layer {RANK[other]}) is not below {unit} (layer {RANK[unit]})"

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image, ImageShow
 
 import ltcl
 from ltcl import images, plots
-from ltcl.errors import FileError, InputError
+from ltcl.device import Device
+from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.solvers import Solution, Status
 
 
@@ -60,6 +64,60 @@ def test_pictures_are_shown_as_they_are_under_their_names(tmp_path: Path) -> Non
     for rows in ((), ({},), ({"a": np.ones(3)},)):
         with pytest.raises(InputError):
             plots.pictures(*rows)
+
+
+def draw_figures(device: Device) -> list[Any]:
+    """A figure of each kind; one solution or analysis may stand alone."""
+    T = ltcl.scenes.box(3, albedo=0.8).transport(device=device)
+    analysis = ltcl.analyze(T)
+    return [
+        sheet(),
+        plots.convergence(SOLUTIONS, rtol=1e-2),
+        plots.convergence(SOLUTIONS["jacobi"], rtol=1e-2),
+        plots.analysis({"a": analysis}),
+        plots.analysis(analysis),
+    ]
+
+
+def test_notebooks_show_every_figure(device, tmp_path: Path) -> None:
+    for figure in draw_figures(device):
+        plots.save(figure, tmp_path / "saved.png")
+        shown = Image.open(io.BytesIO(figure._repr_png_()))
+        saved = images.read_codes(tmp_path / "saved.png")
+        np.testing.assert_array_equal(np.asarray(shown)[..., :3], saved[..., :3])
+
+
+def test_prompts_show_every_figure(device, monkeypatch, caplog) -> None:
+    sizes = []
+
+    def view(picture: Image.Image, _title: str) -> bool:
+        sizes.append(picture.size)
+        return len(sizes) > 1
+
+    monkeypatch.setattr(ImageShow, "show", view)
+    figures = draw_figures(device)
+    for figure in figures:
+        assert "show()" in repr(figure)
+        figure.show()
+    assert sizes == [figure.canvas.get_width_height() for figure in figures]
+    # The first one had no program that shows it.
+    assert len(caplog.records) == 1
+    assert "ltcl.plots.save" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("draw", "name"),
+    [
+        (lambda: plots.analysis([]), "analyses is a list"),  # pyright: ignore[reportArgumentType]
+        (lambda: plots.analysis({"a": 1}), r"analyses\['a'\] is a int"),  # pyright: ignore[reportArgumentType]
+        (lambda: plots.convergence({"a": None}, 0.1), r"solutions\['a'\]"),  # pyright: ignore[reportArgumentType]
+        (lambda: plots.convergence(np.ones(2), 0.1), "solutions is a ndarray"),  # pyright: ignore[reportArgumentType]
+        (lambda: plots.pictures(np.ones((2, 2))), "rows is a ndarray"),  # pyright: ignore[reportArgumentType]
+    ],
+)
+def test_what_cannot_be_drawn_is_named(draw: Any, name: str) -> None:
+    with pytest.raises(InputTypeError, match=name):
+        draw()
 
 
 def test_unknown_extension_and_failure_leave_the_old_file(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import ltcl
 
 found = fig4.measure(8, ltcl.open_device())
 figure = fig4.draw(found)
+figure
 
 # %%
 # The error after n terms:

@@ -14,6 +14,7 @@ import ltcl
 
 measured = fig5.measure(6, ltcl.open_device())
 figure = fig5.draw(measured)
+figure
 
 # %%
 # The outcome of each box (1 % by the paper's series; 1e-5 by Chebyshev's iteration):

@@ -15,5 +15,6 @@ import ltcl
 shade = fig6.with_shadows(6, ltcl.open_device())
 gloss = fig6.with_gloss(4, smoke=True)
 figure = fig6.draw(shade, gloss)
+figure
 
 # sphinx_gallery_thumbnail_number = 6

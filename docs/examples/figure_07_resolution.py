@@ -19,6 +19,7 @@ import fig7
 record = json.loads(Path("../../bench/results/fig7.json").read_text())
 points = fig7.recorded(record["facts"])
 figure = fig7.draw(points, fig7.all_laws(points))
+figure
 
 # %%
 # At the largest size of each:

@@ -14,5 +14,6 @@ import ltcl
 
 found = fig8.invert(10, ltcl.open_device())
 figure = fig8.draw(found, fig8.measure(found, seeds=2))
+figure
 
 # sphinx_gallery_thumbnail_number = 3

@@ -18,5 +18,6 @@ device = ltcl.open_device()
 plain = fig9.diffuse(12, device)
 board = fig9.with_board(5, smoke=True, device=device)
 figure = fig9.draw(plain, board)
+figure
 
 # sphinx_gallery_thumbnail_number = 5

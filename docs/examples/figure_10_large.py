@@ -19,6 +19,7 @@ built = large.build(Options(smoke=True, json=None, plot=None, device=ltcl.open_d
 images, errors = large.pictures(rows, built)
 names = ["pattern", "direct", "bounce 1", "bounce 2"]
 figure = large.draw(names, images)
+figure
 
 # %%
 # Errors against the truth, which all numbers of the rows give:

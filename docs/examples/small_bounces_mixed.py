@@ -34,5 +34,6 @@ mixes = {
     "later bounces only more\n1, 3, 6": mixed(1, 3, 6),
 }
 figure = pictures({name: view(0.8 * light) for name, light in mixes.items()})
+figure
 
 # sphinx_gallery_thumbnail_number = 4

@@ -28,5 +28,6 @@ figure = pictures(
         "seen, 30 x 60": result.appearance,
     }
 )
+figure
 
 # sphinx_gallery_thumbnail_number = 4

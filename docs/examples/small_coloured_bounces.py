@@ -40,6 +40,7 @@ figure = pictures(
         for k, light in enumerate(parts.bounces, start=1)
     },
 )
+figure
 
 # %%
 # The colour of each part, in shares of red, green and blue:

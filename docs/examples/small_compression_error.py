@@ -35,5 +35,6 @@ for rtol in (0.003, 0.01, 0.05):
     above[f"asked for {rtol:.1%}\n{C.nbytes / 1e3:.0f} kB"] = view(seen)
     below[f"off by {off:.2%}\n20 times as bright"] = view(20 * np.abs(seen - exact) + 1e-6)
 figure = pictures(above, below)
+figure
 
 # sphinx_gallery_thumbnail_number = 9

@@ -26,5 +26,6 @@ for name, matrix in columns.items():
     note = f"\nmean error {off:.1e}" if off else ""
     shown[name + note] = 100 * matrix[:, pixel].reshape(corner.grid)
 figure = pictures(shown)
+figure
 
 # sphinx_gallery_thumbnail_number = 3

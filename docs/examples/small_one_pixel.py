@@ -8,10 +8,9 @@ error; ask for a smaller one, and more walks are taken.
 """
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ltcl
-from ltcl.plots.page import FAINT, GRID, INK, PAPER
+from ltcl.plots.page import FAINT, GRID, INK, PAPER, figure_of
 
 corner = ltcl.scenes.box(12, sides=3, albedo=0.45)
 T = corner.transport(first_bounce=corner.first_bounce)
@@ -20,7 +19,7 @@ b = (T @ (0.3 + 0.7 * corner.sample(ltcl.scenes.landscape(300, 300)[..., 0]))).r
 pixel = 200
 truth = ltcl.solve(S, b, "gmres", rtol=1e-6).x[pixel]
 
-figure = Figure(figsize=(8, 4), facecolor=PAPER)
+figure = figure_of(800, 400)
 axes = figure.add_axes((0.1, 0.15, 0.86, 0.75), facecolor=PAPER)
 counts = 4 ** np.arange(1, 9)
 for seed, colour in enumerate(("#5cc8ff", "#ffb347", "#8bd17c")):
@@ -42,6 +41,7 @@ axes.grid(color=GRID)
 axes.tick_params(colors=FAINT)
 axes.spines[:].set_visible(False)
 axes.legend(frameon=False, labelcolor="linecolor")
+figure
 
 # %%
 # An error can be asked for in place of a number of walks:

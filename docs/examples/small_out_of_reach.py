@@ -38,5 +38,6 @@ figure = pictures(
     {"wanted": view(wanted), "seen": view(result.appearance), "missing, and too much": view(shown)},
     width=1000,
 )
+figure
 
 # sphinx_gallery_thumbnail_number = 4

@@ -43,5 +43,6 @@ figure = pictures(
         "both together": view(result.appearance),
     }
 )
+figure
 
 # sphinx_gallery_thumbnail_number = 2

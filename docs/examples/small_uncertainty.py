@@ -45,5 +45,6 @@ for k in (0, 1):
         }
     )
 figure = pictures(*rows)
+figure
 
 # sphinx_gallery_thumbnail_number = 3

@@ -46,5 +46,6 @@ figure = pictures(
         f"the region 20 times as important\noff by {off(weighted):.0%}": view(weighted.appearance),
     }
 )
+figure
 
 # sphinx_gallery_thumbnail_number = 4

@@ -7,7 +7,8 @@ Ten minutes, no hardware. You throw a picture into the corner of a room, see why
 let ltcl find the pattern that makes it look right. Then you take the light apart, bounce by bounce.
 
 You need ltcl (``pip install ltcl``) and a little Python. Each block below can be copied into a
-Python prompt or a notebook, in this order.
+Python prompt or a notebook, in this order. A notebook shows each figure below its block; a prompt
+opens it with ``figure.show()``.
 """
 
 # %%
@@ -33,6 +34,7 @@ def view(light):
 
 
 figure = pictures({"the picture": photo, "on the walls": view(wanted)}, width=640)
+figure
 
 # %%
 # The picture looks flat, although it lies on three walls: this is what we want.
@@ -47,6 +49,7 @@ transport = corner.transport()
 as_it_is = transport @ wanted
 
 figure = pictures({"wanted": view(wanted), "seen": view(as_it_is)}, width=640)
+figure
 
 # %%
 # Two things went wrong. The walls have colours. And they light each other: light that meets the red
@@ -63,6 +66,7 @@ then = result.appearance / result.gain
 figure = pictures(
     {"throw this pattern": view(result.pattern), "and this is seen": view(then)}, width=640
 )
+figure
 
 # %%
 # The pattern is green and blue where the walls are red, and darker where other walls will add their
@@ -86,6 +90,7 @@ for number, light in enumerate(parts.bounces, start=1):
     times = float(f"{parts.direct.mean() / light.mean():.2g}")
     shown[f"bounce {number}\n{times:g} times as bright"] = view(times * light)
 figure = pictures(shown)
+figure
 
 # %%
 # The direct light has all of the detail. Each bounce is smoother and redder than the one before it,
@@ -112,6 +117,7 @@ figure = pictures(
         "first bounce × 3\nshown darker": view(0.6 * strong),
     }
 )
+figure
 
 # %%
 # What you have done, in the words of the paper

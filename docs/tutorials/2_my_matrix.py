@@ -77,6 +77,7 @@ column, row = (
 )
 white = T @ np.ones(T.grid)
 figure = pictures({"one column\n× 20": column, "one row\n× 20": row, "all pixels lit": 0.8 * white})
+figure
 
 # %%
 # No light leaves the three pixels that miss the walls. ltcl found them, and will not use them:
@@ -112,6 +113,7 @@ lights = {"wanted": wanted, "pattern": result.pattern, "seen": result.appearance
 figure = pictures(
     {name: corner.view(light, size=320, supersample=2) for name, light in lights.items()}
 )
+figure
 
 # %%
 # How sure are bounces?

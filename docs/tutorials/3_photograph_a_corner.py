@@ -61,7 +61,7 @@ small simulated corner in place of yours, and then makes every mistake, to show 
 #
 # * Each pattern on the list needs one photograph, with the exposure that stands there, in that
 #   order.
-# * ``--take`` copies new files in the order of the numbers in their names. Older ones may stay in
+# * ``--take`` copies new files in the order in which the camera took them. Older ones may stay in
 #   CARD. There must be as many new ones as are missing: delete those that are too many. Of a camera
 #   that saves a raw and a JPEG file of each photograph, leave the raw ones only.
 # * A photograph that is refused: delete it in ``scan/photographs``, and in CARD. Then ``ltcl
@@ -147,6 +147,7 @@ T = scan(folder, photographer)
 names = sorted((folder / "photographs").iterdir())
 shown = {"white": 1, "stripes, to find places": 20, "one pixel, short": 60, "one pixel, long": 61}
 figure = pictures({name: ltcl.images.read(names[k]) for name, k in shown.items()})
+figure
 
 # %%
 # What came of it
@@ -180,6 +181,7 @@ figure = pictures(
         "the pattern of ltcl projected": after,
     }
 )
+figure
 
 # %%
 # Every mistake, and what ltcl says then

@@ -97,6 +97,7 @@ print(
 
 picked = np.linspace(len(rig.photographs) * 0.5, len(rig.photographs) - 1, 4).astype(int)
 figure = pictures({f"photograph {k}": rig.photographs[k] / 4095 for k in picked})
+figure
 
 # %%
 # Project with it
@@ -127,6 +128,7 @@ def view(light):
 figure = pictures(
     {"wanted": view(wanted), "projected as it is": view(plain), "with ltcl": view(exact)}
 )
+figure
 
 # %%
 # When it was interrupted

@@ -75,6 +75,7 @@ for number in (0, 4, 8, 11):
     rows[1][f"pattern {number + 1}"] = view(pattern)
     rows[2][f"seen under pattern {number + 1}"] = view((T @ pattern) / done.gain)
 figure = pictures(*rows)
+figure
 
 # %%
 # The brightness is the same in all frames: it is one number for the film. Here is how much of each

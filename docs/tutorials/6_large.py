@@ -60,6 +60,7 @@ figure = pictures(
         f"seen under the latter\n{off:.2%} from what was wanted": view(seen),
     }
 )
+figure
 
 # %%
 # Better than 1 % all the same? Let the compressed T take the steps, and the exact one judge them:

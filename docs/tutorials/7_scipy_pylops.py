@@ -87,6 +87,7 @@ figure = pictures(
         "the truth": view(true),
     }
 )
+figure
 
 # %%
 # From SciPy to ltcl

@@ -33,19 +33,21 @@ from ltcl.acquisition.metering import (
     WHITE_LEVEL,
     bracket,
     brightness,
+    check_full_scale,
     fill_hot_pixels,
     find_white_exposure,
     hot_pixels,
     longest_exposure,
     offered_exposures,
     scan_exposures,
+    unsaturated_exposure,
 )
 from ltcl.acquisition.radiometry import Radiance, Response
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
     CaptureSession,
     Photograph,
-    Progress,
+    ProgressFunction,
     Request,
     acquisition_error,
     ignore_progress,
@@ -60,6 +62,10 @@ RESPONSE_SPAN = 16.0
 # reach the last code in each colour.
 MAX_EXTRA_EXPOSURES = 4
 SATURATED_SHARE = 0.05
+# Ratio of the exposure of white to the shortest one, below which ramps, whose light bounces, show
+# nothing as dark as black: the curve between them would be a guess, and be wrong by 0.1 % of full
+# scale, so that clean photographs deviate from each other.
+MIN_DARK_RATIO = 8.0
 # Most ramps for the response.
 MAX_RAMPS = 4
 # Fewest photographs of black and of white: two determine noise.
@@ -209,7 +215,7 @@ def measure(
     exposures: Sequence[float] | None = None,
     frames: int = 16,
     side: int = 1,
-    progress: Progress = ignore_progress,
+    progress: ProgressFunction = ignore_progress,
     log: ArrayLog | None = None,
 ) -> Calibration:
     """Measure a set-up, with as many photographs as `expected_photographs` says.
@@ -258,6 +264,8 @@ def measure(
     # 4. Noise and offset of the camera; then photographs can be compared.
     of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
     consistency.check_black(session, of_white_exposure)
+    shown = {photograph.seconds: photograph.image for photograph in bright}
+    check_full_scale(shots, list(shown), list(shown.values()))
     with session.naming_photographs():
         session.camera = _measure_camera(session, dark, bright)
     session.check_agreement()
@@ -322,24 +330,30 @@ def _measure_response(
     level = brightness(session.photograph(white, seconds), session.hot)
     # The digest is of photographs at the exposure of white, which tell rigs apart, not of probes.
     shots.digest.clear()
-    return nearest(shots.exposures, seconds * WHITE_LEVEL / max(level, 0.01))
+    return unsaturated_exposure(shots, seconds * WHITE_LEVEL / max(level, 0.01))
 
 
 def _response_from_ramps(
     session: CaptureSession, effort: Effort, white_exposure: float
 ) -> tuple[Response, np.ndarray]:
-    """Response of the camera, and its hot pixels, from ramps at a bracket of exposures."""
+    """Response of the camera, and its hot pixels, from ramps at a bracket of exposures.
+
+    Without an exposure much shorter than that of white, photographs of black are added.
+    """
     shots = session.shots
     shortest = white_exposure / RESPONSE_SPAN
     longest = white_exposure * RESPONSE_SPAN
     times = [*offered_exposures(shots, bracket(shortest, longest, effort.exposures))]
     height, width = shots.image.shape[:2]
     ramps = effort.ramps(shots.grid, height * width)
+    if times[0] * MIN_DARK_RATIO > white_exposure:
+        ramps.append(np.zeros(shots.grid, np.float32))
     exposed = session.take([[(ramp, seconds) for ramp in ramps] for seconds in times])
     hot = hot_pixels(np.minimum.reduce([photograph.image for photograph in exposed[0]]))
     if shots.channels == 3:
         _expose_dark_colours(session, ramps, hot, times, exposed)
     images = [_side_by_side(group, hot) for group in exposed]
+    check_full_scale(shots, times, images)
     first = exposed[0][0].number
     subject = f"the response of the camera, photographs {first} to {shots.number}"
     with acquisition_error(subject):
@@ -358,8 +372,9 @@ def _expose_dark_colours(
 ) -> None:
     """Add longer exposures of the ramps, until every colour reaches the last code."""
     longer = [times[-1] * 2.0**k for k in range(1, MAX_EXTRA_EXPOSURES + 1)]
+    lit = [k for k, ramp in enumerate(ramps) if ramp.any()]
     for seconds in offered_exposures(session.shots, longer):
-        image = _side_by_side(exposed[-1], hot)
+        image = _side_by_side([exposed[-1][k] for k in lit], hot)
         darkest_colour = np.quantile(image, 1.0 - SATURATED_SHARE, axis=(0, 1)).min()
         if seconds <= times[-1] or darkest_colour >= SATURATED_CODE:
             return
@@ -473,4 +488,5 @@ def _measure_projector(
         if is_grey:
             return projector, None
         full = [channel[-1] for channel in pictures]
+        consistency.check_colours(full, lit, ambient)
         return projector, radiometry.mixing(full, ambient)

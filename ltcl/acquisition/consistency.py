@@ -5,6 +5,7 @@
     black           no lamp was on in one photograph of several
     uniform codes   show black and a rising part of white
     light           white is brighter than black, and the scan's exposures show it
+    colours         red, green and blue add up to white, else it is a warning
     map             no pattern of Gray code was exchanged with its inverse
 
 An AcquisitionError names photographs, an InputError an argument of `ltcl.acquire`.
@@ -13,6 +14,7 @@ An AcquisitionError names photographs, an InputError an argument of `ltcl.acquir
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +36,10 @@ MIN_LAMP_LEVEL = 0.01
 MAX_LAMP_LEVEL = 0.1
 # Standard deviations by which the mean of a photograph must be above the others.
 LAMP_SIGMAS = 5.0
+# Relative deviation of red, green and blue from white, and its standard deviations, from which on
+# a projector does not add its colours: clean ones deviate by less than 1 %.
+MAX_COLOUR_DEVIATION = 0.03
+COLOUR_SIGMAS = 5.0
 # Standard deviations of noise that white must be above.
 MIN_SIGMAS = 3.0
 # Relative deviation of a projector's curve from pixel to pixel that is allowed.
@@ -42,6 +48,9 @@ PROJECTOR_UNEVENNESS = 0.1
 MIN_MAP_CORRELATION = 0.9
 # Share of a pixel's own light in what white shows there, at least, in most scenes.
 MIN_DIRECT_SHARE = 0.5
+
+
+logger = logging.getLogger(__name__)
 
 
 def check_geometry(shots: Shots, geometry: str | Correspondence) -> None:
@@ -105,6 +114,36 @@ def check_light(
     else:
         return
     raise InputError(f"exposures is {exposures}; half of white {reason}")
+
+
+def check_colours(colours: Sequence[Radiance], white: Radiance, black: Radiance) -> None:
+    """Warn if pictures of red, green and blue (H, W, 3) do not add up to that of white.
+
+    With W = white - black in a channel of the camera, and C the same of the sum of the colours,
+    least squares give C = r W, r = sum_p W C / sum_p W^2, whose variance is that of C.
+    """
+    light = white - black
+    colour_light = [colour - black for colour in colours]
+    total = np.sum([colour.value for colour in colour_light], axis=0)
+    variance = np.sum([colour.variance for colour in colour_light], axis=0)
+    is_valid = np.all([picture.valid for picture in [light, *colour_light]], axis=0)
+    worst = 0.0
+    for c in range(total.shape[2]):
+        pixels = is_valid[..., c]
+        W = light.value[..., c][pixels].astype(np.float64)
+        square = max(float(W @ W), 1e-30)
+        change = float(W @ total[..., c][pixels]) / square - 1.0
+        deviation = math.sqrt(W**2 @ variance[..., c][pixels]) / square
+        if abs(change) > max(COLOUR_SIGMAS * deviation, MAX_COLOUR_DEVIATION, abs(worst)):
+            worst = change
+    if worst:
+        logger.warning(
+            "red, green and blue together have %.0f %% of the light of white: the projector's "
+            "colour mode does not add its colours (a white segment, BrilliantColor, dynamic "
+            "colours), so that coloured patterns are off by as much; choose another mode (sRGB, "
+            "cinema, reference), and begin again",
+            100.0 * (1.0 + worst),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 import numpy as np
 
+from ltcl.acquisition.agreement import sample
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import CaptureSession
 from ltcl.errors import AcquisitionError
@@ -25,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 # Share of the linear range that the brightest pixels under white are to reach.
 WHITE_LEVEL = 0.7
+# Share that they may reach where the camera offers no exposure for that.
+MAX_WHITE_LEVEL = 0.9
 # Longest exposure relative to that of white: beyond, a photograph costs more time than its light
 # is worth.
 MAX_EXPOSURE_RATIO = 64.0
@@ -41,6 +45,14 @@ MAX_WHITE_CODE = 0.95
 BRIGHT_QUANTILE = 0.999
 # Share of hot pixels above which the exposure is too long instead.
 MAX_HOT_SHARE = 0.1
+# Longer exposures are no brighter if codes rise by less than this power of the seconds, although
+# they are below full scale: film, the flattest of the curves, rises by 0.2.
+MIN_RISE_POWER = 0.05
+# Ratio of exposures that tells, and least code that is not noise.
+MIN_EXPOSURE_RATIO = 1.5
+MIN_BRIGHT_CODE = 0.05
+# Relative width of the codes of saturated pixels.
+SATURATION_WIDTH = 0.02
 # Largest number of exposures that are tried for white.
 MAX_PROBES = 10
 
@@ -48,6 +60,18 @@ MAX_PROBES = 10
 def offered_exposures(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
     """The exposures of a camera nearest to `seconds`: ascending, each once."""
     return tuple(sorted({nearest(shots.exposures, t) for t in seconds}))
+
+
+def unsaturated_exposure(shots: Shots, seconds: float) -> float:
+    """The exposure of a camera nearest to `seconds`, at which white has `WHITE_LEVEL`.
+
+    If white were saturated there, the next shorter one, if there is any.
+    """
+    longest = seconds * MAX_WHITE_LEVEL / WHITE_LEVEL
+    chosen = nearest(shots.exposures, seconds)
+    if chosen <= longest or shots.exposures is None:
+        return chosen
+    return max((t for t in shots.exposures if t <= longest), default=chosen)
 
 
 def bracket(shortest: float, longest: float, count: int) -> tuple[float, ...]:
@@ -152,6 +176,37 @@ def _check_bits(shots: Shots, level: float) -> None:
             f"white is saturated at code {code} of {last_code}; "
             f"bits of the rig (camera_bits of a folder) must be {bits}"
         )
+
+
+def check_full_scale(shots: Shots, seconds: Sequence[float], images: Sequence[np.ndarray]) -> None:
+    """Refuse a camera that is full below its last code: longer exposures are no brighter.
+
+    `images` (H, W[, c]) in [0, 1] are of one scene for so many seconds.
+    """
+    for c in range(shots.channels):
+        planes = [sample(image)[:, c] for image in images]
+        levels = [float(np.quantile(plane, BRIGHT_QUANTILE)) for plane in planes]
+        for a, b in combinations(np.argsort(seconds), 2):
+            ratio = seconds[b] / seconds[a]
+            is_below_full = levels[a] > MIN_BRIGHT_CODE and levels[b] < SATURATED_CODE
+            is_flat = levels[b] < levels[a] * ratio**MIN_RISE_POWER
+            if ratio >= MIN_EXPOSURE_RATIO and is_below_full and is_flat:
+                raise AcquisitionError(_full_scale_error(shots, planes[b], levels[b]))
+
+
+def _full_scale_error(shots: Shots, plane: np.ndarray, level: float) -> str:
+    """Tell at which code a camera is full, as saturated pixels of a photograph show it."""
+    code = float(np.median(plane[plane >= (1.0 - SATURATION_WIDTH) * level]))
+    full = f"{code:.4g} of full scale"
+    advice = f"{code:.4g}"
+    if shots.levels is not None:
+        last_code = shots.levels - 1
+        advice = f"{round(code * last_code)}"
+        full = f"code {advice} of {last_code}"
+    return (
+        f"the camera is full at {full}: longer exposures are no brighter; give white_level = "
+        f"{advice} for the rig, or for its camera"
+    )
 
 
 def _check_not_saturated(image: np.ndarray, seconds: float) -> None:

@@ -49,7 +49,10 @@ RIGS: dict[str, Any] = {
     "folder": rigs.FolderRig,
     "live": rigs.LiveRig,
 }
-CAMERAS: dict[str, Any] = {"opencv": rigs.OpenCVCamera, "gphoto2": rigs.GPhoto2Camera}
+CAMERAS: dict[str, Any] = {
+    "opencv": rigs.OpenCVCamera,
+    "gphoto2": rigs.GPhoto2Camera,
+}
 # Arguments of rigs that are objects, which no file has.
 OBJECT_ARGUMENTS = frozenset({"T", "folder"})
 # Electrons at full scale of a camera without photon noise.
@@ -121,9 +124,12 @@ class Project:
                 )
         table = _check_kind(path, "rig", content.get("rig"), RIGS)
         if table["kind"] == "live":
-            table["camera"] = _check_kind(path, "rig.camera", table["camera"], CAMERAS)
-            table["display"] = _check_table(path, "rig.display", table["display"], rigs.Display)
-        settings = _check_table(path, "acquire", content.get("acquire", {}), ScanSettings)
+            camera = table["camera"]
+            display = table["display"]
+            table["camera"] = _check_kind(path, "rig.camera", camera, CAMERAS)
+            table["display"] = _check_table(path, "rig.display", display, rigs.Display)
+        settings = content.get("acquire", {})
+        settings = _check_table(path, "acquire", settings, ScanSettings)
         project = cls(folder, table, settings)
         curve = settings.get("response")
         if curve is not None:
@@ -177,7 +183,9 @@ class Project:
             except (TypeError, ValueError) as error:
                 # A number where a class expects a list.
                 raise InputTypeError(f"holds a value of an unusable type: {error}") from error
-        with Shots(rig):
+        with contextlib.ExitStack() as opened:
+            if hasattr(rig, "close"):
+                opened.callback(rig.close)
             yield rig
 
     @contextlib.contextmanager
@@ -204,7 +212,8 @@ class Project:
             light = _expected_light(rig)
             exposures = settings.exposures
             if exposures is None:
-                exposures = expected_exposures(shots, light.direct + light.indirect, light.ambient)
+                lit = light.direct + light.indirect
+                exposures = expected_exposures(shots, lit, light.ambient)
         if self.state != "new":
             calibration = Calibration.of(self.store)
             noise = calibration.noise
@@ -237,7 +246,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
             f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one"
         )
     try:
-        return tomllib.loads(input_file(path).read_text(encoding="utf-8-sig"))
+        text = input_file(path).read_text(encoding="utf-8-sig")
+        return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from None
 
@@ -256,7 +266,9 @@ def _expected_noise(rig: Any) -> NoiseModel:
     sensor: Sensor | None = getattr(rig, "sensor", None)
     if sensor is None:
         return NoiseModel(levels=levels)
-    electrons = NOISELESS_ELECTRONS if sensor.gain is None else sensor.gain
+    electrons = sensor.gain
+    if electrons is None:
+        electrons = NOISELESS_ELECTRONS
     return NoiseModel(levels=levels, electrons=electrons, read=sensor.read)
 
 
@@ -273,9 +285,8 @@ def _check_kind(path: Path, name: str, table: Any, classes: Mapping[str, Any]) -
     _check_is_table(path, name, table)
     kind = table.get("kind")
     if kind not in list(classes):
-        raise InputError(
-            f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(classes)}"
-        )
+        kinds = ", ".join(classes)
+        raise InputError(f"{path}: [{name}] kind is {kind!r}; it must be one of {kinds}")
     return _check_table(path, name, table, classes[kind], {"kind": True})
 
 
@@ -300,11 +311,16 @@ def _check_table(
         required |= {"transport": True, "grid": False}
     for key in table:
         if key not in required:
-            raise InputError(f"{path}: [{name}] has {key!r}; it may have {', '.join(required)}")
+            allowed = ", ".join(required)
+            raise InputError(f"{path}: [{name}] has {key!r}; it may have {allowed}")
     for key, is_required in required.items():
         if is_required and key not in table:
             raise InputError(f"{path}: [{name}] has no {key!r}; it must be there")
-    return {key: None if value == "none" else value for key, value in table.items()}
+    checked = dict(table)
+    for key, value in table.items():
+        if value == "none":
+            checked[key] = None
+    return checked
 
 
 def _check_is_table(path: Path, name: str, table: Any) -> None:
@@ -329,12 +345,15 @@ def _make_rig(folder: Path, table: dict[str, Any], closed: bool) -> Any:
         return _make_virtual_rig(folder, options)
     if kind == "mitsuba":
         scene = options.pop("scene")
-        return rigs.MitsubaRig(scene if scene in SCENES else folder / str(scene), **options)
+        if scene not in SCENES:
+            scene = folder / str(scene)
+        return rigs.MitsubaRig(scene, **options)
     if kind == "folder":
         return rigs.FolderRig(folder, **options)
     if closed:
         grid = checks.grid("display.grid", options["display"]["grid"])
-        return ClosedRig(projector_grid=grid, channels=options["camera"].get("channels", 3))
+        channels = options["camera"].get("channels", 3)
+        return ClosedRig(projector_grid=grid, channels=channels)
     return _make_live_rig(folder, options)
 
 

@@ -3,7 +3,9 @@
 
 `Shots` checks codes before they go into a rig and images that come from it, counts the
 photographs, and scales their codes:
-    value = code / full scale,    full scale = 2^bits - 1 of an integer camera, 1 of a float one.
+    value = code / full scale,    full scale = 2^bits - 1 of an integer camera, 1 of a float one,
+
+or the white level of a camera that is full below that.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ EXPOSURE_TOLERANCE = 1e-3
 # Cells along a side of the digest of a photograph.
 DIGEST_SIDE = 8
 
-ImageFormat = tuple[tuple[int, ...], np.dtype]  # shape and type of a photograph
+# Shape and type of a photograph.
+ImageFormat = tuple[tuple[int, ...], np.dtype]
 
 
 class Rig(Protocol):
@@ -42,6 +45,8 @@ class Rig(Protocol):
         Seconds that the camera offers, ascending; without it any from 1e-4 to 30.
     bits : int
         Bits in use in a uint16 image; without it 16.
+    white_level : float
+        Code from which on a pixel may be saturated, if that is below full scale.
     prepare(shots)
         Called with the (codes, seconds) that come next.
     describe()
@@ -129,7 +134,8 @@ class Shots(Closing):
         self.grid = checks.grid("rig.projector_grid", rig.projector_grid)
         self.projector_grid = self.grid
         self.channels = checks.one_of("rig.channels", rig.channels, (1, 3))
-        self.exposures = as_exposures("rig.exposures", getattr(rig, "exposures", None))
+        exposures = getattr(rig, "exposures", None)
+        self.exposures = as_exposures("rig.exposures", exposures)
         self.count = 0
         self.image = np.zeros((0, 0))
         self.camera_grid: tuple[int, int] | None = None
@@ -155,9 +161,12 @@ class Shots(Closing):
 
     def name(self, number: int) -> str:
         """Name of a photograph in messages: its number, and its file if the rig has one."""
+        name = f"photograph {number}"
         file_name = getattr(self.rig, "file_name", None)
         file = None if file_name is None else file_name(number)
-        return f"photograph {number}" if file is None else f"photograph {number} ({file})"
+        if file is None:
+            return name
+        return f"{name} ({file})"
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
         """Announce the (codes, seconds) that come next, in order, to a rig that lists them."""
@@ -207,8 +216,10 @@ class Shots(Closing):
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON for records: the rig's own description, grids, and the photographs so far."""
+        rig = {"kind": type(self.rig).__name__}
         describe = getattr(self.rig, "describe", None)
-        rig = {"kind": type(self.rig).__name__} if describe is None else describe()
+        if describe is not None:
+            rig = describe()
         return {
             "rig": rig,
             "projector_grid": self.grid,
@@ -245,9 +256,10 @@ class Shots(Closing):
         sizes = self.camera_grid, self.levels
         if self.expected is not None and self.expected != sizes:
             text = "{} pixels and {} levels"
+            expected = text.format(*self.expected)
             raise InputError(
-                f"{name} has {text.format(*sizes)}; it must have {text.format(*self.expected)}, "
-                "as the scan was begun with, or another store"
+                f"{name} has {text.format(*sizes)}; "
+                f"it must have {expected}, as the scan was begun with, or another store"
             )
 
     def _record_digest(self, codes: np.ndarray, seconds: float, scaled: np.ndarray) -> None:
@@ -266,7 +278,11 @@ def nearest(exposures: Iterable[float] | None, seconds: float) -> float:
     """The exposure whose ratio to `seconds` is nearest to 1; None offers any from 1e-4 to 30."""
     if exposures is None:
         return float(min(max(seconds, SHORTEST), LONGEST))
-    return min(exposures, key=lambda offered: abs(math.log(offered / seconds)))
+
+    def distance(offered: float) -> float:
+        return abs(math.log(offered / seconds))
+
+    return min(exposures, key=distance)
 
 
 def as_exposures(name: str, offered: Any) -> tuple[float, ...] | None:
@@ -277,7 +293,8 @@ def as_exposures(name: str, offered: Any) -> tuple[float, ...] | None:
     if offered is None:
         return None
     seconds = checks.finite(name, checks.real(name, offered))
-    if seconds.ndim != 1 or seconds.size == 0 or seconds[0] <= 0 or np.any(np.diff(seconds) <= 0):
+    is_list = seconds.ndim == 1 and seconds.size > 0
+    if not is_list or seconds[0] <= 0 or np.any(np.diff(seconds) <= 0):
         raise InputError(f"{name} is {offered!r}; it must be positive seconds, ascending")
     return tuple(map(float, seconds))
 
@@ -325,26 +342,39 @@ def to_unit(
     `name`, for an image that cannot be used.
     """
     _check_image(name, image, camera.channels)
+    white_level = _white_level(image.dtype, camera)
     if expected is not None and expected != (image.shape, image.dtype):
         shape, dtype = expected
         raise AcquisitionError(f"{name} is {image.dtype} {image.shape}; it must be {dtype} {shape}")
-    levels = _code_levels(image.dtype, camera)
-    if levels is None:
-        return _finite_image(name, image)
-    if image.max() >= levels:
-        raise AcquisitionError(
-            f"{name} reaches {image.max()}; by rig.bits the largest code is {levels - 1}"
-        )
-    return image * np.float32(1.0 / (levels - 1))
+    if image.dtype.kind == "f":
+        image = _finite_image(name, image)
+        if white_level is None:
+            return image
+    else:
+        largest = _largest_code(image.dtype, camera)
+        if image.max() > largest:
+            raise AcquisitionError(
+                f"{name} reaches {image.max()}; by rig.bits the largest code is {largest}"
+            )
+        if white_level is None:
+            white_level = largest
+    if white_level < image.max():
+        image = np.minimum(image, image.dtype.type(white_level))
+    return image * np.float32(1.0 / white_level)
 
 
 def _check_image(name: str, image: np.ndarray, channels: int) -> None:
-    if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
-        raise AcquisitionError(f"{name} holds {image.dtype}; it must hold uint8, uint16 or float")
-    colours = () if channels == 1 else (3,)
-    if image.ndim < 2 or image.shape[2:] != colours or image.size == 0:
-        expected = "(H, W)" if channels == 1 else "(H, W, 3)"
-        raise AcquisitionError(f"{name} has shape {image.shape}; it must be {expected}, not empty")
+    dtype = image.dtype
+    if dtype not in (np.uint8, np.uint16) and dtype.kind != "f":
+        raise AcquisitionError(f"{name} holds {dtype}; it must hold uint8, uint16 or float")
+    colours = ()
+    expected = "(H, W)"
+    if channels == 3:
+        colours = (3,)
+        expected = "(H, W, 3)"
+    shape = image.shape
+    if len(shape) < 2 or shape[2:] != colours or image.size == 0:
+        raise AcquisitionError(f"{name} has shape {shape}; it must be {expected}, not empty")
 
 
 def _finite_image(name: str, image: np.ndarray) -> np.ndarray:
@@ -361,19 +391,38 @@ def _code_levels(dtype: np.dtype, camera: Any) -> int | None:
     """Number of codes of photographs of `dtype`; None for floats."""
     if dtype.kind == "f":
         return None
+    white_level = _white_level(dtype, camera)
+    if white_level is not None:
+        return int(white_level) + 1
+    return _largest_code(dtype, camera) + 1
+
+
+def _largest_code(dtype: np.dtype, camera: Any) -> int:
+    """The largest code that photographs of integers can have."""
     if dtype == np.uint8:
-        return 256
+        return 255
     bits = getattr(camera, "bits", None)
     if bits is None:
-        return 1 << 16
-    return 1 << checks.count("rig.bits", bits, least=8, most=16)
+        return 65535
+    return (1 << checks.count("rig.bits", bits, least=8, most=16)) - 1
+
+
+def _white_level(dtype: np.dtype, camera: Any) -> float | None:
+    """White level of a camera whose photographs have this type; None for full scale."""
+    level = getattr(camera, "white_level", None)
+    if level is None:
+        return None
+    if dtype.kind == "f":
+        return checks.number("rig.white_level", level, above=0.0)
+    return checks.count("rig.white_level", level, most=_largest_code(dtype, camera))
 
 
 def require_members(name: str, value: Any, *members: str) -> None:
     """Refuse an object without one of the members."""
     missing = [member for member in members if not hasattr(value, member)]
     if missing:
-        raise InputTypeError(f"{name} is a {type(value).__name__} without {', '.join(missing)}")
+        kind = type(value).__name__
+        raise InputTypeError(f"{name} is a {kind} without {', '.join(missing)}")
 
 
 def load_extra(module: str, extra: str, user: str) -> Any:

@@ -28,14 +28,16 @@ from ltcl.files import locked, sweep
 from ltcl.store import ArrayLog
 
 logger = logging.getLogger(__name__)
-VOLATILE_KEYS = frozenset({"survey", "seed", "mitsuba", "source", "backend", "index", "driver"})
-"""Keys of `describe()`, on any level, that may differ when a scan is resumed."""
+# Keys of `describe()`, on any level, that may differ when a scan is resumed.
+VOLATILE_KEYS = frozenset(("survey", "seed", "mitsuba", "source", "backend", "index", "driver"))
 # Names in the log: the description of the rig, and the beginning of those of photographs.
 RIG_ENTRY = "rig"
 SHOT_PREFIX = "shot_"
 
-Request = tuple[np.ndarray, float]  # codes (h, w[, 3]) and seconds
-Progress = Callable[[str, int, int], None]
+# Codes (h, w[, 3]) and seconds.
+Request = tuple[np.ndarray, float]
+# Called with a step, how much of it is done, and of how much.
+ProgressFunction = Callable[[str, int, int], None]
 
 
 def ignore_progress(step: str, done: int, total: int) -> None:
@@ -194,8 +196,8 @@ def calibration_photographs(store: Path) -> int:
 def remove_photographs(store: Path) -> None:
     """Remove the folder after the calibration was committed, also one that a killed run left."""
     names = ArrayLog(calibration_folder(store)).names
-    is_ours = [name == RIG_ENTRY or name.startswith(SHOT_PREFIX) for name in names]
-    if names and all(is_ours):
+    foreign = [name for name in names if name != RIG_ENTRY and not name.startswith(SHOT_PREFIX)]
+    if names and not foreign:
         shutil.rmtree(calibration_folder(store), ignore_errors=True)
 
 
@@ -219,7 +221,7 @@ def photograph_log(store: Path, shots: Shots) -> Iterator[ArrayLog | None]:
         try:
             yield log
         except AcquisitionError:
-            logger.warning("%s has the photographs so far; to take them anew, remove it", log.path)
+            logger.warning("%s has the photographs so far; to take them again, remove it", log.path)
             raise
     remove_photographs(store)
 
@@ -240,7 +242,8 @@ def _open_log(path: Path, shots: Shots) -> ArrayLog:
 
 def check_same_rig(description: Any, shots: Shots, path: Path) -> None:
     """Refuse a rig with another description than that of the photographs in `path`."""
-    check_same("rig", _identity(shots.describe()["rig"]), _identity(description), path)
+    now = shots.describe()["rig"]
+    check_same("rig", _identity(now), _identity(description), path)
 
 
 def check_same(name: str, now: Any, before: Any, path: Path) -> None:

@@ -132,7 +132,8 @@ def _check_response(response: Any, shots: Shots) -> None:
 
 def _offered_exposures(exposures: Any, shots: Shots) -> tuple[float, ...]:
     """The exposures of the camera that equal the seconds asked for."""
-    seconds = checks.finite("exposures", checks.real("exposures", exposures))
+    seconds = checks.real("exposures", exposures)
+    checks.finite("exposures", seconds)
     if seconds.ndim != 1 or seconds.size == 0 or seconds.min() <= 0:
         raise InputError(f"exposures is {exposures!r}; it must be a sequence of positive seconds")
     offered = []

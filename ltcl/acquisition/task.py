@@ -28,8 +28,14 @@ from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.scanning import adaptive, columns, plan
 from ltcl.acquisition.scanning.pictures import ScanCamera, ScanGrid
-from ltcl.acquisition.session import Progress, check_same, check_same_rig, ignore_progress
+from ltcl.acquisition.session import (
+    ProgressFunction,
+    check_same,
+    check_same_rig,
+    ignore_progress,
+)
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
+from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError
 from ltcl.files import as_path
 from ltcl.store import ArrayLog, BlockStore, StoredRows, load
@@ -50,7 +56,7 @@ def acquire(
     strategy: str = ScanSettings.strategy,
     store: str | os.PathLike[str] | None = None,
     resume: bool = True,
-    progress: Progress | None = None,
+    progress: ProgressFunction | None = None,
     exposures: Sequence[float] | None = ScanSettings.exposures,
     response: Response | None = ScanSettings.response,
     frames: int = ScanSettings.frames,
@@ -75,7 +81,7 @@ def acquire(
         (`scanning.plan`).
     store : path, optional
         Folder of the transport, which keeps the photographs, to be resumed. Until the set-up is
-        measured they are in the folder STORE.calibration; to begin anew, remove both.
+        measured they are in the folder STORE.calibration; to begin again, remove both.
     resume : bool
         Go on with the content of the store; else the store must not exist.
     progress : function of (str, int, int), optional
@@ -146,7 +152,7 @@ def acquire(
         sigmas=sigmas,
     ).for_rig(shots)
     if device is not None:
-        device = _open_device(device)
+        device = open_device(device)
     if store is None:
         return _acquire_in_memory(shots, settings, progress, device)
     path = as_path(store, "store")
@@ -166,7 +172,7 @@ def acquire(
     return load(path, on_dark="mask", device=device)
 
 
-def finalize(store: str | os.PathLike[str], progress: Progress | None = None) -> None:
+def finalize(store: str | os.PathLike[str], progress: ProgressFunction | None = None) -> None:
     """Make the transport from the photographs in a store, if that was not done before.
 
     Parameters
@@ -215,13 +221,8 @@ def finalize(store: str | os.PathLike[str], progress: Progress | None = None) ->
     columns.finish(opened, grid, patterns, settings.sigmas)
 
 
-def _open_device(device: Any) -> Any:
-    """Open a device through a small transport: this package does not import `ltcl.device`."""
-    return Transport(np.eye(1), (1, 1), device=device).device
-
-
 def _acquire_in_memory(
-    shots: Shots, settings: ScanSettings, progress: Progress, device: Any
+    shots: Shots, settings: ScanSettings, progress: ProgressFunction, device: Any
 ) -> Transport:
     """Scan into a temporary store, and read the transport from it whole."""
     with tempfile.TemporaryDirectory(prefix="ltcl-") as folder:
@@ -283,7 +284,8 @@ def _check_same_scan(store: BlockStore, shots: Shots, settings: ScanSettings) ->
     for name, value in settings.to_json().items():
         check_same(name, value, before.get(name), path)
     facts = store.provenance["acquisition"]
-    check_same("rig.projector_grid", shots.grid, Calibration.of(store).resampling.grid, path)
+    grid = Calibration.of(store).resampling.grid
+    check_same("rig.projector_grid", shots.grid, grid, path)
     check_same("rig.channels", shots.channels, store.layout.channels, path)
     check_same_rig(facts["rig"], shots, path)
     if facts.get("camera_grid"):
@@ -308,7 +310,11 @@ def _check_same_view(shots: Shots, digests: dict[str, Any], path: Path) -> None:
 
 
 def _calibrate(
-    path: Path, shots: Shots, settings: ScanSettings, log: ArrayLog | None, progress: Progress
+    path: Path,
+    shots: Shots,
+    settings: ScanSettings,
+    log: ArrayLog | None,
+    progress: ProgressFunction,
 ) -> BlockStore:
     """Measure the set-up, choose a strategy, and make the store, which is resumed from here on."""
     side = settings.block if settings.strategy == "block" else 1
@@ -383,7 +389,9 @@ def _store_sizes(strategy: str, grid: ScanGrid, order: int) -> dict[str, Any]:
     }
 
 
-def _scan(store: BlockStore, shots: Shots, settings: ScanSettings, progress: Progress) -> None:
+def _scan(
+    store: BlockStore, shots: Shots, settings: ScanSettings, progress: ProgressFunction
+) -> None:
     """Photograph what is missing in a store with its calibration, and make the transport of it."""
     calibration = Calibration.of(store)
     strategy = store.attributes["strategy"]
@@ -410,7 +418,7 @@ def _run_adaptive(
     grid: ScanGrid,
     camera: ScanCamera | None,
     settings: ScanSettings,
-    progress: Progress,
+    progress: ProgressFunction,
 ) -> None:
     """Run an adaptive scan through its pictures in the store, and photograph the missing ones.
 

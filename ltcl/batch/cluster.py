@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ltcl import checks
+from ltcl.batch.main_guard import check_main_guard
 from ltcl.device import list_devices, open_device
 from ltcl.errors import ClusterError, InputError, InputTypeError, LtclError
 
@@ -168,7 +169,8 @@ def connect(
     InputError
         `cluster` is no address, or has workers of its own.
     ClusterError
-        Nothing answers at the address.
+        Nothing answers at the address; local workers do not start, or are started outside of the
+        main guard, by a file that each of them imports.
     """
     distributed = _distributed()
     from dask import config
@@ -206,6 +208,7 @@ def _check_address(cluster: str) -> None:
 
 def _processes(workers: int | None, device: str | None) -> Any:
     """Workers on this machine, each with its own environment, unlike those of a LocalCluster."""
+    check_main_guard()
     distributed = _distributed()
     devices = _worker_devices(device or os.environ.get("LTCL_DEVICE"))
     count = len(devices) if workers is None else checks.count("workers", workers)
@@ -219,7 +222,13 @@ def _processes(workers: int | None, device: str | None) -> Any:
             "options": {**options, "env": environment},
         }
     scheduler = {"cls": distributed.Scheduler, "options": loopback}
-    return distributed.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
+    try:
+        return distributed.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
+    except (OSError, RuntimeError, TimeoutError) as error:
+        reason = " ".join(str(error).split())
+        raise ClusterError(
+            f"cluster is 'local', but its {count} worker(s) did not start: {reason}"
+        ) from None
 
 
 def _worker_devices(requested: str | None) -> list[str]:

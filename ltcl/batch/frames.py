@@ -33,7 +33,7 @@ from ltcl.images.frames import Source, check_video, open_frames, write_video
 from ltcl.tasks.compensation import compensate
 from ltcl.tasks.compensation.inputs import check_gain
 from ltcl.tasks.report import versions
-from ltcl.tasks.requirements import error_note, resolve_reference
+from ltcl.tasks.requirements import check_exact, error_note
 from ltcl.transport import frames as picture_frames
 from ltcl.transport.transport import Transport, check_transport
 
@@ -254,7 +254,8 @@ def _check_light(
 ) -> float:
     """Check T and what `compensate` gets; return the light that is white in .png."""
     check_transport(T, square=False)
-    resolve_reference(T, options.get("exact"))
+    if options.get("exact") is not None:
+        check_exact(T, options["exact"])
     check_gain(gain, loss)
     _check_pictures(T, options)
     _, high = checks.interval("bounds", options.get("bounds", (0.0, 1.0)))

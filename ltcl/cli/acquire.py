@@ -46,15 +46,16 @@ Overhead = Annotated[
 Card = Annotated[
     Path | None,
     file_option(
-        "Folder with the camera's own files; they are copied, in the order of their numbers, in "
-        "place of the missing photographs.",
+        "Folder with the camera's own files; they are copied, in the order in which they were "
+        "taken, in place of the missing photographs.",
         metavar="FOLDER",
     ),
 ]
 app = typer.Typer(
     help=(
-        "Photograph a scene under patterns, and make its transport of the photographs, in "
-        "DIR/transport.zarr. DIR has an acquisition.toml, which describes the rig and the scan."
+        "Photograph a scene under patterns, and make its transport of the "
+        "photographs, in DIR/transport.zarr. DIR has an acquisition.toml, which "
+        "describes the rig and the scan."
     ),
     no_args_is_help=True,
 )
@@ -87,10 +88,10 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
         noise=facts["noise"],
         light=facts["light"],
         channels=facts["channels"],
-        plans={
-            name: StrategyPlan.from_attributes(strategy) for name, strategy in strategies.items()
-        },
+        plans={},
     )
+    for name, strategy in strategies.items():
+        report.plans[name] = StrategyPlan.from_attributes(strategy)
     return Answer(report, _plan_lines(report, facts["calibration"]))
 
 
@@ -101,19 +102,14 @@ def _rig_kind(project: Any) -> RigKind:
 def _plan_lines(report: PlanReport, calibration_photographs: int) -> list[str]:
     rows = []
     for name, strategy in report.plans.items():
-        rows.append(
-            [
-                name,
-                size_text(strategy.grid),
-                strategy.patterns,
-                strategy.photographs,
-                datetime.timedelta(seconds=round(strategy.seconds)),
-                checks.size(strategy.disk),
-                percent(strategy.error, 2),
-            ]
-        )
+        row = [name, size_text(strategy.grid), strategy.patterns]
+        row += [strategy.photographs, datetime.timedelta(seconds=round(strategy.seconds))]
+        row += [checks.size(strategy.disk), percent(strategy.error, 2)]
+        rows.append(row)
     exposures = ", ".join(f"{seconds:.3g}" for seconds in report.exposures)
-    source = "measured" if report.measured else "guessed; the calibration will measure them"
+    source = "measured"
+    if not report.measured:
+        source = "guessed; the calibration will measure them"
     advice = f"auto takes {report.auto}: {report.why}"
     if report.asked_for != "auto":
         advice = f"acquisition.toml asks for {report.asked_for}; {advice}"
@@ -121,7 +117,7 @@ def _plan_lines(report: PlanReport, calibration_photographs: int) -> list[str]:
         f"{report.folder}: {report.rig} rig, {report.channels} channel(s)",
         f"exposures {exposures} s, noise and light {source}\n",
         table(PLAN_COLUMNS, rows),
-        f"\nphotographs: all, {calibration_photographs} of them of the calibration; "
+        f"\nphotographs: all, with {calibration_photographs} of the calibration; "
         "error of T p: by noise, relative",
         advice,
     ]
@@ -180,11 +176,11 @@ def _check_card(project: Any, take: Path | None) -> None:
     if take is None:
         return
     if project.kind != "folder":
-        raise InputError(
-            f"--take is given, but the rig of {project.folder} is {project.kind}, not folder"
-        )
+        rig = f"the rig of {project.folder} is {project.kind}"
+        raise InputError(f"--take is given, but {rig}, not folder")
     if not take.is_dir():
-        raise FileError(f"{take}: is no folder; --take needs the one with the camera's files")
+        advice = "--take needs the one with the camera's files"
+        raise FileError(f"{take}: is not a folder; {advice}")
 
 
 def _has_all_photographs(project: Any) -> bool:
@@ -224,7 +220,7 @@ def _advice(project: Any, error: BaseException) -> str:
         return f"remove {project.store} to begin again"
     if project.kind == "folder" and not isinstance(error, KeyboardInterrupt):
         photographs = project.folder / "photographs"
-        return f"remove wrong ones from {photographs}, to be asked for them again; {again}"
+        return f"remove wrong ones from {photographs} to take them again; {again}"
     if project.state == "begun":
         return f"what was photographed before is kept in {project.store}; {again}"
     if project.kind == "folder":
@@ -252,7 +248,8 @@ def _report(context: Context, folder: Path, device: str | None) -> Answer:
     project = Project.open(folder)
     opened = open_device(device)
     if not project.store.exists():
-        raise FileError(f"{project.store}: no such folder yet; 'ltcl acquire run' makes it")
+        advice = "'ltcl acquire run' makes it"
+        raise FileError(f"{project.store}: no such folder yet; {advice}")
     context.progress("entries and noise")
     facts = Report.of(project.store)
     T = store.load(project.store, on_dark="mask", device=opened)
@@ -269,6 +266,6 @@ def _report(context: Context, folder: Path, device: str | None) -> Answer:
         with project.rig(aligned=True) as rig:
             scan.error = list(Setup.of(project.store).relative_error(rig, T))
         errors = ", ".join(f"{error:.2%}" for error in scan.error)
-        lines.append(f"relative error of T p, for patterns p that were not scanned: {errors}")
+        lines.append(f"relative error of T p, for p that were not scanned: {errors}")
     lines.append(f"transport in {project.store}")
     return Answer(scan, [*lines, *verdict_lines({str(project.store): judgement})])

@@ -12,7 +12,7 @@ import inspect
 import logging
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -22,7 +22,8 @@ from typer.models import ArgumentInfo
 from ltcl.cli.progress import Progress
 from ltcl.cli.reports.parts import ErrorReport
 from ltcl.cli.reports.report import document
-from ltcl.errors import LtclError
+from ltcl.cli.streams import print_line, print_result
+from ltcl.errors import FileError, LtclError
 from ltcl.tasks import report
 
 FAILED = 1
@@ -31,12 +32,12 @@ WAITING = 3
 INTERNAL = 70
 INTERRUPTED = 130
 EXIT_CODES = (
-    "**Exit codes:** 0 done; 1 refused or failed, with one line that tells why; 2 wrong usage; "
-    "3 'ltcl acquire run' waits for photographs that a person has to take; 70 an error in ltcl "
-    "itself; 130 Ctrl-C.\n\n"
+    "**Exit codes:** 0 done; 1 refused or failed, with one line that tells "
+    "why; 2 wrong usage; 3 'ltcl acquire run' waits for photographs that a "
+    "person has to take; 70 an error in ltcl itself; 130 Ctrl-C.\n\n"
     "With **--json** stdout holds one JSON document, also if a command fails: "
-    '{"error": the problem, "type": its class in ltcl.errors, "exit_code": as above}. '
-    "docs/reference/json.md has all fields."
+    '{"error": the problem, "type": its class in ltcl.errors, '
+    '"exit_code": as above}. docs/reference/json.md has all fields.'
 )
 # Level of a note, between INFO and WARNING.
 NOTE = 25
@@ -146,11 +147,11 @@ def _is_argument(parameter: inspect.Parameter) -> bool:
 
 def _print_answer(answer: Answer, json: bool) -> None:
     if json:
-        typer.echo(report.dumps(document(answer.data)))
+        print_result(report.dumps(document(answer.data)))
         return
     for line in answer.lines:
         if line is not None:
-            typer.echo(line)
+            print_result(line)
 
 
 def fail(error: BaseException, json: bool = False, verbose: bool = False) -> ErrorReport:
@@ -160,7 +161,8 @@ def fail(error: BaseException, json: bool = False, verbose: bool = False) -> Err
     code = FAILED
     if isinstance(error, KeyboardInterrupt):
         code = INTERRUPTED
-        message = message or "interrupted"
+        if not message:
+            message = "interrupted"
     elif isinstance(error, UsageError):
         code = USAGE
     elif isinstance(error, MemoryError) and not isinstance(error, LtclError):
@@ -169,11 +171,12 @@ def fail(error: BaseException, json: bool = False, verbose: bool = False) -> Err
         code = INTERNAL
         message = f"internal error: {kind}: {message}; --verbose prints where it occurred"
         if verbose:
-            typer.echo("".join(traceback.format_exception(error)), err=True)
-    typer.echo(f"ltcl: error: {message}", err=True)
+            print_line("".join(traceback.format_exception(error)))
+    print_line(f"ltcl: error: {message}")
     failure = ErrorReport(error=message, type=kind, exit_code=code)
     if json:
-        typer.echo(report.dumps(failure.document()))
+        with suppress(FileError):
+            print_result(report.dumps(failure.document()))
     return failure
 
 
@@ -186,10 +189,11 @@ class _StderrHandler(logging.Handler):
     """Prints records of ltcl as lines on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        is_warning = record.levelno >= logging.WARNING
-        level = f"{record.levelname.lower()}: " if is_warning else ""
+        level = ""
+        if record.levelno >= logging.WARNING:
+            level = f"{record.levelname.lower()}: "
         message = " ".join(record.getMessage().split())
-        typer.echo(f"ltcl: {level}{message}", err=True)
+        print_line(f"ltcl: {level}{message}")
 
 
 @contextmanager

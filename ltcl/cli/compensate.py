@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ from ltcl.cli.tables import percent, table
 from ltcl.errors import InputError, LtclError
 from ltcl.tasks.compensation import compensate as compensate_picture
 
-SHARING_PANEL = "Sharing the work"
+sharing_option = partial(option, panel="Sharing the work")
 # Share of a picture out of reach from which advice is given.
 ADVICE_SHARE = 0.01
 # Pictures of which a contact sheet shows the first ones.
@@ -35,33 +36,30 @@ COLUMNS = ("picture", "method", "products", "gain", "clipped", "error", "pattern
 def sharing_options(
     mpi: Annotated[
         bool,
-        option(
+        sharing_option(
             "Share each solve between the ranks of 'mpiexec -n 2 ltcl compensate ... --mpi'.",
             "--mpi",
-            panel=SHARING_PANEL,
         ),
     ] = False,
     transports: Annotated[
         str | None,
-        option(
-            "Glob pattern of transports, instead of TRANSPORT, such as 'scans/*.zarr'; DIR gets "
-            "a folder for each.",
+        sharing_option(
+            "Glob pattern of transports, instead of TRANSPORT, such as "
+            "'scans/*.zarr'; DIR gets a folder for each.",
             metavar="PATTERN",
-            panel=SHARING_PANEL,
         ),
     ] = None,
     cluster: Annotated[
         str | None,
-        option(
-            "Workers for --transports: local processes, one for each GPU, or the ADDRESS of a "
-            "Dask scheduler.",
+        sharing_option(
+            "Workers for --transports: local processes, one for each GPU, or "
+            "the ADDRESS of a Dask scheduler.",
             metavar="local|ADDRESS",
-            panel=SHARING_PANEL,
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        option("Number of processes of --cluster local.", metavar="N", min=1, panel=SHARING_PANEL),
+        sharing_option("Number of processes of --cluster local.", metavar="N", min=1),
     ] = None,
 ) -> None:
     """Options that share the work."""
@@ -115,16 +113,16 @@ def _check_pictures(paths: list[Path]) -> None:
 
 def _check_sharing(context: Context) -> None:
     """Refuse options that exclude one another."""
-    has_scenes = context.options["transports"] is not None
-    if context.options["mpi"]:
+    asked = context.options
+    if asked["mpi"]:
         for name in ("transports", "cluster"):
-            if context.options[name] is not None:
+            if asked[name] is not None:
                 raise InputError(f"--mpi is given, and --{name}; give one of them")
     for name in ("cluster", "workers"):
-        if context.options[name] is not None and not has_scenes:
+        if asked[name] is not None and asked["transports"] is None:
             raise InputError(
-                f"--{name} is given, but --transports is not; workers share many transports, and "
-                "'ltcl film' shares frames"
+                f"--{name} is given, but --transports is not; "
+                "workers share many transports, and 'ltcl film' shares frames"
             )
 
 
@@ -150,22 +148,23 @@ def compensate_pictures(
     sheet = []
     rows = []
     with pictures.fill(out) as folder:
-        for name, path in zip(context.progress.each([*desired]), paths, strict=True):
+        names = context.progress.each([*desired])
+        for name, path in zip(names, paths, strict=True):
             try:
                 result = compensate_picture(job.T, desired[name], **job.settings)
             except LtclError as error:
                 error.args = (f"{error} (compensating {path})",)
                 raise
-            entry, row_of_panels = writer.write(folder, name, path, desired[name], result)
+            entry, shown = writer.write(folder, name, path, desired[name], result)
             report.pictures.append(entry)
-            sheet.append(row_of_panels)
+            sheet.append(shown)
             rows.append(_table_row(path, name, entry))
             _note_out_of_reach(path, entry)
         panels.contact_sheet(sheet[:MAX_SHEET_ROWS]).save(folder / "compensate.png")
         pictures.write_report(folder, report)
     lines = [
         table(COLUMNS, rows),
-        f"\npatterns, appearances and what is out of reach as .exr and .png in {out}",
+        f"\npatterns, appearances and light out of reach as .exr and .png in {out}",
         f"look at {out / 'compensate.png'}",
     ]
     return Answer(report, [*lines, *job.notes])
@@ -190,9 +189,10 @@ class PictureWriter:
         appearance_factor = self.factor / result.gain
         seen = panels.to_srgb(result.appearance, appearance_factor)
         missing = panels.mark(seen, result.out_of_reach * appearance_factor)
-        error = f"{100 * result.error:.2g} %"
-        appearance_panel = panels.panel(seen, f"{name}, as predicted, error {error}")
-        missing_panel = panels.panel(missing, "out of reach: orange too dark, blue too bright")
+        label = f"{name}, as predicted, error {100 * result.error:.2g} %"
+        appearance_panel = panels.panel(seen, label)
+        label = "out of reach: orange too dark, blue too bright"
+        missing_panel = panels.panel(missing, label)
         row = [
             panels.linear_panel(desired, f"{name}, desired", self.factor),
             panels.linear_panel(result.pattern, f"{name}, pattern", 1 / self.white),
@@ -231,14 +231,16 @@ class PictureWriter:
         """Write the light of a pattern, and the codes that the projector has to get."""
         from ltcl import images
 
-        files = PictureWithStd(exr=f"{name}_pattern.exr", png=f"{name}_pattern.png")
-        images.write(folder / files.exr, pattern)
+        place = folder / f"{name}_pattern"
+        exr = place.with_suffix(".exr")
+        png = place.with_suffix(".png")
+        images.write(exr, pattern)
         setup = self.job.setup
         if setup is None:
-            images.write(folder / files.png, pattern / self.white, encoding="srgb")
+            images.write(png, pattern / self.white, encoding="srgb")
         else:
-            images.write(folder / files.png, setup.codes(pattern), encoding="linear")
-        return files
+            images.write(png, setup.codes(pattern), encoding="linear")
+        return PictureWithStd(exr=exr.name, png=png.name)
 
 
 def _table_row(path: Path, name: str, entry: CompensatedPicture) -> list[Any]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,8 @@ from ltcl.tasks import compensation
 from ltcl.transport.transport import Transport
 
 PROJECTOR_PANEL = "Projector and target"
+projector_option = partial(option, panel=PROJECTOR_PANEL)
+projector_file = partial(file_option, panel=PROJECTOR_PANEL)
 
 
 def parse_gain(text: str) -> float | str:
@@ -32,12 +35,11 @@ def parse_gain(text: str) -> float | str:
 
 Gain = Annotated[
     str | None,
-    option(
-        "Factor between the picture and what the scene shall show; auto: the largest within "
-        "reach. Default: 1; auto if T was measured.",
+    projector_option(
+        "Factor between the picture and what the scene will show; auto: the "
+        "largest within reach. Default: 1; auto if T was measured.",
         parser=parse_gain,
         metavar="FACTOR",
-        panel=PROJECTOR_PANEL,
     ),
 ]
 
@@ -46,39 +48,32 @@ def target_options(
     gain: Gain = None,
     loss: Annotated[
         float | None,
-        option(
-            "Relative error that the gain may cost with --gain auto. Default: the least possible.",
-            panel=PROJECTOR_PANEL,
+        projector_option(
+            "Relative error that the gain may cost with --gain auto. Default: the least possible."
         ),
     ] = None,
-    low: Annotated[float, option("Darkest light of the projector.", panel=PROJECTOR_PANEL)] = 0.0,
-    high: Annotated[
-        float, option("Brightest light of the projector.", panel=PROJECTOR_PANEL)
-    ] = 1.0,
+    low: Annotated[float, projector_option("Darkest light of the projector.")] = 0.0,
+    high: Annotated[float, projector_option("Brightest light of the projector.")] = 1.0,
     clamp: Annotated[
         bool,
-        option(
-            "Clamp light beyond that range, instead of the best pattern within it.",
+        projector_option(
+            "Cut off light beyond that range, instead of finding the best pattern within it.",
             "--clamp",
-            panel=PROJECTOR_PANEL,
         ),
     ] = False,
     background: Annotated[
         Path | None,
-        file_option(
-            "Picture of the light that stays. Default: as measured, else none.",
-            panel=PROJECTOR_PANEL,
+        projector_file(
+            "Picture of the light without the projector. Default: as measured, else none."
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
-        file_option(
-            "Store of 'ltcl acquire' from which TRANSPORT was made.", panel=PROJECTOR_PANEL
-        ),
+        projector_file("Store of 'ltcl acquire' from which TRANSPORT was made."),
     ] = None,
     weights: Annotated[
         Path | None,
-        file_option("Picture of the weight of the error at each pixel.", panel=PROJECTOR_PANEL),
+        projector_file("Picture of the weight of the error at each pixel."),
     ] = None,
 ) -> None:
     """Options of the target and of the projector."""
@@ -115,9 +110,11 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
     for name in ("weights", "background"):
         settings[name] = _read_camera_picture(context, asked[name], T)
     resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
-    notes = [loading.compression_caveat("errors are", T, asked["exact"])]
-    if settings["weights"] is None and T.masked.any():
-        notes.append("masked pixels do not count in errors")
+    caveat = loading.compression_caveat("errors are", T, asked["exact"])
+    notes = [caveat]
+    if settings["weights"] is None and T.unlit.any():
+        unlit = f"{T.unlit.sum()} camera pixels that the projector does not light"
+        notes.append(f"{unlit} do not count in errors")
     if setup is not None:
         notes.append(
             "pattern .png holds the codes of the measured projector; 'ltcl show' shows it there"
@@ -132,25 +129,22 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
 
 def resolve_gain(gain: float | str | None, setup: Any) -> float | str:
     """Return the gain, by default 1, or "auto" if the projector was measured."""
-    if gain is not None:
-        return gain
-    return 1.0 if setup is None else "auto"
+    if gain is None:
+        return 1.0 if setup is None else "auto"
+    return gain
 
 
 def _check_setup(context: Context, setup: Any, T: Transport) -> None:
     """Refuse a projector with other pixels than T, and bounds beyond its measured range."""
     if (setup.grid, setup.channels) != (T.grid, T.channels):
         sizes = f"{setup.grid} and {setup.channels} channel(s)"
-        raise InputError(
-            f"{context.options['calibration']}: is of {sizes}; TRANSPORT has {T.grid} and "
-            f"{T.channels}"
-        )
+        path = context.options["calibration"]
+        raise InputError(f"{path}: is of {sizes}; TRANSPORT has {T.grid} and {T.channels}")
     low = context.options["low"]
     high = context.options["high"]
     if not 0.0 <= low < high <= 1.0:
-        raise InputError(
-            f"--low is {low:g} and --high is {high:g}; a measured projector has 0 to 1"
-        )
+        problem = f"--low is {low:g} and --high is {high:g}"
+        raise InputError(f"{problem}; a measured projector has 0 to 1")
 
 
 def _read_camera_picture(context: Context, path: Path | None, T: Transport) -> Any:

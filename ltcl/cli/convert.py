@@ -53,16 +53,19 @@ def _set_grids(
         return dataclasses.replace(record, **sizes)
     if any(size != record.grid for size in sizes.values()):
         size = next(iter(sizes.values()))
-        height, width = record.grid
-        raise InputError(f"grid is {size}; this transport is compressed on {height} x {width}")
+        grid = "{} x {}".format(*record.grid)
+        raise InputError(f"grid is {size}; this transport is compressed on {grid}")
     return record
 
 
 def _note_lost_grids(target: Path, record: StoreRecord | CompressedRecord) -> None:
     rows, columns = record.shape
     if target.suffix.lower() == ".npy" or record.grid is None:
-        grid = "x".join(str(size) for size in record.grid or "HW")
-        note(f"{target}: does not contain the grid; give --grid {grid} wherever you use it")
+        grid = "HxW"
+        if record.grid is not None:
+            grid = "{}x{}".format(*record.grid)
+        advice = f"give --grid {grid} wherever you use it"
+        note(f"{target}: does not contain the grid; {advice}")
     elif rows != columns and record.camera_grid is None:
         advice = "give --camera-grid HxW, or to relight"
         note(f"{target}: does not contain the camera's grid; {advice}")

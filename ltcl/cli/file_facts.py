@@ -35,21 +35,17 @@ def describe(
         stored = "dense"
     elif record.stored:
         stored = "row blocks"
-    facts = FileFacts(
-        file=file,
-        shape=record.shape,
-        grid=record.grid,
-        camera_grid=record.camera_grid,
-        mixing=_mixing(record),
-        channels=_channels(len(matrices)),
+    facts = _facts(
+        file,
+        record,
+        F,
+        channels=len(matrices),
         stored=stored,
         dtype=str(matrices[0].dtype),
         entries=sum(map(_count_entries, matrices)),
         nbytes=sum(map(_count_bytes, matrices)),
         first_bounce_from="diagonal" if record.first_bounce is None else "file",
         solution_error=0.0,
-        first_bounce=_interval(F),
-        dark_pixels=_count_dark(F),
     )
     return facts, F
 
@@ -58,38 +54,45 @@ def _describe_compressed(file: Path, record: CompressedRecord) -> tuple[FileFact
     """Describe a compressed transport without its operators, which need a device."""
     F = record.first_bounce
     kinds = ", ".join(record.kinds)
-    facts = FileFacts(
-        file=file,
-        shape=record.shape,
-        grid=record.grid,
-        camera_grid=record.camera_grid,
-        mixing=_mixing(record),
-        channels=_channels(len(F)),
-        stored=_stored_form(record),
+    facts = _facts(
+        file,
+        record,
+        F,
+        channels=len(F),
+        # "compressed" or "inverse".
+        stored=record.format.split("-")[1],
         dtype=f"{kinds}; error {checks.upwards(record.error)}",
         entries=record.entries,
         nbytes=record.nbytes,
         first_bounce_from="file",
         solution_error=record.error,
-        first_bounce=_interval(F),
-        dark_pixels=_count_dark(F),
     )
     return facts, F
 
 
-def _stored_form(record: CompressedRecord) -> Any:
-    """Return "compressed" or "inverse"."""
-    return record.format.split("-")[1]
-
-
-def _channels(count: int) -> Any:
-    return count
-
-
-def _mixing(record: StoreRecord | CompressedRecord) -> Any:
-    if record.mixing is None:
-        return None
-    return np.asarray(record.mixing).tolist()
+def _facts(
+    file: Path,
+    record: StoreRecord | CompressedRecord,
+    F: np.ndarray | None,
+    **facts_of_form: Any,
+) -> FileFacts:
+    """Add what all forms of storage share."""
+    mixing = record.mixing
+    first_bounce = None
+    dark_pixels = None
+    if F is not None:
+        first_bounce = (float(F.min()), float(F.max()))
+        dark_pixels = int(np.count_nonzero((F <= 0).any(axis=0)))
+    return FileFacts(
+        file=file,
+        shape=record.shape,
+        grid=record.grid,
+        camera_grid=record.camera_grid,
+        mixing=None if mixing is None else np.asarray(mixing).tolist(),
+        first_bounce=first_bounce,
+        dark_pixels=dark_pixels,
+        **facts_of_form,
+    )
 
 
 def _count_entries(matrix: Any) -> int:
@@ -104,28 +107,14 @@ def _count_bytes(matrix: Any) -> int:
     return sum(getattr(matrix, name).nbytes for name in CSR)
 
 
-def _interval(F: np.ndarray | None) -> tuple[float, float] | None:
-    if F is None:
-        return None
-    return float(F.min()), float(F.max())
-
-
-def _count_dark(F: np.ndarray | None) -> int | None:
-    if F is None:
-        return None
-    is_dark = (F <= 0).any(axis=0)
-    return int(np.count_nonzero(is_dark))
-
-
 def _first_bounce(record: StoreRecord) -> np.ndarray | None:
     """Check a whole record; return F (channels, N), 0 where dark, or None if T is not square."""
     _check_record(record)
     rows, columns = record.shape
     if rows != columns:
         if record.first_bounce is not None:
-            raise InputError(
-                f"first_bounce is given, but T is {record.shape}; only a square T has one"
-            )
+            problem = f"first_bounce is given, but T is {record.shape}"
+            raise InputError(f"{problem}; only a square T has one")
         return None
     matrices: list[Any] = list(record.matrices)
     F = record.first_bounce
@@ -166,24 +155,23 @@ def _check_record(record: StoreRecord) -> None:
 def judge(record: StoreRecord | CompressedRecord, facts: FileFacts) -> Verdict:
     """Judge a transport as far as this is cheap; else tell which command can."""
     if isinstance(record, CompressedRecord):
-        return Verdict(
-            f"Unknown: stored as {facts.stored}: run 'ltcl analyze' on what it was made of."
-        )
+        advice = "run 'ltcl analyze' on what it was made of"
+        return Verdict(f"Unknown: stored as {facts.stored}: {advice}.")
     is_square = record.shape[0] == record.shape[1]
     missing = ""
     if not record.grid:
         missing += " --grid HxW"
     if not is_square and not record.camera_grid:
         missing += " --camera-grid HxW"
-    tool = f"analyze {facts.file}" if is_square else f"convert {facts.file} OUT.npz"
     reason = ""
     if missing:
         reason = "the file does not contain the grid"
-    elif is_square and facts.nbytes > MAX_JUDGED_BYTES:
+    elif facts.nbytes > MAX_JUDGED_BYTES:
         reason = "T takes more than 256 MiB"
     if reason:
-        return Verdict(f"Unknown: {reason}: run 'ltcl {tool}{missing}'.")
-    arguments = {name: value for name, value in vars(record).items() if value is not None}
+        return Verdict(f"Unknown: {reason}: run 'ltcl analyze {facts.file}{missing}'.")
+    arguments = vars(record).items()
+    arguments = {name: value for name, value in arguments if value is not None}
     matrices = arguments.pop("matrices")
     try:
         return verdict(Transport(matrices, **arguments))

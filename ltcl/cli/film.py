@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +15,8 @@ from ltcl.cli.tables import percent, table
 from ltcl.errors import InputError
 
 FRAMES_PANEL = "Frames"
-CLUSTER_PANEL = "Cluster"
+frame_option = partial(option, panel=FRAMES_PANEL)
+cluster_option = partial(option, panel="Cluster")
 # Share of a pattern at a bound from which advice is given.
 ADVICE_SHARE = 0.01
 COLUMNS = ("frames", "of this run", "a second", "gain", "worst error", "most clipped")
@@ -23,41 +25,37 @@ COLUMNS = ("frames", "of this run", "a second", "gain", "worst error", "most cli
 def frame_options(
     batch: Annotated[
         int | None,
-        option("Number of frames solved at once. Default: 8.", min=1, panel=FRAMES_PANEL),
+        frame_option("Number of frames solved at once. Default: 8.", min=1),
     ] = None,
     resume: Annotated[
         bool,
-        option("Continue the last run into DIR where it ended.", "--resume", panel=FRAMES_PANEL),
+        frame_option("Continue the last run into DIR where it ended.", "--resume"),
     ] = False,
     frames: Annotated[
-        int | None, option("Only the first N frames.", metavar="N", min=1, panel=FRAMES_PANEL)
+        int | None, frame_option("Only the first N frames.", metavar="N", min=1)
     ] = None,
     video: Annotated[
         Path | None,
         file_option(
-            "Video of the patterns to write as well: .mkv or .avi, lossless; or .mp4, which "
-            "changes their codes.",
+            "Video of the patterns to write as well: .mkv or .avi, lossless; or "
+            ".mp4, which changes their codes.",
             callback=check_writable_file,
             panel=FRAMES_PANEL,
         ),
     ] = None,
     fps: Annotated[
         float | None,
-        option(
-            "Frames per second of that video. Default: as the source, else 25.",
-            panel=FRAMES_PANEL,
-        ),
+        frame_option("Frames per second of that video. Default: as the source, else 25."),
     ] = None,
     format: Annotated[
         Literal["png", "exr"] | None,
-        option(
-            "Format of the patterns: png, 16 bits; or exr, the linear light. Default: png.",
-            panel=FRAMES_PANEL,
+        frame_option(
+            "Format of the patterns: png, 16 bits; or exr, the linear light. Default: png."
         ),
     ] = None,
     appearance: Annotated[
         bool,
-        option("Write how the scene will look, too.", "--appearance", panel=FRAMES_PANEL),
+        frame_option("Write how the scene will look, too.", "--appearance"),
     ] = False,
 ) -> None:
     """Options of the frames that are read and written."""
@@ -66,16 +64,15 @@ def frame_options(
 def cluster_options(
     cluster: Annotated[
         str | None,
-        option(
-            "Workers that solve: local processes, one for each GPU, or the ADDRESS of a Dask "
-            "scheduler.",
+        cluster_option(
+            "Workers that solve: local processes, one for each GPU, or the "
+            "ADDRESS of a Dask scheduler.",
             metavar="local|ADDRESS",
-            panel=CLUSTER_PANEL,
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        option("Number of processes of --cluster local.", metavar="N", min=1, panel=CLUSTER_PANEL),
+        cluster_option("Number of processes of --cluster local.", metavar="N", min=1),
     ] = None,
 ) -> None:
     """Options of a cluster."""
@@ -101,9 +98,8 @@ def film(
     from ltcl.images.frames import is_frames
 
     if not is_frames(film):
-        raise InputError(
-            f"FILM is {film}; it must be a video or a folder; 'ltcl compensate' is for pictures"
-        )
+        problem = f"FILM is {film}; it must be a video or a folder"
+        raise InputError(f"{problem}; 'ltcl compensate' is for pictures")
     job = compensation.prepare(context, transport)
     result = _compensate_frames(context, job, film, out)
     report = FilmReport.from_attributes(
@@ -156,7 +152,9 @@ def _note_clipped(report: FilmReport) -> None:
 def _lines(report: FilmReport) -> list[str]:
     worst = report.worst
     most_clipped = report.most_clipped
-    pace = f"{report.frames_per_second:.1f}" if report.solved else None
+    pace = None
+    if report.solved:
+        pace = f"{report.frames_per_second:.1f}"
     row = (
         len(report.frames),
         report.solved,

@@ -59,15 +59,18 @@ def info(
             entries.append(BadFile(file=file, **failure.document()))
             continue
         if F is not None:
-            grid = facts.grid or (1, facts.shape[1])
+            _, pixels = facts.shape
+            grid = (1, pixels) if facts.grid is None else facts.grid
             first_bounces[file.name] = (F, grid)
         verdicts[str(file)] = verdict
         entries.append(GoodFile(**vars(facts), verdict=VerdictReport.from_verdict(verdict)))
         rows.append(_table_row(facts))
     panels.write_first_bounces(show_dark, first_bounces)
-    lines = [table(COLUMNS, rows)] if rows else []
+    lines = verdict_lines(verdicts)
+    if rows:
+        lines.insert(0, table(COLUMNS, rows))
     code = FAILED if len(rows) < len(files) else 0
-    return Answer(entries, [*lines, *verdict_lines(verdicts)], code)
+    return Answer(entries, lines, code)
 
 
 def _read_facts(file: Path, variable: str | None) -> tuple[FileFacts, np.ndarray | None, Verdict]:

@@ -17,7 +17,7 @@ from ltcl.errors import InputError
 from ltcl.operators import rank_device
 from ltcl.solvers.solve import SAMPLED
 from ltcl.tasks import report
-from ltcl.tasks.requirements import default_rtol, resolve_reference
+from ltcl.tasks.requirements import check_exact, default_rtol
 from ltcl.transport.transport import Transport
 
 # Relative error of a float32 picture by rounding.
@@ -53,9 +53,8 @@ def _check_out(out: Path | None, transport: Path) -> None:
         return
     place = out.resolve()
     if transport.resolve() in (place, *place.parents):
-        raise InputError(
-            f"--out is {out}, which is TRANSPORT itself or in it; it must be another place"
-        )
+        problem = f"--out is {out}, which is TRANSPORT itself or in it"
+        raise InputError(f"{problem}; it must be another place")
 
 
 def _open_device(context: Context) -> Any:
@@ -69,12 +68,8 @@ def _open_device(context: Context) -> Any:
 
 def _given_options(context: Context, *names: str) -> dict[str, Any]:
     """Return the options of these names that the command has and that are set."""
-    options = {}
-    for name in names:
-        value = context.options.get(name)
-        if value is not None:
-            options[name] = value
-    return options
+    values = {name: context.options.get(name) for name in names}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def is_measured(path: Path) -> bool:
@@ -145,7 +140,7 @@ def _load_original(context: Context, T: Transport) -> Transport:
         device=T.device,
     )
     # It refuses other colours.
-    resolve_reference(T, exact)
+    check_exact(T, exact)
     channels = (3,) if T.channels == 3 else ()
     pattern = np.random.default_rng(0).random((*T.grid, *channels))
     picture = T @ pattern
@@ -154,31 +149,35 @@ def _load_original(context: Context, T: Transport) -> Transport:
     limit = T.error + PICTURE_ROUNDING
     if not error <= limit:
         reason = f"pictures differ by {error:.2g}, more than {checks.upwards(limit)}"
-        raise InputError(f"{path}: is not what TRANSPORT was compressed from: {reason}")
+        problem = f"{path}: is not what TRANSPORT was compressed from"
+        raise InputError(f"{problem}: {reason}")
     return exact
 
 
 def has_std(T: Transport, settings: dict[str, Any]) -> bool:
     """True if results have standard deviations: the noise was measured, or T has its entries."""
-    judged = settings["exact"] or T
-    return not judged.is_compressed or judged.measured_noise is not None
+    if settings["exact"] is not None:
+        T = settings["exact"]
+    return not T.is_compressed or T.measured_noise is not None
 
 
-def compression_caveat(what: str, T: Transport, exact: Path | None = None) -> str | None:
-    """Return a line on the error of a compressed T, which `what` does not include."""
+def compression_caveat(subject: str, T: Transport, exact: Path | None = None) -> str | None:
+    """Return a line on the error of a compressed T, which errors of the `subject` leave out."""
     if not T.error:
         return None
     if exact is not None:
-        return f"{what} of {exact}, by which solutions were corrected"
+        return f"{subject} of {exact}, by which solutions were corrected"
     bound = f"{100 * float(checks.upwards(T.error)):.2g} %"
     if T.error < T.error_bound:
         bound += " for pictures"
-    return f"{what} of the compressed transport, whose own relative error is at most {bound}"
+    limit = f"whose own relative error is at most {bound}"
+    return f"{subject} of the compressed transport, {limit}"
 
 
 def heading(context: Context, path: Path, T: Transport, **resolved: Any) -> dict[str, Any]:
     """Return the fields of a `Heading`; `resolved` are options with the values that were used."""
-    options = {name: value for name, value in context.options.items() if name != "out"}
+    options = {**context.options}
+    options.pop("out", None)
     transport = TransportFacts.from_attributes(
         T, file=path, masked=int(T.masked.sum()), compressed=T.is_compressed
     )

@@ -13,6 +13,7 @@ import typer
 from ltcl import __version__
 from ltcl.cli import (
     acquire,
+    align,
     analyze,
     compensate,
     convert,
@@ -20,6 +21,7 @@ from ltcl.cli import (
     doctor,
     film,
     info,
+    interrupt,
     ranks,
     relight,
     separate,
@@ -29,6 +31,7 @@ from ltcl.cli import (
     view,
 )
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
+from ltcl.cli.streams import checked_stdout, print_result
 from ltcl.errors import LtclError
 
 app = typer.Typer(
@@ -53,6 +56,7 @@ PANELS: dict[str, list[Any]] = {
         info.info,
         analyze.analyze,
         convert.convert,
+        align.align,
         transform.compress,
         transform.invert,
         transform.denoise,
@@ -71,7 +75,7 @@ def _program_options(
     version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
     if version:
-        typer.echo(f"ltcl {__version__}")
+        print_result(f"ltcl {__version__}")
         raise typer.Exit
 
 
@@ -80,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns the exit code.
     """
+    interrupt.release()
     words = sys.argv[1:] if arguments is None else list(arguments)
     if "--mpi" in words:
         return ranks.run_on_every_rank(run, words)
@@ -89,11 +94,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(words: list[str]) -> int:
     """Run the program in this process."""
     try:
-        return app(args=words, prog_name="ltcl", standalone_mode=False) or 0
+        # Help is printed by typer.
+        with checked_stdout():
+            return app(args=words, prog_name="ltcl", standalone_mode=False) or 0
     except UsageError as error:
         return _refuse_usage(error, words)
     except (LtclError, KeyboardInterrupt) as error:
-        # The command has not begun yet.
+        # The command has not begun yet, or stdout cannot be written.
         return fail(error, "--json" in words).exit_code
     except SystemExit as end:
         # The pipe that reads stdout was closed.

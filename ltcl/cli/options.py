@@ -34,7 +34,8 @@ def parse_grid(text: str) -> tuple[int, int]:
         width = int(match[2])
         if height > 0 and width > 0:
             return height, width
-    raise typer.BadParameter(f"{text!r} is not a grid; write height x width, for instance 48x64")
+    advice = "write height x width, for instance 48x64"
+    raise typer.BadParameter(f"{text!r} is not a grid; {advice}")
 
 
 def parse_path(text: str) -> Path:
@@ -80,7 +81,9 @@ def _with_parents(folder: Path) -> Iterator[Path]:
 
 def check_writable_file(place: Path | None) -> Path | None:
     """Return the path of a file; FileError if it cannot be written."""
-    return None if place is None else check_writable(place, place.parent)
+    if place is None:
+        return None
+    return check_writable(place, place.parent)
 
 
 def check_writable_folder(place: Path) -> Path:
@@ -101,7 +104,10 @@ def option(help: str, *names: str, **settings: Any) -> Any:
 
 
 file_option = partial(option, parser=parse_path, metavar="FILE")
-grid_option = partial(option, parser=parse_grid, metavar="HxW")
+grid_option = partial(option, parser=parse_grid, metavar="HxW", panel=TRANSPORT_PANEL)
+transport_option = partial(option, panel=TRANSPORT_PANEL)
+solver_option = partial(option, panel=SOLVER_PANEL)
+picture_option = partial(option, panel=PICTURES_PANEL)
 
 
 def out_option(help: str, callback: Any = check_writable_file, metavar: str = "FILE") -> Any:
@@ -113,7 +119,7 @@ FORMATS = (
     "Light transport: .npz, .npy, .mtx, .mat or .zarr; with the extra hdf5 also .h5, and .mat of "
     "v7.3."
 )
-SHOW_DARK_HELP = "PNG picture of the direct light to write; pixels without direct light are orange."
+SHOW_DARK_HELP = "PNG of the direct light to write; pixels without it are orange."
 TransportFile = Annotated[Path, argument("TRANSPORT", FORMATS)]
 TransportFiles = Annotated[list[Path], argument("FILE...", FORMATS)]
 Pictures = Annotated[
@@ -139,17 +145,15 @@ DeviceName = Annotated[
 ]
 OnDark = Annotated[
     Literal["mask", "raise"],
-    option(
-        "Treatment of projector pixels whose direct light is 0 or within its noise: keep them "
-        "unlit, or refuse.",
-        panel=TRANSPORT_PANEL,
+    transport_option(
+        "Projector pixels whose direct light is 0 or within its noise: keep them unlit, or refuse."
     ),
 ]
 ShowDark = Annotated[Path | None, file_option(SHOW_DARK_HELP, callback=check_writable_file)]
 Variable = Annotated[
     str | None,
-    option(
-        "Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME", panel=TRANSPORT_PANEL
+    transport_option(
+        "Name of the matrix in a .mat, .h5 or .npz file, or three: red,green,blue.", metavar="NAME"
     ),
 ]
 
@@ -157,11 +161,11 @@ Variable = Annotated[
 def file_options(
     grid: Annotated[
         tuple | None,
-        grid_option("Projector pixels, if the file lacks them.", panel=TRANSPORT_PANEL),
+        grid_option("Projector pixels, if the file lacks them."),
     ] = None,
     camera_grid: Annotated[
         tuple | None,
-        grid_option("Camera pixels, if they differ from the projector's.", panel=TRANSPORT_PANEL),
+        grid_option("Camera pixels, if they differ from the projector's."),
     ] = None,
     variable: Variable = None,
 ) -> None:
@@ -171,26 +175,24 @@ def file_options(
 def transport_options(
     first_bounce: Annotated[
         Literal["diagonal", "exact", "estimate"] | None,
-        option(
-            "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated. "
-            "Default: as in the file.",
-            panel=TRANSPORT_PANEL,
+        transport_option(
+            "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or "
+            "estimated. Default: as in the file."
         ),
     ] = None,
     on_dark: OnDark = "mask",
     dark: Annotated[
         float,
-        option(
-            "Threshold of dark pixels: direct light below DARK times its median is dark, too; "
-            "0 keeps them lit.",
-            panel=TRANSPORT_PANEL,
+        transport_option(
+            "Threshold of dark pixels: direct light below DARK times its median "
+            "is dark, too; 0 keeps them lit."
         ),
     ] = DARK_THRESHOLD,
     noise: Annotated[
         Path | None,
         file_option(
-            "Second measurement of the same scene, to measure the noise of TRANSPORT; without "
-            "it the noise is estimated.",
+            "Second measurement of the same scene, to measure the noise of "
+            "TRANSPORT; without it the noise is estimated.",
             panel=TRANSPORT_PANEL,
         ),
     ] = None,
@@ -202,19 +204,17 @@ def transport_options(
 def solve_options(
     method: Annotated[
         str,
-        option(
+        solver_option(
             f"Method of solution: one of {', '.join(METHODS)}.",
             callback=parse_method,
             metavar="NAME",
-            panel=SOLVER_PANEL,
         ),
     ] = "auto",
     rtol: Annotated[
         float | None,
-        option(
-            "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error "
-            "of T if that is larger.",
-            panel=SOLVER_PANEL,
+        solver_option(
+            "Relative residual that ends a solve. Default: 0.01 (separate: "
+            "0.001), or the error of T if that is larger."
         ),
     ] = None,
     inverse: Annotated[
@@ -227,28 +227,22 @@ def solve_options(
     exact: Annotated[
         Path | None,
         file_option(
-            "Original of a compressed TRANSPORT: solutions are corrected by it to any RTOL, and "
-            "errors are measured with it.",
+            "Original of a compressed TRANSPORT: solutions are corrected by it to "
+            "any RTOL, and errors are measured with it.",
             panel=SOLVER_PANEL,
         ),
     ] = None,
     samples: Annotated[
         int | None,
-        option(
+        solver_option(
             "Random walks from each pixel (monte_carlo, 256), or columns of a row (hybrid, 32).",
             min=1,
             max=2**32 - 1,
-            panel=SOLVER_PANEL,
         ),
     ] = None,
     seed: Annotated[
         int | None,
-        option(
-            "Random seed for monte_carlo and hybrid.",
-            min=0,
-            max=2**64 - 1,
-            panel=SOLVER_PANEL,
-        ),
+        solver_option("Random seed for monte_carlo and hybrid.", min=0, max=2**64 - 1),
     ] = None,
 ) -> None:
     """Options of the solver."""
@@ -257,14 +251,11 @@ def solve_options(
 def picture_options(
     resize: Annotated[
         bool,
-        option("Scale pictures of another size to the grid.", "--resize", panel=PICTURES_PANEL),
+        picture_option("Scale pictures of another size to the grid.", "--resize"),
     ] = False,
     encoding: Annotated[
         Literal["auto", "srgb", "linear"],
-        option(
-            "Encoding of input pictures; auto: integers are sRGB, floats linear.",
-            panel=PICTURES_PANEL,
-        ),
+        picture_option("Encoding of input pictures; auto: integers are sRGB, floats linear."),
     ] = "auto",
 ) -> None:
     """Options of reading pictures."""

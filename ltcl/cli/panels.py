@@ -42,7 +42,8 @@ def exposure(*pictures: np.ndarray) -> float:
     """
     white = 0.0
     for picture in pictures:
-        white = max(white, float(np.quantile(picture, WHITE_QUANTILE, method="higher")))
+        brightest = np.quantile(picture, WHITE_QUANTILE, method="higher")
+        white = max(white, float(brightest))
     return 1.0 / white if white > 0 else 1.0
 
 
@@ -71,8 +72,10 @@ def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
     largest = np.argmax(np.abs(missing), axis=-1)[..., None]
     missing = np.take_along_axis(missing, largest, axis=-1)
     size = np.abs(missing)
-    opacity = np.where(size > VISIBLE_DIFFERENCE, np.clip(0.4 + 2.0 * size, 0.0, 1.0), 0.0)
-    return (1 - opacity) * grey + opacity * np.where(missing > 0, ORANGE, BLUE)
+    opacity = np.clip(0.4 + 2.0 * size, 0.0, 1.0)
+    opacity = np.where(size > VISIBLE_DIFFERENCE, opacity, 0.0)
+    colour = np.where(missing > 0, ORANGE, BLUE)
+    return (1 - opacity) * grey + opacity * colour
 
 
 def linear_panel(picture: np.ndarray, label: str, factor: float) -> Image.Image:
@@ -96,22 +99,26 @@ def panel(codes: np.ndarray, label: str) -> Image.Image:
 def amplified_panel(picture: np.ndarray, name: str, factor: float) -> tuple[int, Image.Image]:
     """Draw a picture times a power of two that shows it best; return that power, too."""
     times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
-    return times, linear_panel(picture, f"{name}, {times} times as bright", factor * times)
+    label = f"{name}, {times} times as bright"
+    return times, linear_panel(picture, label, factor * times)
 
 
 def write_std(
     folder: Path, name: str, std: np.ndarray, factor: float
 ) -> tuple[PictureFiles, Image.Image]:
     """Write files of standard deviations; return their names, and their amplified panel."""
-    label = f"{name.split('/')[-1]}_std"
+    label = f"{name.split('/')[-1]}, std by noise alone"
     _, shown = amplified_panel(std, label, factor)
     return write(folder, f"{name}_std", std, shown), shown
 
 
 def contact_sheet(rows: Sequence[Sequence[Image.Image]]) -> Image.Image:
     """Arrange panels in rows, as one picture."""
-    widths = [sum(shown.width + MARGIN for shown in row) for row in rows]
-    heights = [max(shown.height for shown in row) + MARGIN for row in rows]
+    widths = []
+    heights = []
+    for row in rows:
+        widths.append(sum(shown.width + MARGIN for shown in row))
+        heights.append(max(shown.height for shown in row) + MARGIN)
     size = (max(widths) + MARGIN, sum(heights) + MARGIN)
     sheet = Image.new("RGB", size, PAPER)
     top = MARGIN
@@ -141,5 +148,6 @@ def _first_bounce_panel(name: str, first_bounce: np.ndarray, grid: tuple[int, in
     is_dark = np.any(np.atleast_2d(first_bounce) <= 0.0, axis=0)
     picture = first_bounce.T.reshape(*grid, *first_bounce.shape[:-1])
     codes = to_srgb(picture, exposure(first_bounce))
-    label = f"{name}: {np.count_nonzero(is_dark)} of {is_dark.size} pixels are dark"
+    dark_pixels = np.count_nonzero(is_dark)
+    label = f"{name}: {dark_pixels} of {is_dark.size} pixels are dark"
     return panel(mark(codes, is_dark.astype(np.float64)), label)

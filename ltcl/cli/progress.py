@@ -72,7 +72,9 @@ class Progress(rich.progress.Progress):
     def each(self, items: Sequence[Any]) -> Iterator[Any]:
         """Yield all items, and show their names before the steps that follow."""
         for number, item in enumerate(items, 1):
-            count = f"{number}/{len(items)} " if len(items) > 1 else ""
+            count = ""
+            if len(items) > 1:
+                count = f"{number}/{len(items)} "
             self._item = f"{count}{item}: "
             self._step = ""
             self._solves_begun = 0
@@ -88,8 +90,9 @@ class Progress(rich.progress.Progress):
         def callback(iteration: int, residual: float) -> None:
             if iteration == 0:
                 self._solves_begun += 1
-            is_measurable = 0 < residual < 1 and 0 < rtol < 1
-            gained = math.log(residual) / math.log(rtol) if is_measurable else 0.0
+            gained = 0.0
+            if 0 < residual < 1 and 0 < rtol < 1:
+                gained = math.log(residual) / math.log(rtol)
             detail = f": iteration {iteration}"
             if not math.isnan(residual):
                 detail += f", relative residual {residual:.1e}"

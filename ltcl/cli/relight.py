@@ -46,11 +46,11 @@ def relight(
     rows = []
     with pictures.fill(out) as folder:
         for (name, picture), path in zip(relit.items(), pattern, strict=True):
-            panel = panels.linear_panel(picture, f"{path.name}, relit", report.exposure)
+            label = f"{path.name}, relit"
+            panel = panels.linear_panel(picture, label, report.exposure)
             files = panels.write(folder, f"{name}_relit", picture, panel)
-            entry = RelitPicture(
-                file=path, brightest=float(picture.max()), exr=files.exr, png=files.png
-            )
+            brightest = float(picture.max())
+            entry = RelitPicture(file=path, brightest=brightest, exr=files.exr, png=files.png)
             report.pictures.append(entry)
             rows.append((path.name, entry.brightest, entry.exr))
         pictures.write_report(folder, report)

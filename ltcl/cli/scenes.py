@@ -33,18 +33,16 @@ def connect_cluster(context: Context) -> AbstractContextManager[Any]:
     if cluster is not None:
         return connect(cluster, workers, context.options["device"])
     if workers is not None:
-        raise InputError(
-            f"--workers is {workers}, but there is no --cluster; it is for --cluster local"
-        )
+        problem = f"--workers is {workers}, but there is no --cluster"
+        raise InputError(f"{problem}; it is for --cluster local")
     return nullcontext()
 
 
 def check_pictures(pictures: list[Path]) -> None:
     """Refuse a transport in place of the first picture."""
     if pictures[0].suffix.lower() in FORMATS:
-        raise InputError(
-            f"{pictures[0]}: is a transport, and --transports is given, too; give one of them"
-        )
+        problem = f"{pictures[0]}: is a transport, and --transports is given, too"
+        raise InputError(f"{problem}; give one of them")
 
 
 def compensate_scenes(
@@ -78,7 +76,8 @@ def compensate_scenes(
         rows.append((transport.stem, report["pictures"][0]["gain"], percent(worst)))
     if failure is not None:
         raise failure
-    lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
+    scenes = table(("scene", "gain", "worst error"), rows)
+    lines = [scenes, f"\na folder for each in {out}"]
     return Answer({"folder": out, "scenes": reports}, lines)
 
 
@@ -91,20 +90,18 @@ def _find_transports(pattern: str, out: Path) -> list[Path]:
         raise InputError(
             f"--transports is {pattern}: it must mean files or folders of different names"
         )
-    places = {out.resolve()}
-    for stem in stems:
-        places.add((out / stem).resolve())
+    places = {out.resolve(), *((out / stem).resolve() for stem in stems)}
     if any(transport.resolve() in places for transport in transports):
         raise InputError(f"--out is {out}, where transports are; it must be another place")
     return transports
 
 
 def _options_of_one_scene(context: Context) -> dict[str, Any]:
-    options = {**context.options, "transports": None, "cluster": None, "workers": None}
-    if context.options["cluster"] is not None:
+    options = {**context.options}
+    if options["cluster"] is not None:
         # Each worker has a device of its own.
         options["device"] = None
-    return options
+    return options | dict.fromkeys(("transports", "cluster", "workers"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,9 +54,11 @@ def separate(
         has_folders=len(photographs) > 1,
     )
     with pictures.fill(out) as folder:
-        for name, path in zip(context.progress.each([*photographs]), picture, strict=True):
-            result = separation.separate(T, photographs[name], bounces, **settings)
-            entry = writer.write(folder, name, path, photographs[name], result)
+        names = context.progress.each([*photographs])
+        for name, path in zip(names, picture, strict=True):
+            photograph = photographs[name]
+            result = separation.separate(T, photograph, bounces, **settings)
+            entry = writer.write(folder, name, path, photograph, result)
             report.pictures.append(entry)
         panels.contact_sheet(writer.sheet).save(folder / "separate.png")
         pictures.write_report(folder, report)
@@ -64,6 +66,7 @@ def separate(
         table(COLUMNS, _table_rows(report)),
         f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}",
         _inverse_error_line(report),
+        *dict.fromkeys(picture.warning for picture in report.pictures),
         loading.compression_caveat("all of this is", T, context.options["exact"]),
     ]
     return Answer(report, lines)
@@ -85,40 +88,46 @@ class PartsWriter:
     ) -> SeparatedPicture:
         """Write all parts of a picture, and return its report."""
         light = _parts(result)
-        deviations = _deviations(result) if self.has_std else {}
+        deviations: dict[str, np.ndarray] = {}
+        if self.has_std:
+            deviations = _deviations(result)
         solved = dict(zip(_solved_names(result), result.solutions, strict=True))
         whole = _mean(photograph)
         parts = []
         shown = [panels.linear_panel(photograph, name, self.factor)]
         shown_std = []
-        for part, picture in light.items():
-            place = f"{name}/{part}" if self.has_folders else part
-            panel = panels.linear_panel(picture, part, self.factor)
+        for label, picture in light.items():
+            place = f"{name}/{label}" if self.has_folders else label
+            panel = panels.linear_panel(picture, label, self.factor)
             shown.append(panel)
             files = panels.write(folder, place, picture, panel)
             entry = LightPart(
-                part=part,
+                part=label,
                 exr=files.exr,
                 png=files.png,
                 lowest=float(picture.min()),
                 share=_mean(picture) / whole if whole else None,
-                channels=solves(solved[part]) if part in solved else [],
+                channels=solves(solved.get(label, ())),
             )
-            if part in deviations:
-                entry.std, panel = panels.write_std(folder, place, deviations[part], self.factor)
+            if label in deviations:
+                std = deviations[label]
+                entry.std, panel = panels.write_std(folder, place, std, self.factor)
                 shown_std.append(panel)
             parts.append(entry)
-        self._add_rows([shown[:3], shown[3:], self._amplified_panels(light), shown_std])
-        return SeparatedPicture(file=path, transport_error=result.transport_error, parts=parts)
-
-    def _add_rows(self, rows: list[list[Image.Image]]) -> None:
-        self.sheet += [row for row in rows if row]
+        rows = [shown[:3], shown[3:], self._amplified_panels(light), shown_std]
+        self.sheet += filter(None, rows)
+        return SeparatedPicture(
+            file=path,
+            transport_error=result.transport_error,
+            warning=result.warning,
+            parts=parts,
+        )
 
     def _amplified_panels(self, light: dict[str, np.ndarray]) -> list[Image.Image]:
         """Draw dim parts once more, amplified."""
         amplified = []
-        for part, picture in light.items():
-            times, panel = panels.amplified_panel(picture, part, self.factor)
+        for label, picture in light.items():
+            times, panel = panels.amplified_panel(picture, label, self.factor)
             if times >= MIN_AMPLIFICATION:
                 amplified.append(panel)
         return amplified
@@ -126,14 +135,20 @@ class PartsWriter:
 
 def _solved_names(result: Any) -> list[str]:
     """Name the parts that are solved for."""
-    return ["direct", *(f"bounce_{k}" for k in range(1, len(result.bounces) + 1))]
+    return ["direct", *_bounces(result)]
 
 
 def _parts(result: Any) -> dict[str, np.ndarray]:
-    parts = {"direct": result.direct, "indirect": result.indirect}
-    for number, bounce in enumerate(result.bounces, 1):
-        parts[f"bounce_{number}"] = bounce
-    return {**parts, "rest": result.rest}
+    return {
+        "direct": result.direct,
+        "indirect": result.indirect,
+        **_bounces(result),
+        "rest": result.rest,
+    }
+
+
+def _bounces(result: Any) -> dict[str, np.ndarray]:
+    return {f"bounce_{number}": bounce for number, bounce in enumerate(result.bounces, 1)}
 
 
 def _deviations(result: Any) -> dict[str, np.ndarray]:
@@ -150,15 +165,9 @@ def _table_rows(report: SeparateReport) -> list[list[Any]]:
     for picture in report.pictures:
         for part in picture.parts:
             products = sum(solve.products for solve in part.channels)
-            rows.append(
-                [
-                    picture.file.name,
-                    part.part,
-                    percent(part.share, 4),
-                    products if products else None,
-                    _largest_residual(part.channels),
-                ]
-            )
+            row = [picture.file.name, part.part, percent(part.share, 4)]
+            row += [products or None, _largest_residual(part.channels)]
+            rows.append(row)
     return rows
 
 

@@ -8,12 +8,11 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from ltcl.cli import compensation, loading, options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option
 from ltcl.cli.reports.program import PlayReport, ShowReport
+from ltcl.cli.streams import print_line
 from ltcl.cli.view import address, address_options
 from ltcl.errors import InputError
 from ltcl.tasks.compensation import RTOL
@@ -47,7 +46,7 @@ def play(
     scene = ViewerScene(T, transport.name, {}, setup)
     report = PlayReport(film=film)
     with Window(film.name, **address(context)) as window:
-        typer.echo(f"{window.url} plays {film}; Ctrl-C ends it", err=True)
+        print_line(f"{window.url} plays {film}; Ctrl-C ends it")
         with contextlib.suppress(KeyboardInterrupt):
             pace = run_film(
                 scene,
@@ -72,7 +71,11 @@ def show(
     context: Context,
     folder: Annotated[
         Path,
-        argument("FOLDER", "A picture, a folder of pictures, or the folder of an acquisition."),
+        argument(
+            "FOLDER",
+            "A picture, a folder of pictures, the folder of an acquisition, or the results of "
+            "'ltcl compensate'.",
+        ),
     ],
     display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
     every: Annotated[
@@ -99,9 +102,8 @@ def show(
     This needs the extra projector. With --browser Ctrl-C ends it, and it needs the extra view.
     """
     if every is not None and arrival:
-        raise InputError(
-            f"--every is {every:g}, but --arrival is given; one of them decides what comes next"
-        )
+        problem = f"--every is {every:g}, but --arrival is given"
+        raise InputError(f"{problem}; one of them decides what comes next")
     from ltcl.acquisition import rigs
 
     advance: Any = "key"
@@ -137,7 +139,7 @@ def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter) -> int:
     from ltcl.show.window import Window
 
     with Window(str(folder)) as window:
-        typer.echo(f"{window.url} shows {folder}; Ctrl-C ends it", err=True)
+        print_line(f"{window.url} shows {folder}; Ctrl-C ends it")
         with contextlib.suppress(KeyboardInterrupt):
             return rigs.show(folder, display=window, advance=advance, progress=counter)
     return counter.count

@@ -37,7 +37,7 @@ Curve = Literal["linear", "srgb", "gamma2.2", "film"]
 
 def _parse_albedo(text: str) -> tuple[float, ...]:
     with suppress(ValueError):
-        albedo = tuple(float(part) for part in text.split(","))
+        albedo = tuple(map(float, text.split(",")))
         if len(albedo) in (1, 3):
             return albedo
     raise typer.BadParameter(f"{text!r} is not an albedo; write one number, or red,green,blue")
@@ -193,7 +193,10 @@ def _write_scene(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, A
         rig["camera_grid"] = asked["camera_grid"]
     if is_rendered:
         return {**rig, **_mitsuba_rig(source, asked)}
-    record = _named_scene(source, asked) if is_named else _scene_of_file(scene, asked)
+    if is_named:
+        record = _named_scene(source, asked)
+    else:
+        record = _scene_of_file(scene, asked)
     formats.write(folder / "truth.npz", record)
     ambient = asked["ambient"]
     rig["kind"] = "virtual"
@@ -227,19 +230,29 @@ def _mitsuba_rig(source: str, asked: dict[str, Any]) -> dict[str, Any]:
     albedo = asked["albedo"] or DEFAULT_ALBEDO
     rig["scene"] = source
     rig["channels"] = len(albedo)
-    rig["albedo"] = albedo if len(albedo) > 1 else albedo[0]
+    rig["albedo"] = _single_or_colour(albedo)
     return rig
+
+
+def _single_or_colour(albedo: tuple[float, ...]) -> Any:
+    if len(albedo) == 1:
+        return albedo[0]
+    return albedo
 
 
 def _named_scene(name: str, asked: dict[str, Any]) -> StoreRecord:
     from ltcl import scenes
 
-    albedo = asked["albedo"] or DEFAULT_ALBEDO
-    walls = np.array([albedo]) if len(albedo) > 1 else albedo[0]
-    sides = {"sides": 5} if name == "box" else {}
-    make = getattr(scenes, name)
-    built = make(asked["size"] or DEFAULT_SIZE, albedo=walls, **sides)
-    return StoreRecord(built.matrices(), grid=built.grid)
+    size = asked["size"] or DEFAULT_SIZE
+    albedo = _single_or_colour(asked["albedo"] or DEFAULT_ALBEDO)
+    if np.ndim(albedo):
+        # One colour for all walls.
+        albedo = [albedo]
+    if name == "box":
+        scene = scenes.box(size, albedo=albedo, sides=5)
+    else:
+        scene = getattr(scenes, name)(size, albedo=albedo)
+    return StoreRecord(scene.matrices(), grid=scene.grid)
 
 
 def _scene_of_file(scene: str, asked: dict[str, Any]) -> Any:

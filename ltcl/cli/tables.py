@@ -26,14 +26,21 @@ def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
 
 
 def _align_column(name: str, values: list[str]) -> list[str]:
-    is_numeric = all(value[:1] in "+-.0123456789" or value == DIVERGES for value in values)
     texts = [name, *values]
-    width = max(cell_len(text) for text in texts)
+    width = max(map(cell_len, texts))
+    is_numeric = all(map(_is_number, values))
     aligned = []
     for text in texts:
         gap = " " * (width - cell_len(text))
-        aligned.append(gap + text if is_numeric else text + gap)
+        if is_numeric:
+            aligned.append(gap + text)
+        else:
+            aligned.append(text + gap)
     return aligned
+
+
+def _is_number(text: str) -> bool:
+    return text[:1] in "+-.0123456789" or text == DIVERGES
 
 
 def cell(value: Any) -> str:
@@ -49,7 +56,9 @@ def cell(value: Any) -> str:
 
 def percent(share: float | None, digits: int = 3) -> str | None:
     """Format a share in percent; None if it is unknown."""
-    return None if share is None else f"{100 * share:.{digits}g} %"
+    if share is None:
+        return None
+    return f"{100 * share:.{digits}g} %"
 
 
 def size_text(size: tuple[int, int] | None) -> str:
@@ -71,8 +80,10 @@ def verdict_lines(verdicts: Mapping[str, Verdict]) -> list[str]:
     if names:
         rows = []
         for name in names:
-            rows.append([name, *(verdict.numbers.get(name) for verdict in verdicts.values())])
+            numbers = [verdict.numbers.get(name) for verdict in verdicts.values()]
+            rows.append([name, *numbers])
         lines += ["", table(["verdict", *verdicts], rows)]
     for file, verdict in verdicts.items():
-        lines.append(f"{file}: {verdict.text}" if len(verdicts) > 1 else verdict.text)
+        label = f"{file}: " if len(verdicts) > 1 else ""
+        lines.append(f"{label}{verdict.text}")
     return lines

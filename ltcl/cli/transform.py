@@ -42,7 +42,8 @@ def _parse_bytes(text: str) -> int:
         count = int(float(match[1]) * unit)
         if count > 0:
             return count
-    raise typer.BadParameter(f"{text!r} is not a size; write bytes, or for instance 50MB or 1.5GiB")
+    advice = "write bytes, or for instance 50MB or 1.5GiB"
+    raise typer.BadParameter(f"{text!r} is not a size; {advice}")
 
 
 def _parse_rtol(text: str) -> float | str:
@@ -53,8 +54,8 @@ def _accuracy_options(
     rtol: Annotated[
         Any,
         option(
-            "Relative error that solutions may have; compress also takes noise, which keeps all "
-            "that stands out of the noise.",
+            "Relative error that solutions may have; compress also takes noise, "
+            "which keeps all that stands out of the noise.",
             parser=_parse_rtol,
             metavar="FLOAT",
         ),
@@ -62,8 +63,8 @@ def _accuracy_options(
     basis: Annotated[
         list[str] | None,
         option(
-            f"Basis of R: pixels or a wavelet ({EXAMPLES}, ...; compress also takes 'db2 rows'); "
-            "the best one if given more than once."
+            f"Basis of R: pixels or a wavelet ({EXAMPLES}, ...; compress also takes "
+            "'db2 rows'); the best one if given more than once."
         ),
     ] = None,
 ) -> None:
@@ -95,9 +96,8 @@ def compress(
     _check_out(context, out)
     T = loading.load(context, file)
     if T.is_compressed and T.error:
-        raise InputError(
-            f"{file}: is compressed already, to {T.error:.2g}; compress the original transport"
-        )
+        problem = f"{file}: is compressed already, to {T.error:.2g}"
+        raise InputError(f"{problem}; compress the original transport")
     C = compression.compress(
         T,
         rtol=context.options["rtol"],
@@ -123,10 +123,12 @@ def compress(
 
 def _compression_table(facts: Any) -> str:
     rows = []
-    for colour, channel in zip(COLOURS[len(facts.channels)], facts.channels, strict=True):
+    colours = COLOURS[len(facts.channels)]
+    for colour, channel in zip(colours, facts.channels, strict=True):
         core = f"{channel.format} 1 x {channel.width} {channel.precision}"
         size = checks.size(channel.nbytes)
-        rows.append((colour, channel.basis, core, channel.kept, size, channel.error))
+        row = [colour, channel.basis, core, channel.kept, size, channel.error]
+        rows.append(row)
     return table(COMPRESS_COLUMNS, rows)
 
 
@@ -135,12 +137,14 @@ def _compression_line(report: CompressReport) -> str:
     after = checks.size(report.bytes_compressed)
     disk = checks.size(report.bytes_on_disk)
     facts = report.compression
+    error = checks.upwards(report.solution_error)
     line = (
-        f"\n{report.out}: {before} to {after} with the first bounce, solutions within "
-        f"{checks.upwards(report.solution_error)}, {disk} on disk, in {facts.seconds:.3g} s"
+        f"\n{report.out}: {before} to {after} with the first bounce, "
+        f"solutions within {error}, {disk} on disk, in {facts.seconds:.3g} s"
     )
     if facts.norm == "pictures":
-        line += f", or {checks.upwards(report.error_bound)} for light that is no picture"
+        error = checks.upwards(report.error_bound)
+        line += f", or {error} for light that is no picture"
     return line
 
 
@@ -189,9 +193,11 @@ def invert(
         errors=list(inverse.errors),
         confidence=inverse.confidence,
     )
-    sizes = f"{checks.size(report.bytes)}, {checks.size(report.bytes_on_disk)} on disk"
-    within = checks.upwards(inverse.error)
-    return Answer(report, [f"{out}: solutions within {within}, {sizes}"])
+    error = checks.upwards(inverse.error)
+    memory = checks.size(report.bytes)
+    disk = checks.size(report.bytes_on_disk)
+    line = f"{out}: solutions within {error}, {memory}, {disk} on disk"
+    return Answer(report, [line])
 
 
 def _check_out(context: Context, out: Path) -> None:

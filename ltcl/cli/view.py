@@ -4,41 +4,45 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
-
-import typer
 
 from ltcl.cli import loading, options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option
 from ltcl.cli.reports.program import ViewReport
+from ltcl.cli.streams import print_line
 from ltcl.device import open_device
 from ltcl.errors import InputError
 
-ADDRESS_PANEL = "Address of the page"
+address_option = partial(option, panel="Address of the page")
 
 
 def address_options(
     host: Annotated[
         str,
-        option(
-            "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute.",
-            panel=ADDRESS_PANEL,
+        address_option(
+            "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute."
         ),
     ] = "127.0.0.1",
     port: Annotated[
         int,
-        option(
-            "Port of the page; a page left open finds the next viewer on the same port. Default: "
-            "a free one.",
+        address_option(
+            "Port of the page; a page left open finds the next viewer on the "
+            "same port. Default: a free one.",
             min=0,
             max=65535,
-            panel=ADDRESS_PANEL,
         ),
     ] = 0,
+    url: Annotated[
+        str,
+        address_option(
+            "URL of the page behind a proxy or on a forwarded port, such as http://localhost:9000."
+        ),
+    ] = "",
     no_browser: Annotated[
-        bool, option("Print the URL, and open no browser.", "--no-browser", panel=ADDRESS_PANEL)
+        bool, address_option("Print the URL, and open no browser.", "--no-browser")
     ] = False,
 ) -> None:
     """Options of the address of a page."""
@@ -49,6 +53,7 @@ def address(context: Context) -> dict[str, Any]:
     return {
         "host": context.options["host"],
         "port": context.options["port"],
+        "url": context.options["url"],
         "open_browser": not context.options["no_browser"],
     }
 
@@ -70,9 +75,10 @@ def view(
     """
     from ltcl.viewer.server import Viewer
 
-    scene = _make_scene(context, transport, picture or [])
+    paths = [] if picture is None else picture
+    scene = _make_scene(context, transport, paths)
     with Viewer(scene, **address(context)) as viewer:
-        typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
+        print_line(f"{viewer.url} shows {transport}; Ctrl-C ends it")
         context.progress(f"showing {transport}")
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()
@@ -90,5 +96,6 @@ def _make_scene(context: Context, transport: Path, paths: list[Path]) -> Any:
         pictures = {path.name: images.read(path) for path in paths}
         return ViewerScene(T, transport.name, pictures, loading.load_setup(transport))
     if paths:
-        raise InputError(f"PICTURE is {paths[0]}, but {transport} is an acquisition; it takes none")
+        problem = f"PICTURE is {paths[0]}, but {transport} is an acquisition"
+        raise InputError(f"{problem}; it takes none")
     return Scan(transport, open_device(context.options["device"]))

@@ -174,8 +174,8 @@ class Device:
         host = rounded(values, dtype)
         return self.empty(host.shape, dtype).set(host)
 
-    def require(self, nbytes: int, what: str) -> None:
-        """Refuse `what` if it needs more bytes than the device has, before allocation."""
+    def require(self, nbytes: int, purpose: str) -> None:
+        """Refuse `purpose` if it needs more bytes than the device has, before allocation."""
         # The memory of a host changes while a program runs.
         if self.is_cpu and nbytes > checks.host_memory():
             self.session.pool.free_held()
@@ -184,7 +184,8 @@ class Device:
             memory = min(memory, checks.host_memory())
         if nbytes > memory:
             raise MemoryLimitError(
-                f"{what} needs {checks.size(nbytes)}, but {self.name} has {checks.size(memory)}; "
+                f"{purpose} needs {checks.size(nbytes)}, "
+                f"but {self.name} has {checks.size(memory)}; "
                 "threshold or compress it, or choose another device"
             )
 

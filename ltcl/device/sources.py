@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ltcl.device import pocl_cache
 from ltcl.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -40,9 +41,9 @@ def load(name: str) -> str:
     return _expand(root / f"{name}.cl", root, set())
 
 
-def _expand(path: Path, root: Path, seen: set[Path]) -> str:
+def _expand(path: Path, root: Path, included_files: set[Path]) -> str:
     """Text of a file with each include in place of its line, at its first occurrence only."""
-    seen.add(path)
+    included_files.add(path)
     name = path.relative_to(root).as_posix()
     lines = [f'#line 1 "{name}"']
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
@@ -51,8 +52,8 @@ def _expand(path: Path, root: Path, seen: set[Path]) -> str:
             lines.append(line)
             continue
         included = path.parent / include[1]
-        if included not in seen:
-            lines.append(_expand(included, root, seen))
+        if included not in included_files:
+            lines.append(_expand(included, root, included_files))
         lines.append(f'#line {number + 1} "{name}"')
     return "\n".join(lines)
 
@@ -63,8 +64,16 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
     Raises
     ------
     DeviceError
-        The source does not compile; the message has the compiler's own words.
+        The source does not compile; the message has the compiler's own words. Or the driver is
+        PoCL, and cannot use its folder of compiled kernels.
     """
+    if pocl_cache.DRIVER in device.driver:
+        with pocl_cache.checked():
+            return _build(device, file, defines)
+    return _build(device, file, defines)
+
+
+def _build(device: Device, file: str, defines: dict[str, Any]) -> Any:
     options = list(OPTIONS)
     for name, value in sorted(defines.items()):
         options.append(f"-D{name}={value}")

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Frames of a folder of pictures or of a video, as linear light; videos written.
 
-OpenCV's FFmpeg decodes videos to 8 bits a channel. It leaves damaged frames out, so they are
-counted: the formats of `COUNTED_EXTENSIONS` store their number, and a missing frame is an error;
-others, as Matroska, store a duration, which sound may stretch, and a missing frame is a warning.
-Known limits: a decoder may replace damaged pixels by others, and FFmpeg itself also writes to
-stderr about damage.
+Videos have 8 bits a channel. Frames that cannot be decoded are missing, so frames are counted: the
+formats of `COUNTED_EXTENSIONS` store their number, and a missing frame is an error; others, as
+Matroska, store a duration, which sound may stretch, and a missing frame is a warning.
 """
 
 from __future__ import annotations
@@ -25,9 +23,10 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.images.decoders import decoding
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
 from ltcl.images.pictures import BITS, as_picture, read
+from ltcl.images.utf8_names import name_to_write
+from ltcl.images.video import Video
 
 # Videos that store the number of their frames.
 COUNTED_EXTENSIONS = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
@@ -99,34 +98,28 @@ class Source:
         self.count: int | None = None
         self.fps: float | None = None
         self._files: list[Path] = []
+        self._video: Video | None = None
         if path.is_dir():
             self._files = _list_pictures(path)
             self.count = len(self._files)
             return
-        capture = _open_video(path)
-        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if count > 0:
-            self.count = count
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        if fps > 0.0:
-            self.fps = fps
+        self._video = Video(path)
+        self.count = self._video.count
+        self.fps = self._video.fps
+        if encoding == "auto":
+            self.encoding = self._video.encoding
 
     def __iter__(self) -> Iterator[Frame]:
         """All frames, from the first one on; FileError where one is missing."""
-        if self._files:
-            for number, file in enumerate(self._files, start=1):
-                yield Frame(number, file.name, file, self.encoding)
-        else:
-            yield from self._video_frames()
+        for number, file in enumerate(self._files, start=1):
+            yield Frame(number, file.name, file, self.encoding)
+        if self._video is not None:
+            yield from self._video_frames(self._video)
 
-    def _video_frames(self) -> Iterator[Frame]:
-        capture = _open_video(self.path)
+    def _video_frames(self, video: Video) -> Iterator[Frame]:
         number = 0
-        is_decoded, codes = capture.read()
-        while is_decoded:
-            number += 1
+        for number, codes in enumerate(video, start=1):
             yield Frame(number, f"{self.path.name}:{number}", codes, self.encoding)
-            is_decoded, codes = capture.read()
         self._check_count(number)
 
     def _check_count(self, decoded: int) -> None:
@@ -220,17 +213,25 @@ def write_video(
     check_video(path, (0, 0))
     codec = CODECS[path.suffix.lower()]
     with replace_file(path) as temporary:
-        count = _encode_video(path, temporary, pictures, fps)
+        with name_to_write(temporary) as name:
+            count = _encode_video(path, name, pictures, fps)
         if count == 0:
             raise InputError(f"{path}: there are no frames to write")
         # OpenCV does not say that a disk is full.
-        capture = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
-        written = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        written = _count_written(temporary)
         if written != count:
             raise FileError(
                 f"{path}: holds {written} of {count} frames in {codec}; is the disk full?"
             )
     return count
+
+
+def _count_written(path: Path) -> int | None:
+    """Number of frames in a file; None if it is no video."""
+    try:
+        return Video(path).count
+    except FileError:
+        return None
 
 
 def _encode_video(path: Path, temporary: Path, pictures: Iterable[np.ndarray], fps: float) -> int:
@@ -261,14 +262,6 @@ def _bgr_codes(picture: np.ndarray) -> np.ndarray:
     if codes.ndim == 2:
         return cv2.cvtColor(codes, cv2.COLOR_GRAY2BGR)
     return cv2.cvtColor(codes, cv2.COLOR_RGB2BGR)
-
-
-def _open_video(path: Path) -> cv2.VideoCapture:
-    with decoding(input_file(path)):
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not capture.isOpened():
-            raise FileError("is no video that can be decoded, or a damaged or truncated one")
-        return capture
 
 
 def _list_pictures(folder: Path) -> list[Path]:

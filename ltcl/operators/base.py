@@ -72,13 +72,13 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     coefficient_basis: Basis | None = None
 
     def __init__(
-        self, device: Device, shape: tuple[int, int], *parts: Operator | Array | None
+        self, device: Device, shape: tuple[int, int], *components: Operator | Array | None
     ) -> None:
         super().__init__(np.float32, shape)
         self.device = device
         self.known = Knowledge()
         # Operators and arrays that it is made of.
-        self._parts: tuple[Operator | Array | None, ...] = parts
+        self._components: tuple[Operator | Array | None, ...] = components
 
     # The contract.
 
@@ -136,16 +136,17 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
     def arrays(self) -> set[Array]:
         """All arrays that it keeps on the device."""
         arrays: set[Array] = set()
-        for part in self._parts:
-            if isinstance(part, Array):
-                arrays.add(part)
-            elif part is not None:
-                arrays |= part.arrays()
+        for component in self._components:
+            if isinstance(component, Array):
+                arrays.add(component)
+            elif component is not None:
+                arrays |= component.arrays()
         return arrays
 
     def bytes_read(self) -> int:
         """Bytes that each product reads from a disk."""
-        return sum(part.bytes_read() for part in self._parts if isinstance(part, Operator))
+        operators = [item for item in self._components if isinstance(item, Operator)]
+        return sum(operator.bytes_read() for operator in operators)
 
     # Products on the device.
 
@@ -312,9 +313,9 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
         MemoryLimitError if that has no room for it.
         """
         rows, columns = self.shape
-        what = f"a dense {rows} x {columns} matrix"
+        matrix_name = f"a dense {rows} x {columns} matrix"
         nbytes = 8 * rows * columns
-        checks.fits_host(what, nbytes)
+        checks.fits_host(matrix_name, nbytes)
         try:
             return self._dense()
         except MemoryLimitError:
@@ -322,7 +323,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
         except MemoryError as error:
             # A limit of the process, below the memory of the host.
             raise MemoryLimitError(
-                f"{what} needs {checks.size(nbytes)}, more than the host gives"
+                f"{matrix_name} needs {checks.size(nbytes)}, more than the host gives"
             ) from error
 
     def _dense(self) -> np.ndarray:

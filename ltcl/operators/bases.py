@@ -148,13 +148,15 @@ class SubsetBasis(Basis):
         inverse[self.places] = np.arange(len(self.places))
         self._order = device.upload(self.places, np.int32)
         self._inverse_order = device.upload(inverse, np.int32)
-        name = PIXELS if of is None else of.name
-        super().__init__(
-            device, (h, w), name, len(self.places), self._order, self._inverse_order, of
-        )
-        is_permutation = len(self.places) == count
-        self.orthonormal = is_permutation and (of is None or of.orthonormal)
-        self.isometric = of is None or of.isometric
+        size = len(self.places)
+        super().__init__(device, (h, w), PIXELS, size, self._order, self._inverse_order, of)
+        if of is not None:
+            self.name = of.name
+            self.orthonormal = of.orthonormal
+            self.isometric = of.isometric
+        # Synthesis can not bring back what a true subset leaves out.
+        if size < count:
+            self.orthonormal = False
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The arrays of W, or name and grid, and the places."""

@@ -51,5 +51,5 @@ def as_exact_operator(matrix: Any, device: Device | None = None) -> Operator:
     """
     A = as_operator(matrix, device)
     if isinstance(A, Dense) and A is not matrix:
-        A.given = Float64Form(matrix=np.asarray(matrix))
+        A.exact_form = Float64Form(matrix=np.asarray(matrix))
     return A

@@ -38,7 +38,9 @@ class Coupled(Operator):
     def __init__(
         self, blocks: Sequence[Sequence[Operator | None]], mixing: np.ndarray | None = None
     ) -> None:
-        present = [block for row in blocks for block in row if block is not None]
+        present = []
+        for row in blocks:
+            present += [block for block in row if block is not None]
         row_lengths = [len(row) for row in blocks]
         shapes = {block.shape for block in present}
         if row_lengths != [CHANNELS] * CHANNELS or len(shapes) != 1:

@@ -96,8 +96,8 @@ class Dense(RowOperator):
         return cls(device, arrays["matrix"])
 
     def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
-        if self.given is not None:
-            return self.given
+        if self.exact_form is not None:
+            return self.exact_form
         return Float64Form(matrix=self.to_dense())
 
     def _bind_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:

@@ -109,8 +109,8 @@ def common_device(rows: Sequence[Sequence[Any]], requested: Device | str | None)
     return device
 
 
-def nbytes(systems: Sequence[IdentityPlus]) -> int:
-    """Bytes of all S on the device; a pattern or a basis that they share counts once."""
+def nbytes(systems: Sequence[Operator]) -> int:
+    """Bytes of all operators on the device; a pattern or a basis that they share counts once."""
     arrays: set[Array] = set()
     for S in systems:
         arrays |= S.arrays()
@@ -134,7 +134,7 @@ def _interreflection(
             return _dense_R(rows, divisor, lit, first)
 
         R = upload_matrix(device, matrix, dense_rows)
-        R.given = Float64Form.from_quotient(matrix, divisor, lit)
+        R.exact_form = Float64Form.from_quotient(matrix, divisor, lit)
         return R
     if isinstance(matrix, scipy.sparse.csr_array):
         return upload_matrix(device, _sparse_R(matrix, divisor, lit), pattern=pattern)
@@ -201,10 +201,10 @@ def _sparse_R(
     data[is_diagonal] -= lit[row[is_diagonal]]
     has_full_diagonal = np.count_nonzero(is_diagonal) == rows
     if has_full_diagonal and not data[is_diagonal].any():
-        kept = ~is_diagonal
+        is_kept = ~is_diagonal
         # One entry of each row is gone.
         indptr = T.indptr - np.arange(rows + 1)
-        return scipy.sparse.csr_array((data[kept], T.indices[kept], indptr), shape=T.shape)
+        return scipy.sparse.csr_array((data[is_kept], T.indices[is_kept], indptr), shape=T.shape)
     R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
     if has_full_diagonal:
         return R

@@ -54,30 +54,32 @@ class MultiDevice(Parts, ReadableRows):
     def __init__(self, device: Device, parts: Sequence[RowOperator]) -> None:
         self.parts: list[tuple[int, RowOperator]] = []
         first = 0
-        for part in parts:
-            self.parts.append((first, part))
-            first += part.shape[0]
+        for rows in parts:
+            self.parts.append((first, rows))
+            first += rows.shape[0]
         super().__init__(device, (first, parts[0].shape[1]), *parts)
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """(first row, rows) of all parts."""
-        for start, part in self.parts:
-            for first, rows in part.blocks():
+        for start, operator in self.parts:
+            for first, rows in operator.blocks():
                 yield start + first, rows
 
     def _host_product(self, x: Array, transpose: bool) -> np.ndarray:
         operand = x.get()
         products = []
-        for first, part in self.parts:
+        for first, rows in self.parts:
             if transpose:
-                own_rows = part.device.upload(operand[first : first + part.shape[0]])
-                products.append(part.T.apply(own_rows))
+                own_rows = rows.device.upload(operand[first : first + rows.shape[0]])
+                products.append(rows.T.apply(own_rows))
             else:
-                products.append(part.apply(part.device.upload(operand)))
+                products.append(rows.apply(rows.device.upload(operand)))
             # The device starts before the next one is asked.
-            part.device.flush()
+            rows.device.flush()
         results = [product.get() for product in products]
-        return np.sum(results, axis=0) if transpose else np.concatenate(results)
+        if transpose:
+            return np.sum(results, axis=0)
+        return np.concatenate(results)
 
 
 def upload_matrix(
@@ -116,7 +118,7 @@ def upload_matrix(
         return upload_part(part_device, change(rows.start, matrix[rows]))
 
     A: Any = split_over_devices(device, matrix.shape[0], upload_rows)
-    A.given = Float64Form(matrix=matrix)
+    A.exact_form = Float64Form(matrix=matrix)
     return A
 
 
@@ -127,15 +129,15 @@ def _unchanged(_: int, rows: Any) -> Any:
 def _upload_store(device: Device, store: Any, change: ChangeRows, added_entries: int) -> Any:
     M, N = store.shape
 
-    def upload_rows(part_device: Device, part: slice) -> RowOperator:
+    def upload_rows(part_device: Device, share: slice) -> RowOperator:
         def blocks() -> Iterator[tuple[int, Any]]:
             for first, rows in store.row_blocks():
-                start = max(part.start - first, 0)
-                stop = min(part.stop - first, rows.shape[0])
+                start = max(share.start - first, 0)
+                stop = min(share.stop - first, rows.shape[0])
                 if start < stop:
-                    yield first + start - part.start, change(first, rows)[start:stop]
+                    yield first + start - share.start, change(first, rows)[start:stop]
 
-        count = part.stop - part.start
+        count = share.stop - share.start
         nnz = (store.nnz + added_entries) * count // M
         return RowBlocks(part_device, (count, N), blocks, nnz)
 

@@ -51,7 +51,8 @@ class Pyramid(Basis):
             size = 2**level
             cells.append((-(-h // size), -(-w // size)))
         self.cells = tuple(cells)
-        super().__init__(device, grid, PYRAMID, sum(rows * columns for rows, columns in cells))
+        self._sizes = [rows * columns for rows, columns in cells]
+        super().__init__(device, grid, PYRAMID, sum(self._sizes))
 
     def _transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
@@ -97,7 +98,7 @@ class Pyramid(Basis):
             "y": y,
             "out": out,
         }
-        large = sum(rows * columns > SMALL_LEVEL_PIXELS for rows, columns in self.cells)
+        large = sum(size > SMALL_LEVEL_PIXELS for size in self._sizes)
         for level in range(large):
             cells = self.cells[level]
             launch_grid(kernel, pieces, cells, first_level=level, end_level=level + 1, **arguments)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 
 from ltcl.device import Array, Device
@@ -73,7 +74,7 @@ class RelaxationRows:
         for start in range(0, n, size):
             rows = slice(start, start + size)
             P = self._block(matrix, rows, omega)
-            inverse = _inverse(P)
+            inverse = _inverse(P) if omega is None else _inverse_triangle(P)
             if inverse is None:
                 raise InputError(
                     f"method={method!r} inverts blocks of S; that of rows {start} to "
@@ -103,6 +104,16 @@ def _inverse(P: np.ndarray) -> np.ndarray | None:
     condition = np.linalg.norm(P, 1) * np.linalg.norm(inverse, 1)
     # NaN is not below it.
     return inverse if condition < 1.0 / np.finfo(np.float64).eps else None
+
+
+def _inverse_triangle(P: np.ndarray) -> np.ndarray:
+    """P^-1 of a lower triangle whose diagonal has no zeros.
+
+    It is not judged by its condition: like substitution on a CPU, a sweep with it may overflow,
+    which the solve reports as divergence.
+    """
+    with np.errstate(all="ignore"):
+        return scipy.linalg.solve_triangular(P, np.eye(len(P)), lower=True, check_finite=False)
 
 
 def readable(S: Operator, method: str) -> RelaxationRows:

@@ -113,11 +113,11 @@ class ReadableRows(Operator):
 
     Attributes
     ----------
-    given : Float64Form or None
+    exact_form : Float64Form or None
         Its numbers as they were given, before they were rounded to float32.
     """
 
-    given: Float64Form | None = None
+    exact_form: Float64Form | None = None
 
     @abc.abstractmethod
     def blocks(self) -> Iterator[tuple[int, Any]]:
@@ -159,9 +159,9 @@ class ReadableRows(Operator):
         return dense
 
     def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
-        if self.given is None and reads_blocks:
+        if self.exact_form is None and reads_blocks:
             return Float64Form(matrix=self.to_dense())
-        return self.given
+        return self.exact_form
 
 
 class RowOperator(ReadableRows):
@@ -386,8 +386,8 @@ class RowStepper(Stepper):
             vectors.fill(self._partials, 0.0)
         # Many rows read the direction while the next one is written: the two take turns.
         self._turns = [
-            self._bind_turn(pieces, self.d, self.other),
-            self._bind_turn(pieces, self.other, self.d),
+            self._bind_turn(pieces, self.d, self.spare),
+            self._bind_turn(pieces, self.spare, self.d),
         ]
 
     def _step_pieces(self) -> list[StepPiece]:
@@ -454,16 +454,16 @@ class RowStepper(Stepper):
             launch.set(keep=keep, gain=gain, first_group=waiting_groups + first_group)
             launch()
         self._turns.reverse()
-        self.d, self.other = self.other, self.d
+        self.d, self.spare = self.spare, self.d
         self.waiting += 1
 
 
 def cut(
-    device: Device, row_bytes: np.ndarray, what: str, itemsize: int = 4
+    device: Device, row_bytes: np.ndarray, matrix_name: str, itemsize: int = 4
 ) -> list[tuple[int, int]]:
     """Rows (start, stop) of as few slabs as possible, each in one buffer that the device takes.
 
-    `row_bytes` (M,) are the bytes of each row; `what` names the matrix in a refusal.
+    `row_bytes` (M,) are the bytes of each row; `matrix_name` names it in a refusal.
     """
     # Pointers are one more than rows.
     limit = min(device.max_allocation - SPARE_BYTES - 4, itemsize * MAX_SLAB_ELEMENTS)
@@ -475,7 +475,7 @@ def cut(
         if stop == start:
             row = checks.size(int(row_bytes[start]))
             raise MemoryLimitError(
-                f"row {start} of {what} has {row}, the largest buffer of this device "
+                f"row {start} of {matrix_name} has {row}, the largest buffer of this device "
                 f"{checks.size(limit)}"
             )
         pieces.append((start, stop))

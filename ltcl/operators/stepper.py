@@ -27,7 +27,7 @@ class Stepper:
         self.r = r
         self.slots = slots
         self.d = x.like()
-        self.other = x.like()
+        self.spare = x.like()
         self.waiting = 0
         self._a = a
         self._c = c
@@ -37,7 +37,7 @@ class Stepper:
         groups = vectors.step_groups(self.x)
         # Sums of squares of residuals, (slots, groups, k).
         self._partials = self.A.device.empty((self.slots, groups, self.x.columns))
-        self._multiply = self.A.bind(self.d, self.other, Epilogue(a=self._a, c=self._c))
+        self._multiply = self.A.bind(self.d, self.spare, Epilogue(a=self._a, c=self._c))
 
     def start(self, gain: float) -> None:
         """Queue d = gain r, the first direction."""
@@ -47,7 +47,7 @@ class Stepper:
         """Queue one step: x moves along d, and the next d is keep d + gain r with the new r."""
         self._multiply()
         vectors.queue_step(
-            self.other, self.x, self.r, self.d, keep, gain, self._partials, self.waiting
+            self.spare, self.x, self.r, self.d, keep, gain, self._partials, self.waiting
         )
         self.waiting += 1
 

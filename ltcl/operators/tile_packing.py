@@ -166,9 +166,9 @@ def _norms_of_changes(matrix: Any, changes: np.ndarray) -> tuple[float, float]:
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
     column_sums = np.bincount(matrix.indices, changes)
     row_sums = np.bincount(row, changes)
-    one = float(column_sums.max(initial=0.0))
-    inf = float(row_sums.max(initial=0.0))
-    return frobenius, min(frobenius, (one * inf) ** 0.5)
+    one_norm = float(column_sums.max(initial=0.0))
+    inf_norm = float(row_sums.max(initial=0.0))
+    return frobenius, min(frobenius, (one_norm * inf_norm) ** 0.5)
 
 
 def _tile_leads(matrix: Any, width: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.images import resize, to_srgb
 from ltcl.images.pictures import as_picture
 from ltcl.plots.page import (
@@ -40,12 +40,13 @@ SHORT_DASHES = (0, (2, 2))
 
 
 def convergence(
-    solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence"
+    solutions: Mapping[str, Solution] | Solution, rtol: float, title: str = "Convergence"
 ) -> Figure:
     """Relative residual of several solves of one system against the products they took.
 
-    Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level
-    line. InputError if there is nothing to draw, or rtol is outside (0, 1).
+    They are named, or one is given alone. Solve with ``throw=False``, so that a divergence shows as
+    well. A direct solve becomes a level line. InputError if there is nothing to draw, or rtol is
+    outside (0, 1).
 
     Examples
     --------
@@ -58,16 +59,19 @@ def convergence(
     figure = figure_of(900, 560)
     heading(figure, 34, 26, title, 17)
     axes = figure.add_axes((0.09, 0.13, 0.73, 0.72))
+    if isinstance(solutions, Solution):
+        solutions = {solutions.method: solutions}
+    _check_named("solutions", solutions, Solution)
     _draw_convergence(axes, solutions, rtol)
     return figure
 
 
-def analysis(analyses: Mapping[str, Analysis]) -> Figure:
+def analysis(analyses: Mapping[str, Analysis] | Analysis) -> Figure:
     """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
 
-    On the left is the interval that holds rho(R), with the 1 beyond which the paper's series
-    diverges; on the right are the products of each method, where there is a forecast. InputError if
-    there is nothing to draw.
+    One may be given without a name. On the left is the interval that holds rho(R), with the 1
+    beyond which the paper's series diverges; on the right are the products of each method, where
+    there is a forecast. InputError if there is nothing to draw.
 
     Examples
     --------
@@ -77,8 +81,9 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     >>> [axes.get_title("left") for axes in figure.axes]
     ['spectral radius of R', 'products to 1 %']
     """
-    if not analyses:
-        raise InputError("analyses is empty; there must be at least one analysis to draw")
+    if isinstance(analyses, Analysis):
+        analyses = {"T": analyses}
+    _check_named("analyses", analyses, Analysis)
     channels = _named_channels(analyses)
     first_analysis = next(iter(analyses.values()))
     figure = figure_of(1300, 330 + 46 * len(channels))
@@ -91,6 +96,23 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     _draw_radii(left, channels)
     _draw_products(right, list(channels.values()))
     return figure
+
+
+def _check_named(name: str, values: Any, kind: type) -> None:
+    """Refuse anything but a dictionary with values of a kind."""
+    _check_mapping(name, values)
+    if not values:
+        raise InputError(f"{name} is empty; there must be at least one to draw")
+    for key, value in values.items():
+        if not isinstance(value, kind):
+            problem = f"{name}[{key!r}] is a {type(value).__name__}"
+            raise InputTypeError(f"{problem}; it must be a {kind.__name__}")
+
+
+def _check_mapping(name: str, values: Any) -> None:
+    if not isinstance(values, Mapping):
+        problem = f"{name} is a {type(values).__name__}"
+        raise InputTypeError(f"{problem}; it must be a dictionary by names")
 
 
 def _named_channels(analyses: Mapping[str, Analysis]) -> dict[str, ChannelAnalysis]:
@@ -132,7 +154,7 @@ def _draw_products(axes: Axes, channels: list[ChannelAnalysis]) -> None:
         for place, name in enumerate(methods):
             products = channel.products[name]
             y = place - 0.4 + (row + 0.5) * height
-            length = products if math.isfinite(products) else 0
+            length = np.nan_to_num(products, posinf=0.0)
             bar = axes.barh(y, length, 0.85 * height, color=colours[name])
             label = f"  {_forecast(products)}"
             axes.bar_label(bar, [label], color=FAINT, fontsize=font_size)
@@ -166,6 +188,8 @@ def pictures(
     >>> [text.get_text() for text in figure.texts if text.get_text()]
     ['A corner', 'seen', 'too bright', 'three times']
     """
+    for row in rows:
+        _check_mapping("rows", row)
     rows = tuple(row for row in rows if row)
     width = checks.count("width", width, least=100)
     if not rows:
@@ -207,8 +231,8 @@ class _Page:
     def draw_heading(self, figure: Figure, title: str, subtitle: str) -> None:
         """Title and subtitle."""
         heading(figure, self.margin, 18 * self.scale, title, 17 * self.scale)
-        top = 52 if title else 18
-        label_at(figure, self.margin, top * self.scale, subtitle, size=11 * self.scale, color=FAINT)
+        top = self.scale * (52 if title else 18)
+        label_at(figure, self.margin, top, subtitle, size=11 * self.scale, color=FAINT)
 
     def place_row(self, row: Mapping[str, np.ndarray], top: float) -> list[_PlacedPicture]:
         """Pictures side by side, as wide as the page, their names above."""
@@ -278,8 +302,9 @@ def _draw_picture(
     codes = np.broadcast_to(np.atleast_3d(to_srgb(light)), (h, w, 3))
     paper = np.array([int(PAPER[start : start + 2], 16) / 255 for start in (1, 3, 5)])
     codes = np.where(black[..., None], paper, codes)
+    codes = np.rint(255 * codes).astype(np.uint8)
     axes = axes_at(figure, (left, top, w, h))
-    axes.imshow(np.rint(255 * codes).astype(np.uint8), interpolation="none", aspect="auto")
+    axes.imshow(codes, interpolation="none", aspect="auto")
     axes.axis("off")
 
 
@@ -288,8 +313,6 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     checks.number("rtol", rtol, above=0.0, below=1.0)
-    if not solutions:
-        raise InputError("solutions is empty; there must be at least one to draw")
     _dress(axes, "products with S")
     axes.set_ylabel("relative residual", color=FAINT, fontsize=12, labelpad=6)
     most_products = max(1, *(solution.products for solution in solutions.values()))
@@ -300,10 +323,13 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
         products, residuals = _convergence_line(solution, most_products)
         lowest = min(lowest, float(residuals.min()))
         highest = max(highest, float(residuals.max()))
-        is_below = solution.residual < LOWEST_RESIDUAL
-        label = f"{name} \u2193" if is_below else name
-        # Neumann runs on top of Jacobi, which must stay visible.
-        style = SHORT_DASHES if name == "neumann" else "-"
+        label = name
+        if solution.residual < LOWEST_RESIDUAL:
+            label = f"{name} \u2193"
+        style: Any = "-"
+        if name == "neumann":
+            # Neumann runs on top of Jacobi, which must stay visible.
+            style = SHORT_DASHES
         axes.plot(
             products, residuals, color=colours[name], lw=2.6, ls=style, clip_on=False, label=label
         )

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ltcl.plots.shown_figure import ShownFigure
+
 DPI = 100
 PAPER = "#15171b"
 INK = "#f1efea"
@@ -27,21 +29,17 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     known = figure.canvas.get_supported_filetypes()
     extension = os.path.splitext(path)[1].lstrip(".").lower()
     if extension not in known:
-        name = extension or "missing"
         formats = ", ".join(sorted(known))
-        raise InputError(f"{path}: extension {name!r} is unknown; plots are {formats}")
+        raise InputError(f"{path}: extension is {extension!r}; plots are saved as {formats}")
     with replace_file(path) as temporary:
         figure.savefig(temporary, dpi=DPI, facecolor=figure.get_facecolor())
 
 
-def figure_of(width: int, height: int) -> Figure:
+def figure_of(width: int, height: int) -> ShownFigure:
     """An empty page of so many pixels, drawn by Agg."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from ltcl.plots.shown_figure import ShownFigure
 
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
-    FigureCanvasAgg(figure)
-    return figure
+    return ShownFigure(width, height, DPI, PAPER)
 
 
 def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:

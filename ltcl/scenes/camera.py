@@ -32,6 +32,8 @@ MARGIN = 0.03
 ROWS_AT_ONCE = 32
 # Points this far beside a wall, as a part of it, count as on it; else seams would show as cracks.
 EDGE_TOLERANCE = 1e-9
+# Homogeneous corners (u, v, 1) of a wall, around it.
+CORNERS = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], np.float64)
 # A point this much nearer, as a part, does not hide another: where walls meet, rounding decides.
 DEPTH_TOLERANCE = 1e-6
 # Channels that OpenCV interpolates fast.
@@ -99,9 +101,10 @@ def frame(camera: SceneCamera, walls: Sequence[Wall]) -> ViewFrame:
 
     InputError where it sees none, or one of them is not in front of it.
     """
-    corners = np.array([(0, 0, 1), (0, 1, 1), (1, 0, 1), (1, 1, 1)], dtype=np.float64)
-    seen = [corners @ camera.homography(wall).T for wall in walls if camera.sees(wall)]
-    points = np.concatenate(seen) if seen else np.zeros((1, 3))
+    seen = [wall for wall in walls if camera.sees(wall)]
+    points = np.zeros((1, 3))
+    if seen:
+        points = np.concatenate([CORNERS @ camera.homography(wall).T for wall in seen])
     if points[:, 2].min() <= 0:
         raise InputError(
             f"viewer at {camera.eye} sees {len(seen)} of {len(walls)} walls; "
@@ -151,12 +154,13 @@ def _painted_walls(
     camera: SceneCamera, walls: Sequence[Wall], picture: Any, screens: Sequence[Wall]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Homography and part of the picture of each wall and black screen that the camera sees."""
-    parts = np.split(np.asarray(picture, dtype=np.float32), len(walls), axis=1)
-    black = np.zeros_like(parts[0][:1, :1])
+    paintings = np.split(np.asarray(picture, dtype=np.float32), len(walls), axis=1)
+    black = np.zeros_like(paintings[0][:1, :1])
+    paintings += [black] * len(screens)
     painted = []
-    for wall, part in zip((*walls, *screens), (*parts, *[black] * len(screens)), strict=True):
+    for wall, painting in zip((*walls, *screens), paintings, strict=True):
         if camera.sees(wall):
-            painted.append((camera.homography(wall), part))
+            painted.append((camera.homography(wall), painting))
     return painted
 
 
@@ -187,24 +191,28 @@ def read(
     image = np.asarray(image, dtype=np.float32)
     homographies = {}
     outlines = {}
-    corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
     for number, wall in enumerate((*walls, *screens)):
         if camera.sees(wall):
             homography = camera.homography(wall)
             homographies[number] = homography
-            outlines[number] = np.pad(_apply(homography, corners), ((0, 0), (0, 1)))
+            outline = _apply(homography, CORNERS)
+            outlines[number] = np.pad(outline, ((0, 0), (0, 1)))
 
-    parts = []
+    paintings = []
     for number in range(len(walls)):
         if number not in homographies:
-            parts.append(np.zeros((*patches, *image.shape[2:]), dtype=np.float32))
+            hidden = np.zeros((*patches, *image.shape[2:]), dtype=np.float32)
+            paintings.append(hidden)
             continue
         hiding = []
-        for other, outline in outlines.items():
-            if other != number and overlap(outlines[number], outline, touch=EDGE_TOLERANCE):
-                hiding.append(homographies[other])
-        parts.append(_read_wall(homographies[number], to_pixels, image, patches, hiding))
-    return np.concatenate(parts, axis=1)
+        for screen, outline in outlines.items():
+            is_same = screen == number
+            if not is_same and overlap(outlines[number], outline, EDGE_TOLERANCE):
+                hiding.append(homographies[screen])
+        homography = homographies[number]
+        painting = _read_wall(homography, to_pixels, image, patches, hiding)
+        paintings.append(painting)
+    return np.concatenate(paintings, axis=1)
 
 
 def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -224,10 +232,11 @@ def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     """Places (..., 2) on a wall of image points (..., 3), and 1 / depth there; 0 beside it."""
     mapped = points @ np.linalg.inv(homography).T
     nearness = mapped[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):  # the wall's plane may lie edge-on
+    # The wall's plane may lie edge-on.
+    with np.errstate(divide="ignore", invalid="ignore"):
         place = mapped[..., :2] / nearness[..., None]
-    is_inside = np.all((place >= -EDGE_TOLERANCE) & (place <= 1 + EDGE_TOLERANCE), axis=-1)
-    return place, np.where(is_inside, nearness, 0)
+    is_inside = (place >= -EDGE_TOLERANCE) & (place <= 1 + EDGE_TOLERANCE)
+    return place, np.where(is_inside.all(axis=-1), nearness, 0)
 
 
 def _read_wall(
@@ -255,9 +264,9 @@ def _read_wall(
     nearness = 1 / projected[..., 2]
     places = projected * nearness[..., None]
     is_shown = np.ones(nearness.shape, bool)
-    for other in hiding:
-        _, other_nearness = _hit(other, places)
-        is_shown &= other_nearness <= nearness * (1 + DEPTH_TOLERANCE)
+    for screen in hiding:
+        _, screen_nearness = _hit(screen, places)
+        is_shown &= screen_nearness <= nearness * (1 + DEPTH_TOLERANCE)
     shown = is_shown.astype(np.float32)
     weight = _shrink(shown, points)
     if values.ndim == 3:
@@ -272,11 +281,11 @@ def _interpolate(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     x, y = np.ascontiguousarray(np.moveaxis(places, -1, 0), dtype=np.float32)
     if image.ndim == 2 or image.shape[2] <= CHANNELS_AT_ONCE:
         return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    parts = []
+    values = []
     for first in range(0, image.shape[2], CHANNELS_AT_ONCE):
-        some = image[..., first : first + CHANNELS_AT_ONCE]
-        parts.append(np.atleast_3d(_interpolate(some, places)))
-    return np.concatenate(parts, axis=-1)
+        channels = image[..., first : first + CHANNELS_AT_ONCE]
+        values.append(np.atleast_3d(_interpolate(channels, places)))
+    return np.concatenate(values, axis=-1)
 
 
 def _shrink(image: np.ndarray, factor: int) -> np.ndarray:

@@ -84,7 +84,8 @@ def fill(matrix: np.ndarray, walls: Sequence[Wall], pairs: Iterable[tuple[int, i
             known[congruence.key] = congruence.to_common(exchanged)
         exchanged = congruence.from_common(known[congruence.key])
         matrix[:, i, :, :, j, :] = exchanged * (n**2 / walls[i].area)
-        matrix[:, j, :, :, i, :] = exchanged.transpose(2, 3, 0, 1) * (n**2 / walls[j].area)
+        reverse = exchanged.transpose(2, 3, 0, 1)
+        matrix[:, j, :, :, i, :] = reverse * (n**2 / walls[j].area)
 
 
 class Congruence(NamedTuple):
@@ -111,7 +112,8 @@ class Congruence(NamedTuple):
 
     def from_common(self, exchanged: np.ndarray) -> np.ndarray:
         """Turn an exchange (n, n, n, n) back from the common form."""
-        turned = np.rot90(exchanged.transpose(self.axes), self.first_turn, axes=(0, 1))
+        turned = exchanged.transpose(self.axes)
+        turned = np.rot90(turned, self.first_turn, axes=(0, 1))
         return np.rot90(turned, self.second_turn, axes=(2, 3))
 
 
@@ -129,12 +131,14 @@ def _congruence(first: Wall, second: Wall) -> Congruence:
     vectors[[0, 1, 3, 4, 6]] /= np.linalg.norm(edges[0])
     gram = (vectors @ vectors.T).round(9)
     congruences = []
-    for turn, other_turn, is_mirrored in itertools.product(range(4), range(4), (False, True)):
+    turns = itertools.product(range(4), range(4), (False, True))
+    for turn, other_turn, is_mirrored in turns:
         order, sign = _turned_edges(turn, is_mirrored)
         other_order, other_sign = _turned_edges(other_turn, is_mirrored)
         places = [*order, 2, other_order[0] + 3, other_order[1] + 3, 5, 6]
         signs = np.array([*sign, 1, *other_sign, 1, 1])
-        turned = gram[np.ix_(places, places)] * np.outer(signs, signs) + 0.0  # no -0
+        # Adding 0 turns -0 into 0.
+        turned = gram[np.ix_(places, places)] * np.outer(signs, signs) + 0.0
         congruences.append(Congruence(turned.tobytes(), turn, other_turn, is_mirrored))
     return min(congruences)
 
@@ -161,7 +165,8 @@ def exchange_of_walls(first: Wall, second: Wall, n: int) -> np.ndarray:
     to_middles = (others.sum(axis=0) - edges.sum(axis=0)) / 2
     start = np.subtract(second.corner, first.corner) + to_middles
     offsets = start + places @ np.array(steps)
-    table = exchange(edges, others, offsets.reshape(-1, 3)).reshape(offsets.shape[:-1])
+    table = exchange(edges, others, offsets.reshape(-1, 3))
+    table = table.reshape(offsets.shape[:-1])
     return table[tuple(count - count.min() for count in counts)]
 
 
@@ -202,7 +207,8 @@ def form_factors_of_pairs(patches: Patches, i: np.ndarray, j: np.ndarray) -> np.
     0.20004
     """
     edges = np.stack([patches.down, patches.right], axis=1)
-    return exchange(edges[i], edges[j], patches.centre[j] - patches.centre[i]) / patches.area[i]
+    offset = patches.centre[j] - patches.centre[i]
+    return exchange(edges[i], edges[j], offset) / patches.area[i]
 
 
 def exchange(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -214,9 +220,10 @@ def exchange(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.nd
     result = np.empty(len(offset))
     for start in range(0, len(offset), PAIRS_AT_ONCE):
         slab = slice(start, start + PAIRS_AT_ONCE)
-        first_edges = first if first.ndim == 2 else first[slab]
-        second_edges = second if second.ndim == 2 else second[slab]
-        result[slab] = _exchange_of_slab(first_edges, second_edges, offset[slab])
+        if first.ndim == 2:
+            result[slab] = _exchange_of_slab(first, second, offset[slab])
+        else:
+            result[slab] = _exchange_of_slab(first[slab], second[slab], offset[slab])
     return result
 
 
@@ -233,10 +240,11 @@ def _exchange_of_slab(first: np.ndarray, second: np.ndarray, offset: np.ndarray)
     result = np.zeros(len(offset))
     if first.ndim == 2:
         for least_distance, points in TIERS:
-            some = np.flatnonzero(is_left & is_whole & (distance >= least_distance))
-            if len(some):
-                result[some] = _quadrature(first, second, offset[some], points)
-                is_left[some] = False
+            is_far = distance >= least_distance
+            pairs = np.flatnonzero(is_left & is_whole & is_far)
+            if len(pairs):
+                result[pairs] = _quadrature(first, second, offset[pairs], points)
+                is_left[pairs] = False
     if not is_left.any():
         return result
 
@@ -246,17 +254,18 @@ def _exchange_of_slab(first: np.ndarray, second: np.ndarray, offset: np.ndarray)
     unit = np.broadcast_to(radius, len(offset))
     is_near = distance < NEAREST_TIER
     for near, clipped in itertools.product((True, False), repeat=2):
-        some = np.flatnonzero(is_left & (is_near == near) & (is_whole != clipped))
-        if not len(some):
+        is_kind = (is_near == near) & (is_whole != clipped)
+        pairs = np.flatnonzero(is_left & is_kind)
+        if not len(pairs):
             continue
-        scale = unit[some, None, None, None]
-        outline = _outline(first[some], np.zeros((1, 3))) / scale
-        opposite = _outline(second[some], offset[some]) / scale
+        scale = unit[pairs, None, None, None]
+        outline = _outline(first[pairs], np.zeros((1, 3))) / scale
+        opposite = _outline(second[pairs], offset[pairs]) / scale
         if clipped:
-            outline = _clip(outline, under[some])
-            opposite = _clip(opposite, over[some])
+            outline = _clip(outline, under[pairs])
+            opposite = _clip(opposite, over[pairs])
         points = NEAR_EDGE_POINTS if near else FAR_EDGE_POINTS
-        result[some] = _stokes(outline, opposite, points) * unit[some] ** 2
+        result[pairs] = _stokes(outline, opposite, points) * unit[pairs] ** 2
     return result
 
 
@@ -276,7 +285,8 @@ def _quadrature(
 ) -> np.ndarray:
     """The exchange by points x points Gauss-Legendre points on each patch."""
     node, weight = np.polynomial.legendre.leggauss(points)
-    place = np.stack(np.meshgrid(node, node, indexing="ij"), axis=-1).reshape(-1, 2) / 2
+    nodes = np.meshgrid(node, node, indexing="ij")
+    place = np.stack(nodes, axis=-1).reshape(-1, 2) / 2
     weights = np.outer(weight, weight).ravel() / 4  # (Q,)
     # Points on both patches, from their centres, (Q, 3).
     first_points = place @ first
@@ -299,10 +309,13 @@ def _quadrature(
         r += np.einsum("pi,pi->p", apart, apart)[:, None]
         np.square(r, out=r)
         np.reciprocal(r, out=r)
-        inner = (r.reshape(-1, len(weights)) @ moments).reshape(len(apart), -1, 2)
-        arriving = (apart @ first_normal)[:, None] * inner[..., 0] + inner[..., 1]
+        inner = r.reshape(-1, len(weights)) @ moments
+        inner = inner.reshape(len(apart), -1, 2)
+        elevation = (apart @ first_normal)[:, None]
+        arriving = elevation * inner[..., 0] + inner[..., 1]
         height = (apart @ second_normal)[:, None] - first_points @ second_normal
-        result[start : start + step] = -np.einsum("pk,pk->p", weights * height, arriving)
+        exchanged = np.einsum("pk,pk->p", weights * height, arriving)
+        result[start : start + step] = -exchanged
     return result * (first_area * second_area / np.pi)
 
 
@@ -337,7 +350,8 @@ def _mean_log(p: np.ndarray, q: np.ndarray, points: int) -> np.ndarray:
     node, weight = np.polynomial.legendre.leggauss(points)
     u = (node + 1) / 2
     # s = u^3 (10 - 15 u + 6 u^2) flattens logarithms at both ends.
-    s = low[:, None] + width[:, None] * (u**3 * (10 - 15 * u + 6 * u**2))  # (pieces, points)
+    flat = u**3 * (10 - 15 * u + 6 * u**2)
+    s = low[:, None] + width[:, None] * flat  # (pieces, points)
     # Place of a point of p along q, and its distance from the line of q: both are linear in s.
     t_start = np.einsum("pi,pi->p", offset, unit)
     t_slope = np.einsum("pi,pi->p", p_edge, unit)
@@ -346,7 +360,8 @@ def _mean_log(p: np.ndarray, q: np.ndarray, points: int) -> np.ndarray:
     t = t_start[pair, None] + t_slope[pair, None] * s
     across = across_start[pair, None] + across_slope[pair, None] * s[..., None]
     distance = np.sqrt(np.einsum("...i,...i->...", across, across))
-    inner = _log_integral(t, distance) - _log_integral(t - length[pair, None], distance)
+    t_end = t - length[pair, None]
+    inner = _log_integral(t, distance) - _log_integral(t_end, distance)
     means = width * (inner @ (weight * 15 * u**2 * (1 - u) ** 2))
     return np.bincount(pair, means, len(p)) / length
 
@@ -363,13 +378,15 @@ def _cuts(edge: np.ndarray, along: np.ndarray, offset: np.ndarray) -> np.ndarray
     distance = np.einsum("pi,pi->p", np.cross(along, offset), normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         nearest = distance / np.einsum("pi,pi->p", normal, normal)
-    inside = np.clip(np.nan_to_num(np.stack([at_start, at_end, nearest], axis=1)), 0, 1)
-    return np.pad(np.sort(inside, axis=1), ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
+    places = np.nan_to_num(np.stack([at_start, at_end, nearest], axis=1))
+    inside = np.sort(np.clip(places, 0, 1), axis=1)
+    return np.pad(inside, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
 
 
 def _log_integral(t: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """int_0^t ln sqrt(u^2 + distance^2) du."""
-    return scipy.special.xlogy(t, t**2 + distance**2) / 2 - t + distance * np.arctan2(t, distance)
+    logarithm = scipy.special.xlogy(t, t**2 + distance**2) / 2
+    return logarithm - t + distance * np.arctan2(t, distance)
 
 
 def _outline(edges: np.ndarray, centre: np.ndarray) -> np.ndarray:

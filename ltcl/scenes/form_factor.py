@@ -43,7 +43,7 @@ from ltcl.scenes.patches import (
 )
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import Rays
-from ltcl.scenes.walls import check_albedo
+from ltcl.scenes.walls import box_corners, check_albedo, finite_floats
 
 # Pairs nearer than so many sizes of the pair (see `squared_size`) are corrected by the host.
 NEAR_DISTANCE = 5.0
@@ -113,7 +113,7 @@ class FormFactor(Operator):
         count = len(patches)
         shares = np.ones(count)
         if albedo is not None:
-            value = checks.finite("albedo", checks.real("albedo", albedo)).astype(np.float64)
+            value = finite_floats("albedo", albedo)
             check_albedo(checks.shape("albedo", value, (), (count,)))
             shares = np.broadcast_to(value, (count,))
         if not isinstance(device, Device):
@@ -135,7 +135,8 @@ class FormFactor(Operator):
         self._area = device.upload(placed.area)
         correction = self._correction(patches, blocks, shares, placed.area)
         self._near = CSR(device, correction)
-        self._parts = (self._geometry, self._blocks, self._albedo, self._area, self._near)
+        geometry = (self._geometry, self._blocks)
+        self._components = (*geometry, self._albedo, self._area, self._near)
 
     @classmethod
     def of(cls, scene: Scene, device: Device | str | None = None) -> tuple[FormFactor, ...]:
@@ -161,7 +162,7 @@ class FormFactor(Operator):
         if n != columns:
             raise InputError(f"scene has walls of {n} x {columns} patches; they must be n x n")
         patches = cut(scene.walls, n)
-        blocks = [(block.low, block.high) for block in scene.blocks]
+        blocks = box_corners(scene.blocks)
         if not isinstance(device, Device):
             device = open_device(device)
         return tuple(cls(patches, albedo, blocks, device) for albedo in scene.albedo)
@@ -171,12 +172,14 @@ class FormFactor(Operator):
         return np.zeros(self.shape[0])
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        right = self._albedo if transpose else self._area
-        left = self._area if transpose else self._albedo
+        left, right = self._albedo, self._area
+        if transpose:
+            left, right = right, left
         scale, b, y, c = epilogue
         count = self.shape[0]
         pitch = self._geometry.shape[1]
-        rows_per_launch = max(1, PAIRS_PER_LAUNCH // (pitch * (1 + self._defines["BLOCKS"])))
+        tests_per_row = pitch * (1 + self._defines["BLOCKS"])
+        rows_per_launch = max(1, PAIRS_PER_LAUNCH // tests_per_row)
         group = GROUP_OF_CPU if self.device.is_cpu else GROUP
         for offset, width in widths(x.columns):
             defines = dict(self._defines, K=width)
@@ -230,10 +233,11 @@ class FormFactor(Operator):
             F = F * rays.pairs(i, j)
         # Per area and so symmetric, as in the kernel.
         missing = F / area[j] - self._kernel_pairs(i, j)
-        values = np.concatenate([albedo[i] * missing * area[j], albedo[j] * missing * area[i]])
         rows = np.concatenate([i, j])
         columns = np.concatenate([j, i])
-        correction = scipy.sparse.coo_array((values, (rows, columns)), shape=self.shape)
+        values = albedo[rows] * np.tile(missing, 2) * area[columns]
+        entries = (values, (rows, columns))
+        correction = scipy.sparse.coo_array(entries, shape=self.shape)
         return scipy.sparse.csr_array(correction)
 
     def _kernel_pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -241,12 +245,13 @@ class FormFactor(Operator):
         kernel = self.device.kernel(
             "form_factor", "form_factor_pairs", K=1, PACKED=1, **self._defines
         )
-        pairs_per_launch = max(1, PAIRS_PER_LAUNCH // (64 * (1 + self._defines["BLOCKS"])))
-        parts = [np.zeros(0)]
+        tests_per_pair = 64 * (1 + self._defines["BLOCKS"])
+        pairs_per_launch = max(1, PAIRS_PER_LAUNCH // tests_per_pair)
+        values = [np.zeros(0)]
         for start in range(0, len(i), pairs_per_launch):
-            some = slice(start, start + pairs_per_launch)
-            from_patches = self.device.upload(i[some], np.int32)
-            to_patches = self.device.upload(j[some], np.int32)
+            pairs = slice(start, start + pairs_per_launch)
+            from_patches = self.device.upload(i[pairs], np.int32)
+            to_patches = self.device.upload(j[pairs], np.int32)
             out = self.device.empty(from_patches.shape)
             kernel(
                 out.size,
@@ -259,8 +264,8 @@ class FormFactor(Operator):
                 blocks=self._blocks,
                 out=out,
             )
-            parts.append(out.get().astype(np.float64))
-        return np.concatenate(parts)
+            values.append(out.get().astype(np.float64))
+        return np.concatenate(values)
 
 
 def _near_pairs(patches: Patches) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.scenes.walls import Wall
+from ltcl.scenes.walls import Wall, finite_floats
 
 # Boxes are shrunk by this part of the scene's size: above the rounding of coordinates, far below a
 # patch.
@@ -126,7 +126,7 @@ def check_blocks(blocks: Any) -> np.ndarray:
     """Return `blocks` as (B, 2, 3) float64, low and high corners of boxes; None is no box."""
     if blocks is None:
         return np.zeros((0, 2, 3))
-    value = checks.finite("blocks", checks.real("blocks", blocks)).astype(np.float64)
+    value = finite_floats("blocks", blocks)
     if value.size == 0:
         return np.zeros((0, 2, 3))
     if value.ndim != 3 or value.shape[1:] != (2, 3):

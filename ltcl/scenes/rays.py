@@ -124,9 +124,11 @@ def sight(
     v, u = np.meshgrid(step, step, indexing="ij")
     u = u.reshape(-1, 1)
     v = v.reshape(-1, 1)
-    origins = patches.centre[:, None] + u * patches.right[:, None] + v * patches.down[:, None]
-    is_free = clear(walls, origins.reshape(-1, 3), place, boxes).reshape(len(patches), -1)
-    share = np.where(towards[:, 2] > 0, is_free.mean(axis=1), 0.0)
+    right = u * patches.right[:, None]
+    origins = patches.centre[:, None] + right + v * patches.down[:, None]
+    is_free = clear(walls, origins.reshape(-1, 3), place, boxes)
+    free_share = is_free.reshape(len(patches), -1).mean(axis=1)
+    share = np.where(towards[:, 2] > 0, free_share, 0.0)
     if not share.any():
         raise InputError(
             f"{position}, where it faces none of {len(walls)} wall(s) in plain view; "
@@ -159,13 +161,15 @@ def _meet_wall(
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -start[:, 2] / step[:, 2]
         place = start[:, :2] + distance[:, None] * step[:, :2]
-        is_inside = ((place >= -RAY_TOLERANCE) & (place <= 1 + RAY_TOLERANCE)).all(axis=1)
-        met = is_inside & (distance > RAY_TOLERANCE) & (distance < hits.distance)
+        is_inside = (place >= -RAY_TOLERANCE) & (place <= 1 + RAY_TOLERANCE)
+        is_nearest = (distance > RAY_TOLERANCE) & (distance < hits.distance)
+        met = is_inside.all(axis=1) & is_nearest
     from_front = met & (step[:, 2] < 0)
     hits.distance[met] = distance[met]
     hits.wall[met] = -1
     hits.wall[from_front] = number
-    hits.u[met], hits.v[met] = np.where(from_front[met], np.clip(place[met].T, 0, 1), 0.0)
+    inside = np.clip(place[met].T, 0, 1)
+    hits.u[met], hits.v[met] = np.where(from_front[met], inside, 0.0)
 
 
 def _meet_block(

@@ -22,7 +22,14 @@ from ltcl.errors import InputError
 from ltcl.scenes import camera
 from ltcl.scenes.camera import MAX_IMAGE_SIDE, SceneCamera
 from ltcl.scenes.rays import clear
-from ltcl.scenes.walls import Block, Wall, check_albedo, point, refuse_crossing
+from ltcl.scenes.walls import (
+    Block,
+    Wall,
+    box_corners,
+    check_albedo,
+    point,
+    refuse_crossing,
+)
 from ltcl.transport.transport import Transport
 
 # Rows and columns touched at a time where a matrix meets its transpose.
@@ -121,7 +128,7 @@ class Scene:
     @property
     def first_bounce(self) -> np.ndarray:
         """Direct light of a unit pattern, F = albedo: (N,), or (3, N) in colour."""
-        return self.albedo[0] if self.channels == 1 else self.albedo
+        return single_or_all(self.albedo)
 
     @property
     def A(self) -> np.ndarray | tuple[np.ndarray, ...]:
@@ -131,7 +138,7 @@ class Scene:
         """
         self._check_memory(self.channels)
         bounces = tuple(albedo[:, None] * self.form_factors for albedo in self.albedo)
-        return bounces[0] if self.channels == 1 else bounces
+        return single_or_all(bounces)
 
     def matrices(self) -> tuple[np.ndarray, ...]:
         """Exact light transport T = (I - A)^-1 diag(albedo) (eq. 4), (N, N) float64 per channel.
@@ -183,10 +190,12 @@ class Scene:
         >>> dihedral(4).transport().grid
         (4, 8)
         """
-        matrices = self.matrices()
-        matrix = matrices[0] if self.channels == 1 else matrices
         return Transport(
-            matrix, grid=self.grid, first_bounce=first_bounce, device=device, on_dark=on_dark
+            single_or_all(self.matrices()),
+            grid=self.grid,
+            first_bounce=first_bounce,
+            device=device,
+            on_dark=on_dark,
         )
 
     def picture(self, patches: Any) -> np.ndarray:
@@ -308,12 +317,12 @@ class Scene:
         ((8, 24), 1.0)
         """
         place = np.array(point("light", light))
-        boxes = [(block.low, block.high) for block in self.blocks]
+        boxes = box_corners(self.blocks)
         for low, high in boxes:
             if np.all((place > low) & (place < high)):
                 raise InputError(f"light is {light}, inside a block; move it out")
-        parts = [self._wall_irradiance(wall, place, boxes) for wall in self.walls]
-        picture = np.concatenate(parts, axis=1)
+        light_on_walls = [self._wall_irradiance(wall, place, boxes) for wall in self.walls]
+        picture = np.concatenate(light_on_walls, axis=1)
         if picture.max() <= 0:
             raise InputError(
                 f"light is {light}, from where it reaches no patch; move it in front of a wall"
@@ -328,8 +337,10 @@ class Scene:
         v = (np.arange(h * LIGHT_POINTS) + 0.5) / (h * LIGHT_POINTS)
         points = wall.points(u, v[:, None])
         rays = place - points
-        light = np.maximum(rays @ wall.normal, 0) / np.linalg.norm(rays, axis=-1) ** 3
-        light *= clear(self.walls, points.reshape(-1, 3), place, boxes).reshape(light.shape)
+        distance = np.linalg.norm(rays, axis=-1)
+        light = np.maximum(rays @ wall.normal, 0) / distance**3
+        is_clear = clear(self.walls, points.reshape(-1, 3), place, boxes)
+        light *= is_clear.reshape(light.shape)
         return light.reshape(h, LIGHT_POINTS, w, LIGHT_POINTS).mean(axis=(1, 3))
 
     @property
@@ -342,8 +353,18 @@ class Scene:
 
     def _check_memory(self, matrices: int) -> None:
         pixels = len(self.area)
-        what = f"{matrices} matrix(es) of {pixels} x {pixels} for the scene {self.name}"
-        checks.fits_host(what, matrices * 8 * pixels**2)
+        shape = f"{pixels} x {pixels}"
+        checks.fits_host(
+            f"{matrices} matrix(es) of {shape} for the scene {self.name}",
+            matrices * 8 * pixels**2,
+        )
+
+
+def single_or_all(channels: Any) -> Any:
+    """Values of the only channel, or of all channels of a colour."""
+    if len(channels) == 1:
+        return channels[0]
+    return channels
 
 
 def transport_matrix(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
@@ -417,6 +438,7 @@ def _check_exchange(form_factors: np.ndarray, area: np.ndarray) -> None:
 
 def _blocks(size: int) -> list[tuple[slice, slice]]:
     """Blocks (rows, columns) that cover the upper triangle of a size x size matrix."""
-    starts = range(0, size, BLOCK_SIZE)
-    parts = [slice(start, min(start + BLOCK_SIZE, size)) for start in starts]
-    return list(itertools.combinations_with_replacement(parts, 2))
+    stretches = []
+    for start in range(0, size, BLOCK_SIZE):
+        stretches.append(slice(start, min(start + BLOCK_SIZE, size)))
+    return list(itertools.combinations_with_replacement(stretches, 2))

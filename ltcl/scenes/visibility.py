@@ -64,13 +64,13 @@ class Rays:
         """V of listed pairs, (P,) float32."""
         width = lanes(self.device)
         pairs = max(1, TESTS_PER_LAUNCH // (self.rays * self.boxes * width))
-        parts = [np.zeros(0, np.float32)]
+        shares = [np.zeros(0, np.float32)]
         for start in range(0, len(i), pairs):
             first = i[start : start + pairs]
             second = j[start : start + pairs]
             stretches = self._launch(first, second // width * width, 1)
-            parts.append(stretches[second % width, np.arange(len(first))])
-        return np.concatenate(parts)
+            shares.append(stretches[second % width, np.arange(len(first))])
+        return np.concatenate(shares)
 
     def _launch(self, i: np.ndarray, start: np.ndarray, columns: int) -> np.ndarray:
         """V of patches i and `columns` from `start`, in whole lanes: (columns or more, len(i))."""

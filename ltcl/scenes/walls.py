@@ -123,9 +123,8 @@ class Block:
         if min(self.size) <= 0:
             raise InputError(f"block size is {self.size}; all three lengths must be above 0")
         if self.albedo is not None:
-            albedo = checks.finite("block albedo", checks.real("block albedo", self.albedo))
-            albedo = checks.shape("block albedo", albedo.astype(np.float64), (), (3,))
-            check_albedo(albedo)
+            albedo = finite_floats("block albedo", self.albedo)
+            check_albedo(checks.shape("block albedo", albedo, (), (3,)))
 
     @property
     def low(self) -> np.ndarray:
@@ -157,10 +156,21 @@ class Block:
         return tuple(faces)
 
 
+def box_corners(blocks: Sequence[Block]) -> np.ndarray:
+    """Low and high corner of each block, (B, 2, 3)."""
+    corners = [(block.low, block.high) for block in blocks]
+    return np.array(corners).reshape(-1, 2, 3)
+
+
+def finite_floats(name: str, value: Any) -> np.ndarray:
+    """Return `value` as float64; refuse other than finite real numbers."""
+    return checks.finite(name, checks.real(name, value)).astype(np.float64)
+
+
 def vector(array: np.ndarray) -> Vector:
     """Three floats of an array (3,)."""
-    x, y, z = (float(v) for v in array)
-    return x, y, z
+    x, y, z = array.tolist()
+    return float(x), float(y), float(z)
 
 
 def point(name: str, value: Any) -> Vector:
@@ -187,19 +197,21 @@ def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
     >>> spread_albedo([0.5, 0.2], walls=2, n=1)
     array([[0.5, 0.2]])
     """
-    value = checks.finite("albedo", checks.real("albedo", albedo)).astype(np.float64)
+    value = finite_floats("albedo", albedo)
     if value.shape == (walls,) == (3,):
         raise InputError(
             "albedo has shape (3,) for 3 walls: one per wall, or one colour? "
             "It must be (3, 1) for one per wall, (1, 3) for a colour"
         )
     checks.shape("albedo", value, (), (walls,), (3,), (walls, 1), (1, 3), (walls, 3))
-    if value.ndim == 1:
-        value = value[:, None] if len(value) == walls else value[None, :]
     check_albedo(value)
-    channels = value.shape[-1] if value.ndim else 1
-    of_walls = np.broadcast_to(value, (walls, channels))
-    patches = np.broadcast_to(of_walls.T[:, None, :, None], (channels, n, walls, n))
+    value = np.atleast_1d(value)
+    if value.shape == (walls,):
+        value = value[:, None]
+    channels = value.shape[-1]
+    wall_albedos = np.broadcast_to(value, (walls, channels)).T
+    shape = (channels, n, walls, n)
+    patches = np.broadcast_to(wall_albedos[:, None, :, None], shape)
     return patches.reshape(channels, -1)
 
 
@@ -233,13 +245,13 @@ def _crossing(first: Wall, second: Wall) -> str:
     """Describe how two walls cross; the text is empty if they do not."""
     a = first.outline
     b = second.outline
-    longest_edge = max(np.abs(np.diff(corners, axis=0)).max() for corners in (a, b))
+    longest_edge = np.abs(np.diff([a, b], axis=1)).max()
     touch = OVERLAP_TOLERANCE * longest_edge
     # Heights of the corners of each wall above the plane of the other.
     heights_a = (a - b[0]) @ _normal(b)
     heights_b = (b - a[0]) @ _normal(a)
     faces_same_way = first.normal @ second.normal > 0
-    is_same_plane = max(np.abs(heights_a).max(), np.abs(heights_b).max()) <= touch
+    is_same_plane = np.abs([heights_a, heights_b]).max() <= touch
     if faces_same_way and is_same_plane:
         return "lie on top of each other" if overlap(a, b, touch) else ""
     depths = (-heights_a.min(), heights_a.max(), -heights_b.min(), heights_b.max())
@@ -280,7 +292,8 @@ def _span(corners: np.ndarray, height: np.ndarray, line: np.ndarray) -> tuple[fl
     next_corners = np.roll(corners, -1, axis=0)
     next_height = np.roll(height, -1)
     is_crossing = (height < 0) != (next_height < 0)
-    share = height[is_crossing] / (height[is_crossing] - next_height[is_crossing])
+    drop = (height - next_height)[is_crossing]
+    share = height[is_crossing] / drop
     steps = (next_corners - corners)[is_crossing]
     along = (corners[is_crossing] + share[:, None] * steps) @ line
     return float(along.min()), float(along.max())

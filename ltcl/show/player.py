@@ -128,7 +128,9 @@ class _FrameCompensator:
         """Return the light of a frame on the camera's grid."""
         light = frame.picture()
         grid = self._T.camera_grid
-        return light if light.shape[:2] == grid else images.resize(light, grid)
+        if light.shape[:2] == grid:
+            return light
+        return images.resize(light, grid)
 
 
 @dataclass(kw_only=True)
@@ -160,7 +162,7 @@ class _Timing:
 
     def wait_until_due(self, number: int, begun_at: float) -> None:
         """Take note of a computed frame, and wait for its time."""
-        # The first frame is shown at once. Kernels were built for it, so that it is no measure.
+        # The first frame is shown at once. Kernels were built for it, which takes longer.
         if self.shown:
             ready_at = time.monotonic()
             self.computing.append(ready_at - begun_at)
@@ -181,11 +183,16 @@ class _Timing:
 
     def pace(self, gain: float) -> Pace:
         """Return the pace so far."""
-        seconds = self.sent_at - self.start
+        rate = 0.0
+        latency = 0.0
+        if self.shown:
+            rate = self.shown / (self.sent_at - self.start)
+        if self.latencies:
+            latency = median(self.latencies)
         return Pace(
             shown=self.shown,
             dropped=self.number - self.shown,
             gain=gain,
-            frames_per_second=self.shown / seconds if self.shown else 0.0,
-            latency=median(self.latencies or [0.0]),
+            frames_per_second=rate,
+            latency=latency,
         )

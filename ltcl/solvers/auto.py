@@ -221,9 +221,9 @@ def plan(
         yield PlannedMethod(method=plain.method, reason=reason)
     elif not is_refined and columns <= COLUMNS_OF_A_PRODUCT and not _was_solved(S):
         S.known.was_tried = True
-        most = min(STEPS + int(free.products), GMRES.restart)
-        reason = f"gmres: at most {most} products, without a survey at the first solve"
-        yield PlannedMethod(method=GMRESTrial(most), reason=reason)
+        max_products = min(STEPS + int(free.products), GMRES.restart)
+        reason = f"gmres: at most {max_products} products, without a survey at the first solve"
+        yield PlannedMethod(method=GMRESTrial(max_products), reason=reason)
     yield from _plan_by_survey(S, rtol, columns)
 
 

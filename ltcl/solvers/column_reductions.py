@@ -62,13 +62,13 @@ class ColumnReductions:
             self._kernels[name] = vectors.kernel_of(self.device, name, **defines)
         if self.device.is_cpu:
             items = 16 if self.k <= 16 else 64
-            most = min(4 * self.device.compute_units, MAX_SLICES)
+            max_slices = min(4 * self.device.compute_units, MAX_SLICES)
         else:
             items = 256
-            most = MAX_SLICES
+            max_slices = MAX_SLICES
         self.group = min(kernel.group(items) for kernel in self._kernels.values())
         enough = -(-x.size // (VALUES_PER_ITEM * self.group))
-        self.slices = max(1, min(enough, most))
+        self.slices = max(1, min(enough, max_slices))
 
     def bind(self, name: str, /, *, extra: int = 0, across: int = 1, **arguments: object) -> Launch:
         """Bind kernel `name`, `across` times, with local memory for `extra` reals a column.

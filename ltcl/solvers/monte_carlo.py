@@ -186,16 +186,15 @@ class MonteCarlo(Sampler):
         scores = np.sqrt(square[pixels][:, channel_of_column])
         unmet = UNMET_CHANCE**0.5 * scores * np.abs(light).max(axis=0)
         units = np.stack([np.broadcast_to(c.unit, columns) for c in channels], axis=-1)
-        most = self.max_samples
         if self.error is None:
             # One stage, after which any error will do.
             error = np.inf
-            first = most
+            first = self.max_samples
         else:
             error = self.error
-            first = min(FIRST_STAGE_SAMPLES, most)
+            first = min(FIRST_STAGE_SAMPLES, self.max_samples)
         target = error / units.ravel()
-        stages = _Stages(walker, light, pixels, unmet, target, first, most)
+        stages = _Stages(walker, light, pixels, unmet, target, first, self.max_samples)
         return stages.run()
 
     def _solution(
@@ -261,14 +260,14 @@ class _Stages:
         unmet: np.ndarray,
         target: np.ndarray,
         first: int,
-        most: int,
+        max_samples: int,
     ) -> None:
         self.walker = walker
         self.light = walker.tables.device.upload(light)
         self.pixels = pixels
         self.unmet = unmet
         self.target = target
-        self.most = most
+        self.max_samples = max_samples
         self.mean = np.zeros(unmet.shape)
         self.spread = np.zeros(unmet.shape)
         # Samples of the last stage of each pixel, and of all.
@@ -286,8 +285,10 @@ class _Stages:
             if active.size == 0:
                 return PixelEstimates(mean=self.mean, standard_error=error, samples=self.spent)
             # The first stage tells the spread; each later one has to have more samples.
-            least = self.samples[active] if stage == 0 else 2 * self.samples[active]
-            self.samples[active] = self._next_samples(active, least)
+            min_samples = self.samples[active]
+            if stage > 0:
+                min_samples = 2 * min_samples
+            self.samples[active] = self._next_samples(active, min_samples)
             stage += 1
 
     def _unmet_pixels(self, error: np.ndarray, stage: int) -> np.ndarray:
@@ -297,7 +298,7 @@ class _Stages:
         """
         limit = self.target if stage else 0.0
         is_met = np.all(error <= limit, axis=1)
-        return np.flatnonzero((self.samples < self.most) & ~is_met)
+        return np.flatnonzero((self.samples < self.max_samples) & ~is_met)
 
     def _sample(self, active: np.ndarray, stage: int) -> None:
         """Take the samples of one stage, together for all pixels that need as many."""
@@ -309,15 +310,15 @@ class _Stages:
             self.spread[same] = sums.standard_error
         self.spent[active] += needed
 
-    def _next_samples(self, active: np.ndarray, least: np.ndarray) -> np.ndarray:
+    def _next_samples(self, active: np.ndarray, min_samples: np.ndarray) -> np.ndarray:
         """Return the samples n with a / n + b / n^2 <= 1, and some to spare."""
         with np.errstate(over="ignore", divide="ignore"):
             a = self.samples[active, None] * (self.spread[active] / self.target) ** 2
             b = (self.unmet[active] / self.target) ** 2
             root = np.max(a + np.sqrt(a**2 + 4.0 * b), axis=1)
             needed = SPARE_SAMPLES / 2 * root
-        needed = np.clip(needed, least, self.most)
-        return np.minimum(2.0 ** np.ceil(np.log2(needed)), self.most)
+        needed = np.clip(needed, min_samples, self.max_samples)
+        return np.minimum(2.0 ** np.ceil(np.log2(needed)), self.max_samples)
 
 
 def _mean_square_after_first_step(step: Weights, lengths: Lengths) -> np.ndarray:

@@ -139,8 +139,8 @@ class Solution:
         if self.status is Status.SAMPLED and self.reason:
             return self.reason
         if self.least_rtol is not None:
-            least = checks.upwards(self.least_rtol)
-            return f"rounding may hide up to {least} of it; ask for no less"
+            hidden = checks.upwards(self.least_rtol)
+            return f"rounding may hide up to {hidden} of it; ask for no less"
         if self.status is Status.STAGNATED and self.method != "direct":
             return f"{cause} or try method='direct'"
         if self.status is not Status.DIVERGED:

@@ -177,8 +177,8 @@ class Monitor:
             return 1
         required = self._required_steps()
         remaining = self.rule.maxiter - done
-        most = min(required, 2.0 * SLOTS - 1.0, 2.0 * remaining - 1.0)
-        half = int((most + 1.0) / 2.0)
+        max_steps = min(required, 2.0 * SLOTS - 1.0, 2.0 * remaining - 1.0)
+        half = int((max_steps + 1.0) / 2.0)
         return max(1, min(half, done))
 
     def check(self, x: Any, r: Array, norms: np.ndarray, travelled: Any = None) -> bool:

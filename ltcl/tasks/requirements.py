@@ -10,7 +10,6 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import IdentityPlus
 from ltcl.solvers import Inverse
 from ltcl.transport.transport import Transport, check_transport
 
@@ -34,7 +33,9 @@ def check_same_scene(name: str, other: Any, T: Transport, advice: str) -> None:
 
 
 def _mixing_matrix(T: Any) -> np.ndarray:
-    return np.eye(3) if T.mixing is None else T.mixing
+    if T.mixing is None:
+        return np.eye(3)
+    return T.mixing
 
 
 def check_inverse(T: Transport, inverse: Any, rtol: float | None, **replaced: Any) -> None:
@@ -90,19 +91,11 @@ def default_rtol(
     return max(minimum, error)
 
 
-def resolve_reference(
-    T: Transport, exact: Any
-) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:
-    """The transport that results describe, and the S that judges each channel.
-
-    Without `exact` these are T and None.
-    """
-    if exact is None:
-        return T, (None,) * T.channels
+def check_exact(T: Transport, exact: Any) -> None:
+    """Refuse an `exact` that is not the uncompressed transport of T."""
     check_transport(T)
     check_transport(exact, name="exact")
     check_same_scene("exact", exact, T, "it must be that of T, or T made from exact")
-    return exact, exact.systems
 
 
 def check_progress(

@@ -46,8 +46,8 @@ class EntryErrors:
             F = np.atleast_2d(T.first_bounce)[channel]
             return T.systems[channel].matmat(F[:, None] * patterns)
         matrices = channel_matrices(T, channel)
-        parts = np.split(patterns, len(matrices))
-        return sum(A @ part for A, part in zip(matrices, parts, strict=True))
+        light = np.split(patterns, len(matrices))
+        return sum(A @ x for A, x in zip(matrices, light, strict=True))
 
     def solve(self, channel: int, light: np.ndarray) -> np.ndarray:
         """S^-1 of light (N, k, draws), float64."""
@@ -111,7 +111,7 @@ class EntryErrors:
         products = filtered[..., i] * filtered[..., j]
         sums = self.variance(channel, products.reshape(len(products), -1))
         sums = sums.reshape(-1, *products.shape[1:])
-        if self.noise.neighbours[channel]:
+        if self.noise.neighbours[channel] and self.T.is_square:
             # The first bounce has no part in its neighbours.
             direct = self.diagonal_variance(channel)[:, None, None]
             sums += direct * (patterns[..., i] * patterns[..., j] - products)

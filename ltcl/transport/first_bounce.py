@@ -78,9 +78,10 @@ def find_first_bounce(
         is_lit = ~rule.find_dark(F)
     if requested == "exact":
         n = F.shape[1]
+        needed = INVERSE_BYTES_PER_ENTRY * n**2
         try:
-            checks.fits_host(f"a dense inverse of {n} pixels", INVERSE_BYTES_PER_ENTRY * n**2)
-            exact = [_exact(T, lit) for T, lit in zip(matrices, is_lit, strict=True)]
+            checks.fits_host(f"a dense inverse of {n} pixels", needed)
+            exact = list(map(_exact, matrices, is_lit))
             return np.where(is_lit, exact, F), None
         except MemoryError:
             logger.warning("T of %d pixels is too large for a dense inverse; F is estimated", n)
@@ -93,7 +94,8 @@ def _check_first_bounce(matrices: Sequence[Any], F: Any) -> np.ndarray:
     """A given first bounce, (N,) or (channels, N), as (channels, N) float64."""
     n: int = matrices[0].shape[0]
     channels = len(matrices)
-    F = checks.finite("first_bounce", checks.real("first_bounce", F)).astype(np.float64)
+    F = checks.real("first_bounce", F)
+    F = checks.finite("first_bounce", F).astype(np.float64)
     F = checks.shape("first_bounce", F, (n,), (channels, n))
     return np.broadcast_to(F, (channels, n))
 
@@ -124,7 +126,9 @@ def _diagonal(matrix: Any) -> np.ndarray:
 
 def _exact(matrix: Any, is_lit: np.ndarray) -> np.ndarray:
     """1 / diag(T^-1), by a dense inverse of the pixels that are lit."""
-    dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
+    dense = matrix
+    if not isinstance(matrix, np.ndarray):
+        dense = matrix.toarray()
     dense = dense.astype(np.float64)
     # A dark pixel would make T singular.
     is_lit = is_lit & dense.any(axis=0) & dense.any(axis=1)
@@ -158,8 +162,9 @@ def _estimate(
     for channel, S0 in enumerate(interreflections(matrices, F0, device)):
         mean, spread = _probe_inverse_diagonal(S0, signs)
         is_known = mean > 0
-        np.divide(F0[channel], mean, out=F[channel], where=is_known)
-        np.divide(F[channel] * spread, mean, out=error[channel], where=is_known)
+        estimate = F[channel]
+        np.divide(F0[channel], mean, out=estimate, where=is_known)
+        np.divide(estimate * spread, mean, out=error[channel], where=is_known)
     return F, error
 
 
@@ -219,12 +224,15 @@ class DarkRule:
         least = np.maximum(MIN_FIRST_BOUNCE, self.threshold * median)
         # Light is never negative, noise is.
         most_negative = np.maximum(-light.min(axis=1, keepdims=True), 0.0)
-        faint_limit = np.maximum(FAINT_SHARE * median, NOISE_SIGMAS * most_negative)
+        faint_limit = FAINT_SHARE * median
+        faint_limit = np.maximum(faint_limit, NOISE_SIGMAS * most_negative)
         is_faint = (light > least) & (light < faint_limit)
         if self.is_measured:
-            least = np.maximum(least, NOISE_SIGMAS * self.noise().diagonal(light))
+            sigma = self.noise().diagonal(light)
+            least = np.maximum(least, NOISE_SIGMAS * sigma)
         elif has_entries and is_faint.any():
-            least = np.maximum(least, NOISE_SIGMAS * self._estimated_sigma(light, is_faint))
+            sigma = self._estimated_sigma(light, is_faint)
+            least = np.maximum(least, NOISE_SIGMAS * sigma)
         return light <= least
 
     def _estimated_sigma(self, light: np.ndarray, is_faint: np.ndarray) -> np.ndarray:
@@ -263,13 +271,16 @@ def mask_dark(
         )
     pixels = np.flatnonzero(is_masked)
     zero = np.count_nonzero(is_masked & np.any(F <= 0.0, axis=0))
+    dim = len(pixels) - zero
     reason = (
-        f"first_bounce is dark at {len(pixels)} of {len(is_masked)} pixels (zero or negative at "
-        f"{zero}, within its noise or below the dark threshold at {len(pixels) - zero})"
+        f"first_bounce is dark at {len(pixels)} of {len(is_masked)} pixels "
+        f"(zero or negative at {zero}, "
+        f"within its noise or below the dark threshold at {dim})"
     )
     if may_mask or len(pixels) == 0:
         return np.where(is_masked, 0.0, F), is_masked, reason
-    first = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
+    places = [divmod(int(pixel), grid[1]) for pixel in pixels[:8]]
+    first = ", ".join(map(str, places))
     advice = "give on_dark='mask' to leave them unlit, which a LinearOperator cannot"
     raise InputError(f"{reason} at (row, column): {first}; {advice}")
 

@@ -74,7 +74,9 @@ def check_blocks(value: Any) -> Blocks | None:
 def check_mixing(value: Any, channels: int, has_blocks: bool) -> np.ndarray:
     """The (3, 3) float64 mixing of a T of 3 channels without blocks; a singular one is refused."""
     if channels != 3 or has_blocks:
-        kind = "one channel" if channels == 1 else "3 x 3 blocks, which mix colours themselves"
+        kind = "one channel"
+        if has_blocks:
+            kind = "3 x 3 blocks, which mix colours themselves"
         raise InputError(f"mixing is given, but T has {kind}; it is for a T of 3 channels")
     M = checks.shape("mixing", checks.real("mixing", value), (3, 3))
     M = checks.finite("mixing", M).astype(np.float64)

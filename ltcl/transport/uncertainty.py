@@ -58,10 +58,10 @@ class _Deviations:
 
     def __repr__(self) -> str:
         texts = []
-        for each in fields(self):
-            values = getattr(self, each.name)
+        for field in fields(self):
+            values = getattr(self, field.name)
             rms = np.sqrt(np.mean(np.square(values, dtype=np.float64)))
-            texts.append(f"{each.name} {rms:.2g}")
+            texts.append(f"{field.name} {rms:.2g}")
         return f"<ltcl standard deviations, rms of {', '.join(texts)}>"
 
 
@@ -115,9 +115,8 @@ def separation_std(
         variances = bounce_variances(errors, channel, b, random)
         deviations.append(np.sqrt(np.maximum(variances, 0.0)))
     packed = []
-    for k in range(len(pictures)):
-        picture = shape.pack([deviation[..., k] for deviation in deviations], T.grid)
-        packed.append(picture.astype(np.float32))
+    for columns in np.moveaxis(np.stack(deviations), -1, 0):
+        packed.append(shape.pack(columns, T.grid).astype(np.float32))
     return SeparationStd(packed[0], np.stack(packed)[1:])
 
 
@@ -128,14 +127,15 @@ def bounce_variances(
     F = np.atleast_2d(errors.T.first_bounce)[channel]
     p = ratio(b, F[:, None, None])
     pictures = b.shape[1]
-    draws = FRAME_DRAWS if pictures > 1 else DRAWS
+    draws = _draw_count(pictures)
     variances = np.empty(b.shape)
     for group in _groups(pictures):
-        variances[:, group] = _group_bounce_variances(errors, channel, p[:, group], draws, random)
+        patterns = p[:, group]
+        variances[:, group] = _group_variances(errors, channel, patterns, draws, random)
     return variances
 
 
-def _group_bounce_variances(
+def _group_variances(
     errors: EntryErrors, channel: int, p: np.ndarray, draws: int, random: np.random.Generator
 ) -> np.ndarray:
     """Variances (N, k, n) of the bounces of patterns p (N, k, n)."""
@@ -156,7 +156,8 @@ def _group_bounce_variances(
     for k in range(n):
         x = errors.solve(channel, dl - E[..., k])
         db = x + D * p[:, :, None, k]
-        variance[..., k] += _other_rows(errors, channel, previous - x, db - own_row[..., k])
+        other_light = db - own_row[..., k]
+        variance[..., k] += _other_rows(errors, channel, previous - x, other_light)
         dl = dl - db
         previous = x
     return variance
@@ -183,7 +184,7 @@ def compensation_std(
         is_inside = (bounds[0] < light) & (light < bounds[1])
         is_free.append(is_inside & ~T.masked[:, None])
     picture_variances = _picture_variances(errors, columns)
-    appearance = shape.pack([np.sqrt(variance) for variance in picture_variances], T.camera_grid)
+    appearance = shape.pack(np.sqrt(picture_variances), T.camera_grid)
     if systems:
         free = is_free
         if len(systems) < T.channels:
@@ -209,7 +210,7 @@ def _picture_variances(errors: EntryErrors, columns: Sequence[np.ndarray]) -> li
     if T.blocks is not None:
         patterns = [np.concatenate(columns)] * 3
     elif T.mixing is not None:
-        patterns = list(np.einsum("cd,dnk->cnk", T.mixing, np.stack(columns)))
+        patterns = np.einsum("cd,dnk->cnk", T.mixing, np.stack(columns))
     else:
         patterns = list(columns)
     variances = []
@@ -233,7 +234,8 @@ def _unbounded_variances(
         for group in _groups(pictures):
             e = _draw_light(variance[:, group], _draw_count(pictures), random)
             x = errors.solve(channel, e)
-            light[:, group] = variance[:, group] + _other_rows(errors, channel, x, x - e)
+            other_rows = _other_rows(errors, channel, x, x - e)
+            light[:, group] = variance[:, group] + other_rows
         variances.append(ratio(light, scale[:, None] ** 2))
     if T.mixing is None:
         return variances
@@ -258,14 +260,20 @@ def _bounded_variances(
         variance = picture_variances[number]
         pictures = variance.shape[1]
         free = is_free[number] & (scale > 0)[:, None]
-        w = np.broadcast_to(weights[number] if weights else 1.0, variance.shape)
-        draws = _draw_count(pictures) if has_closed_form else DRAWS_WITHOUT_CLOSED_FORM
+        w = np.ones(variance.shape)
+        if weights:
+            w = np.broadcast_to(weights[number], variance.shape)
+        draws = DRAWS_WITHOUT_CLOSED_FORM
+        if has_closed_form:
+            draws = _draw_count(pictures)
         light = np.empty(free.shape)
         for group in _groups(pictures):
             e = _draw_light(variance[:, group], draws, random)
-            x = least_squares(A, e, free[:, group, None], w[:, group, None], rtol=SOLVE_RTOL)
+            is_free_now = free[:, group, None]
+            x = least_squares(A, e, is_free_now, w[:, group, None], rtol=SOLVE_RTOL)
             if has_closed_form:
-                light[:, group] = variance[:, group] + _other_rows(errors, number, x, x - e)
+                other_rows = _other_rows(errors, number, x, x - e)
+                light[:, group] = variance[:, group] + other_rows
             else:
                 light[:, group] = np.mean(x**2, axis=-1)
         variances.append(ratio(light, scale[:, None] ** 2))

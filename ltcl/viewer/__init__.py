@@ -19,6 +19,7 @@ def view(
     host: str = "127.0.0.1",
     port: int = 0,
     open_browser: bool = True,
+    url: str = "",
     setup: Any = None,
     title: str = "",
 ) -> Viewer:
@@ -36,6 +37,10 @@ def view(
         port.
     open_browser : bool
         Whether to open the page in the browser.
+    url : str
+        Address at which the browser finds the page behind a proxy or on a forwarded port, such as
+        "http://localhost:9000" or "https://hub.example.org/user/me/proxy/8123"; other addresses
+        than this one and the viewer's own are refused.
     setup : ltcl.acquisition.Setup, optional
         Measured projector of T, whose codes projector windows then show; else they show sRGB.
     title : str
@@ -49,7 +54,7 @@ def view(
     Raises
     ------
     InputError
-        The address is not available, or the extra `view` is not installed.
+        The address is not available, `url` is none, or the extra `view` is not installed.
 
     Examples
     --------
@@ -68,5 +73,7 @@ def view(
         pictures = picture
     elif picture is not None:
         pictures = {"picture": picture}
-    scene = ViewerScene(T, title or repr(T).strip("<>"), pictures, setup)
-    return Viewer(scene, host, port, open_browser)
+    if not title:
+        title = repr(T).strip("<>")
+    scene = ViewerScene(T, title, pictures, setup)
+    return Viewer(scene, host, port, open_browser, url)

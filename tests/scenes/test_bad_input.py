@@ -42,29 +42,29 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: trihedral(2, albedo=1.0), r"outside \[0, 1\)"),
     *((lambda angle=angle: dihedral(2, angle=angle), "angle is .* 180") for angle in BAD[:4]),
     *((lambda angle=angle: trihedral(2, angle=angle), "angle is .* 120") for angle in BAD[3:]),
-    (lambda: box(2, sides=7), "sides is 7; it must be at most 6"),
-    (lambda: box(2, sides=3, albedo=[0.1, 0.2, 0.3]), "one per wall, or one colour"),
+    (lambda: box(2, sides=7), "sides is 7"),
+    (lambda: box(2, sides=3, albedo=[0.1, 0.2, 0.3]), "one per wall"),
     (lambda: box(2, occluder=Block((0.8, 0, 0), (0.3, 0.1, 0.1))), "reaches from .* out of"),
     (lambda: box(2, occluder=Block((0, 0, 0), (1, 1, 1))), "occluder fills the room"),
     (lambda: box(2, occluder=(0.1, 0.1)), "occluder is .*ltcl.scenes.Block"),  # pyright: ignore[reportArgumentType]
     (lambda: transport_matrix(ONE, np.full(2, 1 - 1e-9), np.ones(2)), "gain of 1 or more"),
     (
         lambda: replace(CORNER, grid=(4, 15)),
-        r"form_factors has shape \(75, 75\); it must be \(60, 60\)",
+        r"form_factors has shape \(75, 75\).*\(60, 60\)",
     ),
     (lambda: replace(CORNER, albedo=np.full((1, 75), np.nan)), "albedo has 75 NaN"),
     (lambda: replace(CORNER, form_factors=UNEVEN), "breaks reciprocity by"),
     (lambda: CORNER.sample(np.full((2, 2), np.nan)), "image has 4 NaN"),
     (lambda: SHADED.irradiance((0.5, 0.5)), r"light is \(0.5, 0.5\)"),
     (lambda: SHADED.irradiance((0.5, -0.5, 0.5)), "reaches no patch"),  # behind the left wall
-    (lambda: SHADED.irradiance((0.45, 0.45, 0.45)), "inside a block; move it out"),
+    (lambda: SHADED.irradiance((0.45, 0.45, 0.45)), "inside a block"),
     (lambda: frame(SceneCamera((1, 1, 3), (1, 1, 0)), [SCREEN]), "straight up or down"),
     (lambda: Wall("flat", (0, 0, 0), (1, 0, 0), (2, 0, 0)), "wall 'flat' .* no area"),
     (lambda: Block((0, 0, 0), (0.1, 0, 0.1)), r"block size is \(0.1, 0.0, 0.1\)"),
     (lambda: shine(gloss=-0.1), "gloss is -0.1"),
-    (lambda: shine(directions=60), "directions is 60; it must be a square number"),
+    (lambda: shine(directions=60), "directions is 60"),
     (lambda: shine(projector=(0, 0.5, 0.5)), "projector is at .*, on the wall 'right'"),
-    (lambda: shine(camera=(-1, -1, 0.5)), "camera is at .*, where it faces none of 2 wall"),
+    (lambda: shine(camera=(-1, -1, 0.5)), "camera is at .* 2 wall"),
     (lambda: shine(blocks=[[(0, 0, 0), (1, 1, 1)]]), "blocks is .* ltcl.scenes.Block"),
     (lambda: FormFactor([1], 0.5), "patches is a list"),  # pyright: ignore[reportArgumentType]
     (lambda: FormFactor(PATCHES, [0.5, 0.5]), r"albedo has shape \(2,\)"),
@@ -82,10 +82,10 @@ def test_bad_input_is_refused(device: Any, make: Callable[[], Any], part: str) -
 @pytest.mark.parametrize(
     ("wall", "what"),
     [
-        (Wall("other", (0.5, 0.2, 1), (0, 0.5, 0), (0, 0, -1.01)), "cut through each other"),
-        (Wall("other", (-1, 0.5, -1), (3, 0.1, 3), (0, 0, -0.7)), "cut through each other"),
-        (Wall("other", (0.9, 0.9, 0), (0, 1, 0), (1, 0, 0)), "lie on top of each other"),
-        (Wall("other", (0.2, 0.2, 0), (0, 0.1, 0), (0.1, 0, 0)), "lie on top of each other"),
+        (Wall("other", (0.5, 0.2, 1), (0, 0.5, 0), (0, 0, -1.01)), "cut through"),
+        (Wall("other", (-1, 0.5, -1), (3, 0.1, 3), (0, 0, -0.7)), "cut through"),
+        (Wall("other", (0.9, 0.9, 0), (0, 1, 0), (1, 0, 0)), "on top of"),
+        (Wall("other", (0.2, 0.2, 0), (0, 0.1, 0), (0.1, 0, 0)), "on top of"),
     ],
 )
 def test_crossing_walls_are_refused(wall: Wall, what: str) -> None:

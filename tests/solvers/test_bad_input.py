@@ -31,7 +31,7 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "b is short": (
         {"b": np.ones(3)},
         InputError,
-        r"b has shape \(3,\); it must be \(4,\) or \(4, k\)",
+        r"b has shape \(3,\).*\(4,\)",
     ),
     "b is a picture": ({"b": np.ones((4, 1, 1))}, InputError, r"b has shape \(4, 1, 1\)"),
     "b is empty": ({"b": np.ones((4, 0))}, InputError, r"b has shape \(4, 0\)"),
@@ -53,7 +53,7 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "atol is negative": ({"atol": -1.0}, InputError, "atol is -1.0"),
     "maxiter is zero": ({"maxiter": 0}, InputError, "maxiter is 0"),
     "maxiter is a fraction": ({"maxiter": 2.5}, InputError, "maxiter is 2.5"),
-    "x0 is short": ({"x0": np.ones(3)}, InputError, r"x0 has shape \(3,\); it must be \(4,\)"),
+    "x0 is short": ({"x0": np.ones(3)}, InputError, r"x0 has shape \(3,\).*\(4,\)"),
     "x0 has NaN": ({"x0": [np.nan] * 4}, InputError, "x0 has 4 NaN or infinite value"),
     "callback is a number": ({"callback": 3}, InputTypeError, "callback is 3"),
     "S is a transport": (

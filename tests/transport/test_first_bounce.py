@@ -136,5 +136,5 @@ def test_exact_becomes_an_estimate_where_a_dense_inverse_does_not_fit(
         monkeypatch.setattr("scipy.linalg.inv", inv)
     scene = lambertian(MANY, 0.9)
     F, error = estimated(device, scene, how="exact")
-    assert "too large for a dense inverse" in caplog.text
+    assert "dense inverse" in caplog.text
     assert np.abs((F - scene.F) / error).max() <= 4.0

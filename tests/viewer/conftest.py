@@ -28,10 +28,10 @@ def browser() -> Iterator[Any]:
     playwright_api = pytest.importorskip(
         "playwright.sync_api", reason='playwright is not installed: pip install "ltcl[test]"'
     )
-    found = [path for path in map(shutil.which, PROGRAMS) if path is not None]
-    if not found:
+    browsers = [path for path in map(shutil.which, PROGRAMS) if path is not None]
+    if not browsers:
         pytest.skip("Chromium is not installed (Debian: apt install chromium)")
     with playwright_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found[0], args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=browsers[0], args=FLAGS)
         yield browser
         browser.close()

@@ -445,8 +445,8 @@ def test_a_thousand_connections_that_say_nothing(running):
         with Page(running.url) as page:
             assert "picture" in page.ask("column", pixel=[0, 0])
         assert time.monotonic() - start < client.READ_SECONDS
-        held = len(list(Path(f"/proc/{running.process.pid}/fd").iterdir()))
-        assert held < server.MAX_CONNECTIONS + 100
+        descriptors = len(list(Path(f"/proc/{running.process.pid}/fd").iterdir()))
+        assert descriptors < server.MAX_CONNECTIONS + 100
 
 
 def test_pages_are_counted_and_told_so(running):

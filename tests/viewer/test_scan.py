@@ -51,18 +51,18 @@ def project(folder: Path, text: str) -> Project:
     return Project.open(folder)
 
 
-def news(page: Page, seen: int = 0, count: int = 0, **wanted: Any) -> dict[str, Any]:
+def news(page: Page, seen: int = 0, count: int = 0, **expected: Any) -> dict[str, Any]:
     """Ask again until the answer has these facts, and `count` photographs and warnings."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
-        found = page.ask("scan", seen=seen)
+        facts = page.ask("scan", seen=seen)
         if (
-            found.items() >= wanted.items()
-            and len(found["photographs"] + found["warnings"]) >= count
+            facts.items() >= expected.items()
+            and len(facts["photographs"] + facts["warnings"]) >= count
         ):
-            return found
+            return facts
         time.sleep(0.1)
-    raise AssertionError(f"nothing with {wanted}")
+    raise AssertionError(f"nothing with {expected}")
 
 
 def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
@@ -138,9 +138,9 @@ def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
         assert news(page, state="new", finished=False)["done"] == 0
         with scan.rig() as rig:
             T = ltcl.acquire(rig, store=scan.store, **scan.settings)
-        found = news(page, state="final", left=None, finished=True)
-        assert found["done"] == found["total"] >= 32
-        assert (found["coverage"], found["saturated"]) == (1.0, 0.0)
+        facts = news(page, state="final", left=None, finished=True)
+        assert facts["done"] == facts["total"] >= 32
+        assert (facts["coverage"], facts["saturated"]) == (1.0, 0.0)
         with Page(viewer.url) as again:
             assert again.hello.items() >= {"grid": [4, 8], "scan": True}.items()
         unit = np.zeros(T.grid, np.float32)
@@ -247,8 +247,8 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
             with pytest.raises(HTTPError, match=str(code)):  # a window has neither
                 urlopen(Request(f"{window.url}{path}", data, headers))  # noqa: S310
         window.close()
-    for found, pattern in zip(shown, patterns, strict=True):
-        np.testing.assert_array_equal(found[..., 0], np.rint(255 * pattern))
+    for codes, pattern in zip(shown, patterns, strict=True):
+        np.testing.assert_array_equal(codes[..., 0], np.rint(255 * pattern))
 
 
 @pytest.mark.slow
@@ -273,8 +273,8 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(
     assert pace.shown == len(numbers) == len(shown)
     assert pace.shown + pace.dropped == numbers[-1] + 1
     assert numbers == sorted({*numbers})
-    for found, number in zip(shown, numbers, strict=True):
-        np.testing.assert_allclose(found.astype(int), expected[number].astype(int), atol=1)
+    for codes, number in zip(shown, numbers, strict=True):
+        np.testing.assert_allclose(codes.astype(int), expected[number].astype(int), atol=1)
     # On a busy machine; were nothing dropped, it would add up to 2 s.
     assert pace.latency < slow + 1.0
     assert pace.dropped > 5 or not slow
@@ -317,10 +317,10 @@ def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey:
         pace = play(scene, source, window, 0.5, lambda *_, **__: None, **rules)
         assert pace.shown == 2
         window.close()
-    for found, frame in zip(shown, source, strict=True):
+    for codes, frame in zip(shown, source, strict=True):
         light = ltcl.compensate(T, frame.picture(), gain=0.5, **rules).pattern
         exact = np.atleast_3d(scene.codes(light, 1.0))
-        np.testing.assert_allclose(found.astype(int), exact.astype(int), atol=1)
+        np.testing.assert_allclose(codes.astype(int), exact.astype(int), atol=1)
     with pytest.raises(errors.InputError, match="inverse"):
         play(
             scene,
@@ -416,7 +416,5 @@ def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_holds_nothing_is_called_so(tmp_path: Path) -> None:
-    with pytest.raises(
-        errors.FileError, match=r"folder with neither zarr\.json.*acquisition\.toml"
-    ):
+    with pytest.raises(errors.FileError, match=r"zarr\.json.*acquisition\.toml"):
         ltcl.load(tmp_path)

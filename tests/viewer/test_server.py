@@ -87,10 +87,10 @@ def whole(T: ltcl.Transport) -> np.ndarray:
     return blocks.transpose(2, 0, 3, 1).reshape(3 * T.shape[0], 3 * T.shape[1])
 
 
-def near(found: np.ndarray, exact: np.ndarray) -> None:
-    assert found.size == exact.size
+def near(picture: np.ndarray, exact: np.ndarray) -> None:
+    assert picture.size == exact.size
     np.testing.assert_allclose(
-        found.ravel(), exact.ravel(), rtol=0, atol=ROUNDING * np.abs(exact).max()
+        picture.ravel(), exact.ravel(), rtol=0, atol=ROUNDING * np.abs(exact).max()
     )
 
 
@@ -139,39 +139,39 @@ def test_bounces_of_a_picture_and_of_the_pattern(colour):
     with viewing(colour, colour @ light) as page:
         page.ask("relight", {"pattern": codes})
         for fields in ({"picture": 1}, {}):
-            found = page.ask("bounces", count=2, **fields)
+            reply = page.ask("bounces", count=2, **fields)
             rest = np.einsum("cij,jc->ic", A, light.reshape(-1, 3))
             shares = []
             total = rest.sum()
             for name in ("direct", "bounce_1", "bounce_2"):
                 b = np.stack([F[c] * np.linalg.solve(A[c], rest[:, c]) for c in range(3)], axis=1)
                 np.testing.assert_allclose(
-                    found[name].reshape(-1, 3), b, rtol=0, atol=4e-3 * rest.max()
+                    reply[name].reshape(-1, 3), b, rtol=0, atol=4e-3 * rest.max()
                 )
-                assert found[f"{name}_std"].shape == found[name].shape
+                assert reply[f"{name}_std"].shape == reply[name].shape
                 rest = rest - b
                 shares.append(b.sum() / total)
-            np.testing.assert_allclose(found["shares"], [*shares, rest.sum() / total], atol=4e-3)
+            np.testing.assert_allclose(reply["shares"], [*shares, rest.sum() / total], atol=4e-3)
 
 
 def test_a_compensation_and_its_downloads(colour, tmp_path):
     pattern = 0.2 + 0.6 * random.random((*colour.grid, 3))
     desired = (colour @ pattern).astype(np.float32)
     with viewing(colour, {"wanted": desired}) as page:
-        found = page.ask("compensate", picture=1)
+        reply = page.ask("compensate", picture=1)
         exact = np.linalg.solve(whole(colour), desired.ravel())
-        np.testing.assert_allclose(found["pattern"].ravel(), exact, atol=0.02)
-        near(found["target"], desired)
+        np.testing.assert_allclose(reply["pattern"].ravel(), exact, atol=0.02)
+        near(reply["target"], desired)
         np.testing.assert_allclose(
-            found["appearance"].ravel(), desired.ravel(), atol=0.02 * desired.max()
+            reply["appearance"].ravel(), desired.ravel(), atol=0.02 * desired.max()
         )
-        assert not found["out_of_reach"].any()
-        assert found["gain"] == 1.0
-        assert found["clipped"] == 0.0
-        assert found["method"] == "direct"
-        assert found["products"] == 0
-        assert found["seconds"] > 0
-        assert found["residuals"][-1] <= 1e-2
+        assert not reply["out_of_reach"].any()
+        assert reply["gain"] == 1.0
+        assert reply["clipped"] == 0.0
+        assert reply["method"] == "direct"
+        assert reply["products"] == 0
+        assert reply["seconds"] > 0
+        assert reply["residuals"][-1] <= 1e-2
         files = {}
         for name in (
             "pattern.exr",
@@ -187,13 +187,13 @@ def test_a_compensation_and_its_downloads(colour, tmp_path):
         assert files["pattern.exr"] == "image/x-exr"
         assert files["codes.png"] == "image/png"
         light = images.read(tmp_path / "pattern.exr")
-        near(found["pattern"], light)
+        near(reply["pattern"], light)
         codes = np.rint(255 * images.to_srgb(light))
         np.testing.assert_array_equal(images.read_codes(tmp_path / "codes.png"), codes)
         np.testing.assert_array_equal(images.read_codes(tmp_path / "pattern.png"), codes)
         written = json.loads((tmp_path / "report.json").read_text())
         assert (
-            written.items() >= {"picture": "wanted", "error": found["error"], "gain": 1.0}.items()
+            written.items() >= {"picture": "wanted", "error": reply["error"], "gain": 1.0}.items()
         )
 
         brighter = page.ask("compensate", picture=1, gain="auto", bounds=[0, 2])
@@ -248,8 +248,8 @@ def test_uploads_are_relit_and_wrong_ones_refused(colour):
             assert " object at " not in wrong[1]
         for number in range(3, 25):
             upload(page, f"{number}.png", png(codes))
-        kept = page.ask("pictures")["pictures"]
-        assert [each["picture"] for each in kept] == list(range(25 - answers.MAX_UPLOADS, 25))
+        pictures = page.ask("pictures")["pictures"]
+        assert [each["picture"] for each in pictures] == list(range(25 - answers.MAX_UPLOADS, 25))
 
 
 def test_projector_windows_show_what_is_relit_and_compensated(colour):
@@ -259,11 +259,11 @@ def test_projector_windows_show_what_is_relit_and_compensated(colour):
         np.testing.assert_array_equal(window.next()["codes"], np.full((*colour.grid, 1), 255))
         page.ask("relight", {"pattern": codes})
         np.testing.assert_array_equal(window.next()["codes"], codes)
-        found = page.ask("compensate", picture=1, bounds=[0, 2])
+        reply = page.ask("compensate", picture=1, bounds=[0, 2])
         pushed = window.next()
         assert pushed["do"] == "show"
         np.testing.assert_allclose(
-            pushed["codes"], 255 * images.to_srgb(found["pattern"] / 2), atol=0.6
+            pushed["codes"], 255 * images.to_srgb(reply["pattern"] / 2), atol=0.6
         )
 
 
@@ -360,9 +360,9 @@ def test_what_is_asked_again_takes_the_place_of_what_waits_or_runs(colour, slow)
         slow.begun.wait()
         page.send("bounces", count=3)
         last = page.send("bounces", picture=7)
-        while (found := page.next())["do"] == "progress":
+        while (reply := page.next())["do"] == "progress":
             pass
-        assert found.items() >= {"id": last, "do": "bounces"}.items()
+        assert reply.items() >= {"id": last, "do": "bounces"}.items()
         assert slow.steps < 500
 
 

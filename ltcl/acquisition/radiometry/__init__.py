@@ -4,8 +4,7 @@
     exposures       photographs at several exposures, checked
     response        from codes to linear light
     response_fit    the response, estimated from photographs alone
-    noise           noise of a camera, estimated from repeated photographs
-    black_level     level of a camera without light
+    noise           noise and black level of a camera, estimated from photographs
     merge           photographs to radiance, with its variance and its valid pixels
     strips          work on a picture in strips of rows, in parallel
     projector       from codes to the light of the projector, and how its colours mix
@@ -15,9 +14,8 @@ A linear value is light on the sensor, 1 at the largest code; radiance is linear
 
 from __future__ import annotations
 
-from ltcl.acquisition.radiometry.black_level import black_level
 from ltcl.acquisition.radiometry.merge import Radiance, merge
-from ltcl.acquisition.radiometry.noise import NoiseModel, estimate
+from ltcl.acquisition.radiometry.noise import NoiseModel, black_level, estimate
 from ltcl.acquisition.radiometry.projector import mixing, projector_response
 from ltcl.acquisition.radiometry.response import Response
 from ltcl.acquisition.radiometry.response_fit import calibrate

@@ -116,10 +116,12 @@ def exposure_stack(images: Sequence[Any], seconds: Any, levels: int | None = Non
     differences of pixels.
     """
     arrays = check_photographs("images", images)
-    times = checks.finite("seconds", checks.real("seconds", seconds).astype(np.float64))
+    times = checks.real("seconds", seconds).astype(np.float64)
+    checks.finite("seconds", times)
     if times.shape != (len(arrays),) or times.min() <= 0:
         raise InputError(
-            f"seconds is {seconds!r}; it must be {len(arrays)} positive number(s), one an image"
+            f"seconds is {seconds!r}; "
+            f"it must be {len(arrays)} positive number(s), one for each image"
         )
     order = np.argsort(times, kind="stable")
     shape = arrays[0].shape
@@ -139,31 +141,29 @@ def check_photographs(name: str, images: Any) -> tuple[np.ndarray, ...]:
     """Photographs as arrays of one shape and type; another, an empty one and NaN are refused."""
     if len(images) == 0:
         raise InputError(f"{name} holds no photograph; there must be at least one")
-    arrays = tuple(checks.real(f"{name}[{k}]", image) for k, image in enumerate(images))
-    first = arrays[0]
-    if first.ndim not in (2, 3) or first.shape[2:] not in ((), (3,)) or first.size == 0:
-        raise InputError(
-            f"{name}[0] has shape {first.shape}; it must be (H, W) or (H, W, 3), not empty"
-        )
-    if first.dtype.kind != "f" and first.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"{name}[0] holds {first.dtype}; photographs must be uint8, uint16 or float"
-        )
+    arrays = [checks.real(f"{name}[{k}]", image) for k, image in enumerate(images)]
+    shape = arrays[0].shape
+    dtype = arrays[0].dtype
+    is_picture = len(shape) in (2, 3) and shape[2:] in ((), (3,))
+    if not is_picture or arrays[0].size == 0:
+        raise InputError(f"{name}[0] has shape {shape}; it must be (H, W) or (H, W, 3), not empty")
+    if dtype.kind != "f" and dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{name}[0] holds {dtype}; photographs must be uint8, uint16 or float")
     for k, image in enumerate(arrays):
-        checks.shape(f"{name}[{k}]", image, first.shape)
-        if image.dtype != first.dtype:
-            raise InputError(
-                f"{name}[{k}] holds {image.dtype}; it must be {first.dtype}, as {name}[0]"
-            )
-        if image.dtype.kind == "f":
+        checks.shape(f"{name}[{k}]", image, shape)
+        if image.dtype != dtype:
+            raise InputError(f"{name}[{k}] holds {image.dtype}; it must be {dtype}, as {name}[0]")
+        if dtype.kind == "f":
             checks.finite(f"{name}[{k}]", image)
-    return arrays
+    return tuple(arrays)
 
 
 def normalise_codes(codes: np.ndarray, levels: int) -> np.ndarray:
     """Integer codes over the largest, `levels` - 1; floats as they are. float32."""
-    scale = 1.0 if codes.dtype.kind == "f" else 1.0 / (levels - 1)
-    return codes.astype(np.float32) * np.float32(scale)
+    scaled = codes.astype(np.float32)
+    if codes.dtype.kind == "f":
+        return scaled
+    return scaled * np.float32(1.0 / (levels - 1))
 
 
 def code_levels(images: tuple[np.ndarray, ...], levels: int | None) -> int:
@@ -188,7 +188,8 @@ def code_levels(images: tuple[np.ndarray, ...], levels: int | None) -> int:
 def _check_order(stack: ExposureStack, order: np.ndarray) -> None:
     """Refuse a photograph that is not brighter than the one before; `order` has their numbers."""
     codes = stack.codes(ORDER_TEST.max_pixels).astype(np.float64)
-    rounding = 1.0 / max(stack.levels, 1 << 12)  # an allowance of one code
+    # An allowance of one code.
+    rounding = 1.0 / max(stack.levels, 1 << 12)
     for k, (short, long) in enumerate(pairwise(codes)):
         ratio = stack.seconds[k + 1] / stack.seconds[k]
         if _is_brighter(short, long, ratio, rounding):
@@ -209,7 +210,8 @@ def _is_brighter(short: np.ndarray, long: np.ndarray, ratio: float, rounding: fl
 
     # The darkest pixels of a channel may show its offset.
     light = np.minimum(short, long)
-    darkest = np.quantile(np.where(is_clear, light, 1.0), ORDER_TEST.darkest_share, axis=0)
+    clear_light = np.where(is_clear, light, 1.0)
+    darkest = np.quantile(clear_light, ORDER_TEST.darkest_share, axis=0)
     offset = np.where(darkest < ORDER_TEST.max_offset, darkest, 0.0)
     light = (light - offset)[is_clear]
 

@@ -68,8 +68,9 @@ class Radiance:
     def __sub__(self, other: Radiance) -> Radiance:
         """Difference of two pictures, such as one and its black frame; variances add."""
         valid = self.valid & other.valid
+        sum_of_variances = self.variance + other.variance
         value = np.where(valid, self.value - other.value, np.float32(0.0))
-        variance = np.where(valid, self.variance + other.variance, np.float32(np.inf))
+        variance = np.where(valid, sum_of_variances, np.float32(np.inf))
         return Radiance(value, variance, valid)
 
 
@@ -128,7 +129,9 @@ def merge(
     if black is None:
         black = noise.black
     offsets = _channel_offsets(black, channels)
-    mergers = [ChannelMerger(stack, response, noise, offsets[c], c) for c in range(channels)]
+    mergers = []
+    for c, offset in enumerate(offsets):
+        mergers.append(ChannelMerger(stack, response, noise, offset, c))
     value = np.empty((pixels, channels), np.float32)
     variance = np.empty((pixels, channels), np.float32)
     valid = np.empty((pixels, channels), bool)
@@ -180,7 +183,8 @@ class ChannelMerger:
         self.weights = (1.0 / variance).astype(np.float32)
 
         # Radiance whose noise is clipped at neither end of an exposure.
-        low_margin, high_margin = MARGIN * np.sqrt(variance[[0, -1]]).astype(np.float32)
+        deviations = np.sqrt(variance[[0, -1]]).astype(np.float32)
+        low_margin, high_margin = MARGIN * deviations
         self.min_clear = (self.lowest + low_margin) / self.t
         self.max_clear = (self.saturation - high_margin - black) / self.t
 
@@ -197,7 +201,8 @@ class ChannelMerger:
         pilot = light.sum(axis=0) / np.maximum(seconds, TINY)
 
         # Second L: by the weights that the first predicts.
-        is_clear = is_unsaturated & (pilot > self.min_clear) & (pilot < self.max_clear)
+        is_inside = (pilot > self.min_clear) & (pilot < self.max_clear)
+        is_clear = is_unsaturated & is_inside
         value, precision = self._weighted_mean(pilot, is_clear, light)
 
         # Pixels without a clear exposure: those that are not saturated count.
@@ -205,13 +210,14 @@ class ChannelMerger:
         if len(unclear):
             is_usable = is_unsaturated[:, unclear]
             some_light = light[:, unclear]
-            some_value, some_precision = self._weighted_mean(pilot[unclear], is_usable, some_light)
-            some_precision *= (is_usable & (some_light > self.lowest)).any(axis=0)
-            value[unclear] = some_value
-            precision[unclear] = some_precision
+            mean, weight = self._weighted_mean(pilot[unclear], is_usable, some_light)
+            is_above_black = is_usable & (some_light > self.lowest)
+            value[unclear] = mean
+            precision[unclear] = weight * is_above_black.any(axis=0)
 
         valid = precision > 0
-        variance = np.where(valid, 1.0 / np.maximum(precision, TINY), np.float32(np.inf))
+        variance = 1.0 / np.maximum(precision, TINY)
+        variance[~valid] = np.inf
         return value * valid, variance, valid
 
     def _linear(self, codes: np.ndarray) -> np.ndarray:
@@ -226,7 +232,8 @@ class ChannelMerger:
         self, pilot: np.ndarray, is_usable: np.ndarray, light: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """L and sum w t^2, by the weights that the pilot predicts."""
-        index = (self.t * (pilot * np.float32(TABULATED_VALUES - 1))).astype(np.int32)
+        place = self.t * (pilot * np.float32(TABULATED_VALUES - 1))
+        index = place.astype(np.int32)
         weight = self.weights.take(index, mode="clip")
         weight *= is_usable
         weight *= self.t

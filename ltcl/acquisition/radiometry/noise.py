@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Noise of a camera: its model, and the estimate of it from repeated photographs.
+"""Noise and black level of a camera: the model, and its estimates from photographs.
 
     variance = max(x, 0) / electrons + read^2 + (slope / (levels - 1))^2 / 12
 
@@ -10,29 +10,36 @@ variance^2, as samples of a variance have them.
 
 Known limit: noise below 0.4 codes does not show in the variance of whole codes, so that `read` is
 never below 0.2 codes, and in 8 bits electrons may come out 16 % too many.
+
+Black level (`black_level`): under a black projector pixel p has the linear value b + a_p t_k after
+t_k seconds: a level b of its channel, and ambient light a_p. By least squares with weights w_k of
+the mean of each photograph
+
+    b = sum_p (Y0 - Y1 S1 / S2) / sum_p (S0 - S1^2 / S2)
+    Sn = sum_k w_k t_k^n,    Yn = sum_k w_k t_k^n y_pk
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.optimize
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import (
+    MAX_PIXELS,
     MIN_BRIGHTNESS,
     NO_LIGHT,
     check_photographs,
     code_levels,
+    exposure_stack,
     normalise_codes,
 )
+from ltcl.acquisition.radiometry.response import Response
 from ltcl.errors import InputError
-
-if TYPE_CHECKING:
-    from ltcl.acquisition.radiometry.response import Response
 
 # Bins of pixels of equal number: the noise of a variance among their mean is 8 times that of all.
 BINS = 64
@@ -46,7 +53,7 @@ MAX_CLIPPED_SHARE = 0.002
 # More electrons than any pixel holds, for codes without photon noise.
 MAX_ELECTRONS = 1e9
 
-# Standard deviations above the line from which the variance of a bin is no noise alone.
+# Standard deviations above the line from which the variance of a bin is not noise alone.
 OUTLIER_DEVIATIONS = 5.0
 
 # Standard deviation, in codes, that whole codes may hide.
@@ -154,7 +161,9 @@ def estimate(
         statistics.append(_burst_statistics(codes, response))
     bins = _bin_pixels(np.concatenate(statistics, axis=1))
     if len(bins.light) == 0:
-        reason = NO_LIGHT if brightest < MIN_BRIGHTNESS else "other exposures are needed"
+        reason = "other exposures are needed"
+        if brightest < MIN_BRIGHTNESS:
+            reason = NO_LIGHT
         raise InputError(f"bursts have no pixels between black and saturation; {reason}")
     if not levels:
         levels = 0
@@ -234,7 +243,8 @@ def _fit_line(bins: PhotonTransfer, levels: int) -> NoiseModel:
     rounding = np.zeros_like(bins.light)
     if levels:
         rounding = np.maximum(bins.squared_slope, TINY) / (12.0 * (levels - 1) ** 2)
-    columns = np.stack([np.maximum(bins.light, 0.0), np.ones_like(bins.light)], axis=1)
+    light = np.maximum(bins.light, 0.0)
+    columns = np.stack([light, np.ones_like(light)], axis=1)
     min_variance = 1e-3 * bins.variance.mean() + TINY
     unrounded = np.maximum(bins.variance - rounding, 0.0)
     outlier_factor = 1.0 + OUTLIER_DEVIATIONS * np.sqrt(2.0 / bins.freedom)
@@ -246,8 +256,10 @@ def _fit_line(bins: PhotonTransfer, levels: int) -> NoiseModel:
         # Bins far above the line have edges of a scene that moved: weighted by their own variance
         # they hardly count.
         is_outlier = bins.variance > outlier_factor * expected
-        weights = np.sqrt(bins.freedom) / np.where(is_outlier, bins.variance, expected)
-        line, _ = scipy.optimize.nnls(columns * weights[:, None], unrounded * weights)
+        scale = np.where(is_outlier, bins.variance, expected)
+        weights = np.sqrt(bins.freedom) / scale
+        weighted = columns * weights[:, None]
+        line, _ = scipy.optimize.nnls(weighted, unrounded * weights)
         gain, floor = line
         expected = np.maximum(columns @ line + rounding, min_variance)
 
@@ -257,3 +269,69 @@ def _fit_line(bins: PhotonTransfer, levels: int) -> NoiseModel:
         read=float(np.sqrt(max(floor, hidden))),
         levels=levels,
     )
+
+
+def black_level(
+    images: Sequence[Any],
+    seconds: Any,
+    response: Response,
+    noise: NoiseModel,
+    *,
+    levels: int | None = None,
+) -> np.ndarray:
+    """Linear value of a camera without light: the `black` of `merge`.
+
+    Parameters
+    ----------
+    images : sequence of (H, W) or (H, W, 3) arrays
+        Photographs as in `merge`, under a black projector.
+    seconds : sequence of float
+        Their exposures, at least two different ones.
+    response : Response
+        Response of the camera.
+    noise : NoiseModel
+        Noise of the camera; its `black` is not used.
+    levels : int, optional
+        Number of codes of the camera; None for that of the noise model, or all of the type.
+
+    Returns
+    -------
+    (channels,) float64
+
+    Raises
+    ------
+    InputError
+        As in `merge`; also for one exposure only, and if every pixel is saturated in some
+        photograph.
+
+    Examples
+    --------
+    >>> from ltcl.acquisition.radiometry import Response
+    >>> shots = [0.01 + t * np.array([[0.0, 0.1, 0.2]]) for t in (0.5, 1.0, 2.0)]
+    >>> black_level(shots, [0.5, 1.0, 2.0], Response.identity(), NoiseModel()).round(4)
+    array([0.01])
+    """
+    stack = exposure_stack(images, seconds, choose_levels(levels, noise))
+    stack.check_different_exposures(seconds)
+    light = response.linear(stack.codes(MAX_PIXELS))
+    channels = light.shape[2]
+    level = np.empty(channels)
+    for c in range(channels):
+        is_clear = light[..., c].max(axis=0) <= noise.saturation
+        y = light[:, is_clear, c].astype(np.float64)
+        if y.shape[1] == 0:
+            raise InputError(
+                "images are saturated at every pixel; they need shorter exposures or less light"
+            )
+        level[c] = _intercept(stack.seconds, y, noise)
+    return level
+
+
+def _intercept(t: np.ndarray, y: np.ndarray, noise: NoiseModel) -> float:
+    """The common value at 0 seconds of the lines through y (K, pixels) at t (K,)."""
+    w = 1.0 / noise.variance(y.mean(axis=1))
+    S0 = float(np.sum(w))
+    S1 = float(np.sum(w * t))
+    S2 = float(np.sum(w * t**2))
+    pixels = y.shape[1]
+    return np.sum((w - w * t * (S1 / S2)) @ y) / (pixels * (S0 - S1**2 / S2))

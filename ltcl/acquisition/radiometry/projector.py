@@ -74,7 +74,8 @@ def projector_response(codes: Any, channels: Sequence[Sequence[Radiance]]) -> Re
     >>> projector_response(codes, [pictures]).linear(codes).round(4)
     array([0.    , 0.0625, 0.25  , 0.5625, 1.    ], dtype=float32)
     """
-    levels = checks.finite("codes", checks.real("codes", codes).astype(np.float64))
+    levels = checks.real("codes", codes).astype(np.float64)
+    checks.finite("codes", levels)
     if not _rises_from_0_to_1(levels):
         raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
     tables = []
@@ -94,7 +95,7 @@ def _channel_table(codes: np.ndarray, pictures: Sequence[Radiance], name: str) -
     """Light at `TABLE_SIZE` codes, in [0, 1]."""
     if len(pictures) != len(codes):
         raise InputError(
-            f"{name} holds {len(pictures)} picture(s); it must hold {len(codes)}, one a code"
+            f"{name} holds {len(pictures)} picture(s); it must hold {len(codes)}, one for each code"
         )
     is_valid = np.all([picture.valid for picture in pictures], axis=0)
     if not is_valid.any():
@@ -115,7 +116,8 @@ def _channel_table(codes: np.ndarray, pictures: Sequence[Radiance], name: str) -
 
     w = 1.0 / np.maximum(black_variance + white_variance, TINY)
     products = (L[1:-1] - L[0]) * s - black_variance
-    g = (products @ w) / np.sum(w * (s**2 - black_variance - white_variance))
+    squares = s**2 - black_variance - white_variance
+    g = (products @ w) / np.sum(w * squares)
     return _monotone_table(codes, g)
 
 
@@ -123,7 +125,8 @@ def _monotone_table(codes: np.ndarray, g: np.ndarray) -> np.ndarray:
     """Table of the monotone cubic through the light `g` at the codes between 0 and 1."""
     light = np.concatenate([[0.0], np.clip(g, 0.0, 1.0), [1.0]])
     rising = scipy.optimize.isotonic_regression(light).x
-    table = PchipInterpolator(codes, rising)(np.linspace(0.0, 1.0, TABLE_SIZE))
+    curve = PchipInterpolator(codes, rising)
+    table = curve(np.linspace(0.0, 1.0, TABLE_SIZE))
     return np.maximum.accumulate(np.clip(table, 0.0, 1.0))
 
 

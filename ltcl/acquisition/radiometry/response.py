@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
+
+# A function of one plane of an image, and of the table of its channel.
+PlaneFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -39,19 +43,21 @@ class Response:
     values: np.ndarray
 
     def __post_init__(self) -> None:
-        values = np.atleast_2d(checks.real("values", self.values)).astype(np.float64)
-        if values.ndim != 2 or values.shape[0] not in (1, 3) or values.shape[1] < 2:
-            raise InputError(
-                f"values has shape {values.shape}; it must be (1, n) or (3, n), n at least 2"
-            )
+        table = checks.real("values", self.values).astype(np.float64)
+        values = np.atleast_2d(table)
+        shape = values.shape
+        if len(shape) != 2 or shape[0] not in (1, 3) or shape[1] < 2:
+            raise InputError(f"values has shape {shape}; it must be (1, n) or (3, n), n at least 2")
         checks.finite("values", values)
-        if np.diff(values).min() < 0 or not np.all(values[:, -1] > values[:, 0]):
+        is_constant = values[:, -1] <= values[:, 0]
+        if np.diff(values).min() < 0 or np.any(is_constant):
             raise InputError("values falls, or stays the same throughout; a response must rise")
         values.setflags(write=False)
         object.__setattr__(self, "values", values)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}(channels={self.channels}, n={self.values.shape[1]})"
+        channels, n = self.values.shape
+        return f"{type(self).__name__}(channels={channels}, n={n})"
 
     @classmethod
     def identity(cls) -> Response:
@@ -65,48 +71,50 @@ class Response:
 
     def linear(self, image: Any) -> np.ndarray:
         """Linear values of codes (..., [3]) in [0, 1]; float32, same shape."""
-        planes = [_interpolate(codes, table) for codes, table in self._channels(image)]
-        return self._join(planes)
+        return self._map_channels(interpolate, image)
 
     def derivative(self, image: Any) -> np.ndarray:
         """Linear value per code, at codes (..., [3]) in [0, 1]; float32, same shape."""
-        planes = [_slope(codes, table) for codes, table in self._channels(image)]
-        return self._join(planes)
+        return self._map_channels(_slope, image)
 
     def codes(self, linear: Any) -> np.ndarray:
         """Codes (..., [3]) that have these linear values, within [0, 1]; float32, same shape."""
-        codes = np.linspace(0, 1, self.values.shape[1])
-        planes = [np.interp(light, table, codes) for light, table in self._channels(linear)]
-        return self._join(planes)
+        return self._map_channels(_invert, linear)
 
-    def _channels(self, image: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Pairs of a plane and its table: one for each channel, or one for the whole image."""
+    def _map_channels(self, function: PlaneFunction, image: Any) -> np.ndarray:
+        """Apply a function of a plane and its table to each channel, float32.
+
+        A response of one table takes the whole image as one plane.
+        """
         array = checks.real("image", image)
         if array.dtype.kind != "f":
             raise InputError(f"image holds {array.dtype}; codes must be floats, 1 for the largest")
         if self.channels == 1:
-            return [(array, self.values[0])]
+            return np.asarray(function(array, self.values[0]), np.float32)
         if array.shape[-1:] != (3,):
             raise InputError(f"image has shape {array.shape}; this response needs (..., 3)")
-        return [(array[..., c], table) for c, table in enumerate(self.values)]
-
-    def _join(self, planes: list[np.ndarray]) -> np.ndarray:
-        """The inverse of `_channels`: float32 of the shape of the image."""
-        if self.channels == 1:
-            return np.asarray(planes[0], np.float32)
+        planes = []
+        for c, table in enumerate(self.values):
+            planes.append(function(array[..., c], table))
         return np.stack(planes, axis=-1).astype(np.float32)
 
 
-def _interpolate(codes: np.ndarray, table: np.ndarray) -> np.ndarray:
+def interpolate(codes: np.ndarray, table: np.ndarray) -> np.ndarray:
     """Values at codes, which may lie beyond the ends of the table."""
     place, interval = _intervals(codes, table)
-    return table[interval] + (place - interval) * np.diff(table)[interval]
+    step = np.diff(table)[interval]
+    return table[interval] + (place - interval) * step
 
 
 def _slope(codes: np.ndarray, table: np.ndarray) -> np.ndarray:
     """Slope of the table at codes, which may lie beyond its ends."""
     _, interval = _intervals(codes, table)
     return (len(table) - 1) * np.diff(table)[interval]
+
+
+def _invert(light: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Codes at which the table has these values."""
+    return np.interp(light, table, np.linspace(0, 1, len(table)))
 
 
 def _intervals(codes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,11 @@ minimise
 L_p is eliminated, which leaves a quadratic form in the coefficients of f. After the first round it
 is linearised about the codes c' that f and L_p predict, f(c) = f(c') + f'(c') (c - c')
 (Gauss-Newton), so that noise of the codes does not flatten the curve. Exposures whose prediction
-lies within the noise of either end do not count; objects that moved are weighted down by Tukey's
-biweight. Known limit: exposures in equal ratios do not separate f from f times a wobble of that
-period in log f; ratios of 2, 3, 2, 3 are better than 4, 4, 4.
+lies within the noise of saturation do not count. Those near black do: noise that is clipped there
+bends the curve by less than one standard deviation, but without them its dark end is a guess.
+Objects that moved are weighted down by Tukey's biweight. Known limit: exposures in equal ratios do
+not separate f from f times a wobble of that period in log f; ratios of 2, 3, 2, 3 are better than
+4, 4, 4.
 """
 
 from __future__ import annotations
@@ -24,17 +26,17 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.optimize
+import scipy.sparse
 from scipy.interpolate import BSpline
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import (
-    MAX_PIXELS,
     MIN_BRIGHTNESS,
     NO_LIGHT,
     exposure_stack,
 )
 from ltcl.acquisition.radiometry.noise import NoiseModel
-from ltcl.acquisition.radiometry.response import Response
+from ltcl.acquisition.radiometry.response import Response, interpolate
 from ltcl.errors import InputError
 
 # Values of a table of the result.
@@ -52,6 +54,8 @@ class FitSettings:
 
     Attributes
     ----------
+    candidates : int
+        Pixels of the photographs, spread evenly, of which samples are drawn.
     samples : int
         Pixels of a channel (1024: 0.14 %, 4096: 0.08 %).
     min_pixels : int
@@ -63,15 +67,16 @@ class FitSettings:
     smoothness : float
         Weight of a relative change of slope by 1, in units of noise (30: 0.11 %, 1000: 0.07 %).
     margin : float
-        Standard deviations that a prediction keeps from the ends (1: 0.08 %, 4: 0.09 %).
+        Standard deviations that a prediction keeps from saturation (1: 0.08 %, 4: 0.09 %).
     tukey : float
         Standard deviations from which a residual does not count (3: 0.17 %, 8: 0.07 %).
     noise_bins : int
         Bins of light, in which the size of residuals gives the noise.
-    inverse_size : int
-        Codes of the table that inverts the curve: 1/8 code of 8 bits.
+    grid_size : int
+        Codes to linearise about, and of the table that inverts the curve: 1/8 code of 8 bits.
     """
 
+    candidates: int = 1 << 18
     samples: int = 4096
     min_pixels: int = 50
     brightness_bins: int = 64
@@ -80,7 +85,7 @@ class FitSettings:
     margin: float = 2.5
     tukey: float = 5.0
     noise_bins: int = 16
-    inverse_size: int = 2049
+    grid_size: int = 2049
 
 
 SETTINGS = FitSettings()
@@ -156,7 +161,7 @@ def calibrate(
     stack.check_different_exposures(seconds)
     checks.number("saturation", saturation, above=0.0, most=1.0)
     tables = []
-    for codes in np.moveaxis(stack.codes(MAX_PIXELS), -1, 0):
+    for codes in np.moveaxis(stack.codes(SETTINGS.candidates), -1, 0):
         fit = CurveFit(_sample_pixels(codes), stack.seconds, stack.levels, saturation)
         tables.append(_tabulate(fit.run(), TABLE_SIZE))
     return Response(np.stack(tables))
@@ -181,7 +186,8 @@ class CurveFit:
     """Fit of the curve of one channel to codes (K, pixels) in [0, 1].
 
     `theta` are the coefficients of the spline, `weight` the weights of the codes, `near` the codes
-    c' to linearise about, and `offset` f'(c') (c - c').
+    c' to linearise about, as numbers of the grid, and `offset` f'(c') (c - c'). A basis B gives
+    f(codes) = B theta.
     """
 
     def __init__(
@@ -191,15 +197,16 @@ class CurveFit:
         self.t = seconds[:, None]
         self.levels = levels
         self.saturation = saturation
-        self.grid = np.linspace(0.0, 1.0, SETTINGS.inverse_size)
+        self.grid = np.linspace(0.0, 1.0, SETTINGS.grid_size)
+        self.grid_basis = _basis(self.grid)
         lowest = 0.5 / (levels - 1) if levels else 0.0
         self.is_usable = (codes <= saturation) & (codes > lowest)
         self._check_pixels()
         self.theta = GREVILLE_ABSCISSAE
         # First round: errors of 5 % of the code, and of a thousandth of full scale.
         self.weight = self.is_usable / (0.05 * (0.02 + codes)) ** 2
-        self.near = codes
-        self.offset = np.zeros_like(codes)
+        self.near = self._nearest(codes)
+        self.offset = codes - self.grid[self.near]
 
     def run(self) -> np.ndarray:
         """Coefficients of the curve."""
@@ -230,26 +237,31 @@ class CurveFit:
                 "each other, or a scene with more between"
             )
 
+    def _nearest(self, codes: np.ndarray) -> np.ndarray:
+        """Numbers of the codes of the grid that are nearest."""
+        return np.rint(codes * (len(self.grid) - 1)).astype(np.intp)
+
     def _linearise(self) -> None:
         """Predict codes from curve and light; set weights and linearisation of the next round."""
         grid = self.grid
-        table = _tabulate(self.theta, SETTINGS.inverse_size)
-        light = np.interp(self.near, grid, table) + self.offset
+        table = self.grid_basis @ self.theta
+        light = table[self.near] + self.offset
         squares = np.maximum((self.weight * self.t**2).sum(axis=0), TINY)
-        x = (self.weight * self.t * light).sum(axis=0) / squares * self.t  # L_p t_k
+        L = (self.weight * self.t * light).sum(axis=0) / squares
+        x = L * self.t
 
-        self.near = np.interp(x, table, grid)
-        slope = np.interp(self.near, grid, np.gradient(table, grid))
-        self.offset = slope * (self.codes - self.near)
+        self.near = self._nearest(np.interp(x, table, grid))
+        slope = np.gradient(table, grid)[self.near]
+        self.offset = slope * (self.codes - grid[self.near])
 
-        residual = np.interp(self.codes, grid, table) - x
-        is_inside = self.is_usable & (self.near < self.saturation)
+        residual = interpolate(self.codes, table) - x
+        is_inside = self.is_usable & (grid[self.near] < self.saturation)
         noise = _residual_noise(residual[is_inside], x[is_inside], slope[is_inside], self.levels)
         sigma = np.sqrt(noise.variance(x, slope))
-        low, high = np.interp([0.0, self.saturation], grid, table)
-        margin = SETTINGS.margin * sigma
-        is_clear = self.is_usable & (x + margin < high) & (x - margin > low)
-        biweight = np.clip(1.0 - (residual / (SETTINGS.tukey * sigma)) ** 2, 0.0, 1.0) ** 2
+        high = np.interp(self.saturation, grid, table)
+        is_clear = self.is_usable & (x + SETTINGS.margin * sigma < high)
+        deviation = residual / (SETTINGS.tukey * sigma)
+        biweight = np.clip(1.0 - deviation**2, 0.0, 1.0) ** 2
         self.weight = is_clear * biweight / sigma**2
 
     def _fit_curve(self) -> np.ndarray:
@@ -264,13 +276,15 @@ class CurveFit:
         M = M + SETTINGS.smoothness * D.T @ D
 
         # Non-negative least squares in steps d between coefficients, theta = value + P d.
-        anchor = _design(np.quantile(self.near[self.weight > 0], [0.75]))
+        anchor_code = np.quantile(self.grid[self.near[self.weight > 0]], [0.75])
+        anchor = _basis(anchor_code).toarray()
         value = float((anchor @ self.theta)[0])
         P = np.tril(np.ones((SPLINE_SIZE, SPLINE_SIZE)), -1)[:, :-1]
         P = P - anchor @ P
         H = P.T @ M @ P
         constant = np.full(SPLINE_SIZE, value)
-        g = -P.T @ (M @ constant + v) - H @ np.full(SPLINE_SIZE - 1, MIN_STEP)
+        least_steps = np.full(SPLINE_SIZE - 1, MIN_STEP)
+        g = -P.T @ (M @ constant + v) - H @ least_steps
         scale = 1.0 / np.sqrt(np.diagonal(H))
         scaled = H * scale * scale[:, None]
         root = scipy.linalg.cholesky(scaled + RIDGE * np.eye(SPLINE_SIZE - 1))
@@ -282,20 +296,29 @@ class CurveFit:
     def _quadratic_form(self) -> tuple[np.ndarray, np.ndarray]:
         """M and v of the residuals, with all L_p eliminated."""
         w = self.weight
-        t = self.t
-        B = _design(self.near.ravel())
-        C = ((w * t)[:, :, None] * B.reshape(*self.near.shape, SPLINE_SIZE)).sum(axis=0)
-        inverse = 1.0 / np.maximum((w * t**2).sum(axis=0), TINY)
-        M = B.T @ (w.reshape(-1, 1) * B) - C.T @ (inverse[:, None] * C)
-        light_offset = inverse * (w * t * self.offset).sum(axis=0)
+        B = self.grid_basis[self.near.ravel()]
+        C = (self._sum_over_exposures(w * self.t) @ B).toarray()
+        inverse = 1.0 / np.maximum((w * self.t**2).sum(axis=0), TINY)
+        weighted = B * w.reshape(-1, 1)
+        M = (B.T @ weighted).toarray() - C.T @ (inverse[:, None] * C)
+        light_offset = inverse * (w * self.t * self.offset).sum(axis=0)
         v = B.T @ (w * self.offset).ravel() - C.T @ light_offset
         return M, v
 
+    def _sum_over_exposures(self, factors: np.ndarray) -> scipy.sparse.csr_array:
+        """The matrix that sums values (K pixels), times `factors` (K, pixels), for each pixel."""
+        exposures, pixels = factors.shape
+        columns = np.arange(pixels)[:, None] + pixels * np.arange(exposures)
+        ends = exposures * np.arange(pixels + 1)
+        return scipy.sparse.csr_array((factors.T.ravel(), columns.ravel(), ends))
+
     def _slope_changes(self) -> np.ndarray:
         """D with the changes of slope D @ theta, relative to the slopes of the round before."""
-        slopes = np.diff(np.eye(SPLINE_SIZE), axis=0) / np.diff(GREVILLE_ABSCISSAE)[:, None]
+        steps = np.diff(GREVILLE_ABSCISSAE)
+        slopes = np.diff(np.eye(SPLINE_SIZE), axis=0) / steps[:, None]
         size = np.maximum(slopes @ self.theta, 1e-3)
-        return np.diff(slopes, axis=0) / np.minimum(size[1:], size[:-1])[:, None]
+        smaller = np.minimum(size[1:], size[:-1])
+        return np.diff(slopes, axis=0) / smaller[:, None]
 
 
 def _residual_noise(
@@ -305,29 +328,33 @@ def _residual_noise(
 
     Unlike `estimate` of repeated photographs, there is one sample of each pixel, and outliers.
     """
-    bins = [pixels for pixels in np.array_split(np.argsort(x), SETTINGS.noise_bins) if len(pixels)]
-    if len(bins) < 2:
+    if len(x) < 2:
         return NoiseModel(levels=levels)
+    count = min(SETTINGS.noise_bins, len(x))
+    bins = np.array_split(np.argsort(x), count)
     rounding_model = NoiseModel(read=0.0, levels=levels)
     variance = np.empty(len(bins))
     light = np.empty(len(bins))
     rounding = np.empty(len(bins))
     for k, pixels in enumerate(bins):
-        variance[k] = (DEVIATION_OF_MEDIAN * np.median(np.abs(residual[pixels]))) ** 2
+        median = np.median(np.abs(residual[pixels]))
+        variance[k] = (DEVIATION_OF_MEDIAN * median) ** 2
         light[k] = max(x[pixels].mean(), 0.0)
         rounding[k] = rounding_model.variance(0.0, slope[pixels]).mean()
     variance = np.maximum(variance, rounding + 1e-12)
-    columns = np.stack([light, np.ones_like(light)], axis=1) / variance[:, None]
-    (gain, floor), _ = scipy.optimize.nnls(columns, 1.0 - rounding / variance)
-    return NoiseModel(electrons=1.0 / max(gain, 1e-9), read=float(np.sqrt(floor)), levels=levels)
+    columns = np.stack([light / variance, 1.0 / variance], axis=1)
+    line, _ = scipy.optimize.nnls(columns, 1.0 - rounding / variance)
+    gain, floor = line
+    electrons = 1.0 / max(gain, 1e-9)
+    return NoiseModel(electrons=electrons, read=float(np.sqrt(floor)), levels=levels)
 
 
-def _design(codes: np.ndarray) -> np.ndarray:
-    """B with curve(codes) = B @ theta: (len(codes), SPLINE_SIZE)."""
+def _basis(codes: np.ndarray) -> scipy.sparse.csr_array:
+    """B with curve(codes) = B @ theta: (len(codes), SPLINE_SIZE), four numbers in a row."""
     clipped = np.clip(codes, 0.0, 1.0)
-    return BSpline.design_matrix(clipped, KNOTS, SPLINE_DEGREE).toarray()
+    return BSpline.design_matrix(clipped, KNOTS, SPLINE_DEGREE)
 
 
 def _tabulate(theta: np.ndarray, count: int) -> np.ndarray:
     """Values of the curve at `count` equally spaced codes."""
-    return _design(np.linspace(0.0, 1.0, count)) @ theta
+    return _basis(np.linspace(0.0, 1.0, count)) @ theta

@@ -9,6 +9,7 @@ survey          what a live rig measures before its first photograph
 cameras         cameras that OpenCV or gphoto2 opens
 display         a display in full screen; `show` of a folder of patterns there
 photographs     files of a camera as codes
+memory_card     the order in which a camera took its files
 simulated       sensor and projector curve of a computed scene
 virtual         a scene of known light transport
 camera_maps     parts of projector pixels that camera pixels see

@@ -59,9 +59,11 @@ def camera_map(
         x, y, _ = np.broadcast_arrays(*place(u + du, v + dv), u)
         column = np.floor(x + 0.5).ravel()
         row = np.floor(y + 0.5).ravel()
-        is_hit = (column >= 0) & (column < w) & (row >= 0) & (row < h)  # NaN hits nothing
+        # NaN hits nothing.
+        is_hit = (column >= 0) & (column < w) & (row >= 0) & (row < h)
         camera_pixels = np.flatnonzero(is_hit)
-        projector_pixels = (row[is_hit] * w + column[is_hit]).astype(np.int64)
+        projector_pixels = row[is_hit] * w + column[is_hit]
+        places = camera_pixels, projector_pixels.astype(np.int64)
         ones = np.ones(len(camera_pixels))
-        C = C + scipy.sparse.csr_array((ones, (camera_pixels, projector_pixels)), shape=C.shape)
+        C = C + scipy.sparse.csr_array((ones, places), shape=C.shape)
     return scipy.sparse.csr_array(C / points**2)

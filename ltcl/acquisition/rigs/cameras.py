@@ -72,6 +72,8 @@ class OpenCVCamera(Closing):
         Exposure of a camera that cannot set it: streams, and cameras without V4L2.
     size : (int, int), optional
         Height and width of frames; None for the camera's default.
+    white_level : int, optional
+        Code from which on pixels are saturated; None for the largest code.
 
     Raises
     ------
@@ -91,6 +93,7 @@ class OpenCVCamera(Closing):
         channels: int = 3,
         seconds: float | None = None,
         size: tuple[int, int] | None = None,
+        white_level: int | None = None,
     ) -> None:
         self.channels = checks.one_of("channels", channels, (1, 3))
         if not isinstance(source, int | str | os.PathLike):
@@ -102,6 +105,7 @@ class OpenCVCamera(Closing):
         if seconds is not None:
             self.exposures = (checks.number("seconds", seconds, above=0.0),)
         self.limits = (SHORTEST, LONGEST)
+        self.white_level = _check_white_level(white_level)
         if size is not None:
             size = checks.grid("size", size)
         self._capture = cv2.VideoCapture(self.source)
@@ -150,6 +154,7 @@ class OpenCVCamera(Closing):
             "backend": self._backend,
             "channels": self.channels,
             "exposures": self.exposures,
+            "white_level": self.white_level,
         }
 
     def close(self) -> None:
@@ -200,7 +205,7 @@ class OpenCVCamera(Closing):
         before = self._capture.get(setting)
         self._capture.set(setting, value)
         actual = self._capture.get(setting)
-        is_missing = before == UNKNOWN_PROPERTY and actual == UNKNOWN_PROPERTY
+        is_missing = before == actual == UNKNOWN_PROPERTY
         if actual != value and not is_missing:
             raise AcquisitionError(
                 f"automatic {name} of {self.source!r} cannot be switched off: "
@@ -217,6 +222,8 @@ class GPhoto2Camera(Closing):
     ----------
     channels : 1 or 3
         One channel is the green one.
+    white_level : int, optional
+        Code from which on pixels are saturated; None for the largest code.
 
     Raises
     ------
@@ -227,8 +234,9 @@ class GPhoto2Camera(Closing):
 
     stream = False
 
-    def __init__(self, channels: int = 3) -> None:
+    def __init__(self, channels: int = 3, *, white_level: int | None = None) -> None:
         self.channels = checks.one_of("channels", channels, (1, 3))
+        self.white_level = _check_white_level(white_level)
         self._gphoto2 = load_extra("gphoto2", "camera", "a camera on a cable")
         self._camera = self._gphoto2.Camera()
         self._seconds: float | None = None
@@ -265,14 +273,19 @@ class GPhoto2Camera(Closing):
             with self._refusing("photograph"):
                 place = self._camera.capture(gphoto2.GP_CAPTURE_IMAGE)
                 path = Path(folder) / Path(place.name).name
-                file = self._camera.file_get(place.folder, place.name, gphoto2.GP_FILE_TYPE_NORMAL)
+                kind = gphoto2.GP_FILE_TYPE_NORMAL
+                file = self._camera.file_get(place.folder, place.name, kind)
                 file.save(str(path))
                 self._camera.file_delete(place.folder, place.name)
             return read_photograph("the camera's file", path, self.channels, self._seconds)
 
     def describe(self) -> dict[str, Any]:
         """The camera as plain JSON."""
-        facts: dict[str, Any] = {"kind": "gphoto2", "channels": self.channels}
+        facts: dict[str, Any] = {
+            "kind": "gphoto2",
+            "channels": self.channels,
+            "white_level": self.white_level,
+        }
         for name in DESCRIBED_SETTINGS:
             value = self._value(name)
             if value is not None:
@@ -310,7 +323,8 @@ class GPhoto2Camera(Closing):
         """Choices of the shutter that are an exposure, by their seconds."""
         choices = {}
         if self._shutter:
-            for choice in self._camera.get_single_config(self._shutter).get_choices():
+            widget = self._camera.get_single_config(self._shutter)
+            for choice in widget.get_choices():
                 seconds = _shutter_seconds(str(choice))
                 if seconds > 0:
                     choices[seconds] = str(choice)
@@ -333,6 +347,12 @@ class GPhoto2Camera(Closing):
             return str(self._camera.get_single_config(name).get_value())
         except self._gphoto2.GPhoto2Error:
             return None
+
+
+def _check_white_level(level: Any) -> int | None:
+    if level is None:
+        return None
+    return checks.count("white_level", level, most=65535)
 
 
 def _shutter_seconds(choice: str) -> float:

@@ -21,6 +21,7 @@ import numpy as np
 from ltcl import checks, images
 from ltcl.acquisition.rig import Closing, as_codes, load_extra
 from ltcl.acquisition.rigs.folder import FolderRig, enlarge
+from ltcl.acquisition.rigs.memory_card import number_key
 from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.files import as_path
@@ -28,6 +29,14 @@ from ltcl.images.frames import open_frames
 
 # Seconds between two looks for a key or a photograph.
 POLL_SECONDS = 0.05
+
+# Drivers of SDL whose display nobody sees, which it takes without a desktop, and the variables that
+# ask for a driver.
+INVISIBLE_DRIVERS = ("dummy", "offscreen", "evdev")
+DRIVER_VARIABLES = ("SDL_VIDEODRIVER", "SDL_VIDEO_DRIVER")
+
+# The report of 'ltcl compensate', in whose folder some pictures are patterns, and others not.
+COMPENSATION_REPORT = "compensate.json"
 
 
 class Display(Closing):
@@ -75,7 +84,8 @@ class Display(Closing):
             levels = levels[..., None]
         levels = np.broadcast_to(levels, (*self.size, 3))
         # pygame counts pixels (x, y).
-        self._pygame.surfarray.blit_array(self._screen, levels.swapaxes(0, 1))
+        transposed = levels.swapaxes(0, 1)
+        self._pygame.surfarray.blit_array(self._screen, transposed)
         self._pygame.display.flip()
 
     def key_pressed(self) -> bool:
@@ -89,7 +99,8 @@ class Display(Closing):
         is_pressed = False
         for event in pygame.event.get():
             is_key = event.type == pygame.KEYDOWN
-            if event.type == pygame.QUIT or (is_key and event.key == pygame.K_ESCAPE):
+            is_escape = is_key and event.key == pygame.K_ESCAPE
+            if is_escape or event.type == pygame.QUIT:
                 self.close()
                 raise AcquisitionError("the display was closed by its window or the Escape key")
             is_pressed |= is_key
@@ -97,7 +108,12 @@ class Display(Closing):
 
     def describe(self) -> dict[str, Any]:
         """The display as plain JSON."""
-        return {"kind": "display", "index": self.index, "size": self.size, "period": self.period}
+        return {
+            "kind": "display",
+            "index": self.index,
+            "size": self.size,
+            "period": self.period,
+        }
 
     def close(self) -> None:
         """Release the display; it cannot show anything afterwards."""
@@ -107,14 +123,17 @@ class Display(Closing):
     def _open(self, index: int | None) -> None:
         display = self._pygame.display
         display.init()
+        _check_visible(display.get_driver())
         sizes = display.get_desktop_sizes()
         self.index = _choose_display(index, sizes)
         w, h = sizes[self.index]
         self.size = (h, w)
-        enlarge(np.zeros(self.grid), self.size)  # refuses a grid that does not fit
+        # Refuses a grid that does not fit.
+        enlarge(np.zeros(self.grid), self.size)
         rate = display.get_desktop_refresh_rates()[self.index]
         self.period = 1.0 / rate if rate > 0 else None
-        self._screen = display.set_mode((w, h), self._pygame.FULLSCREEN, display=self.index)
+        mode = self._pygame.FULLSCREEN
+        self._screen = display.set_mode((w, h), mode, display=self.index)
         actual_size = self._screen.get_size()
         if actual_size != (w, h):
             raise AcquisitionError(
@@ -124,6 +143,17 @@ class Display(Closing):
         display.set_allow_screensaver(False)
 
 
+def _check_visible(driver: str) -> None:
+    """Refuse a driver without a display, unless the environment asks for it."""
+    drivers = ",".join(os.environ.get(variable, "") for variable in DRIVER_VARIABLES)
+    is_asked_for = driver.lower() in drivers.lower().split(",")
+    if driver.lower() in INVISIBLE_DRIVERS and not is_asked_for:
+        raise AcquisitionError(
+            f"no display can be opened: there is no desktop, and SDL's driver {driver!r} shows "
+            "nothing; start it on the desktop, or use --browser"
+        )
+
+
 def _choose_display(index: int | None, sizes: list[tuple[int, int]]) -> int:
     """Number of a display among those of `sizes` (w, h); None is the second or the only one."""
     if index is None:
@@ -131,10 +161,11 @@ def _choose_display(index: int | None, sizes: list[tuple[int, int]]) -> int:
     else:
         chosen = checks.count("index", index, least=0)
     if chosen not in range(len(sizes)):
-        offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes))
-        if not offered:
-            offered = "none"
-        raise InputError(f"index is {index}, of {offered}; a projector must extend the desktop")
+        offered = [f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes)]
+        displays = ", ".join(offered) if offered else "none"
+        raise InputError(
+            f"index is {index}; the displays are {displays}: a projector must extend the desktop"
+        )
     return chosen
 
 
@@ -151,7 +182,7 @@ def show(
     folder : path
         Folder of a `FolderRig`, whose patterns come in the order of the shooting list, without
         those that are photographed already; or a folder of pictures, in the order of the numbers in
-        their names; or one picture.
+        their names, of which only the patterns if 'ltcl compensate' wrote it; or one picture.
     display : int or object
         Number of the display, from 0; or an open one, or any object with `show(codes)` and
         `key_pressed()`.
@@ -177,7 +208,7 @@ def show(
     --------
     >>> show("nowhere")
     Traceback (most recent call last):
-    ltcl.errors.FileError: nowhere: has no shooting list, which 'ltcl acquire run' writes
+    ltcl.errors.FileError: nowhere: no such file or folder
     """
     folder = as_path(folder)
     if not isinstance(advance, str):
@@ -195,8 +226,10 @@ def show(
         return 0
 
     h, w = images.read(folder / shots[0].pattern).shape[:2]
-    is_open = hasattr(display, "show")
-    with contextlib.nullcontext(display) if is_open else Display((h, w), index=display) as screen:
+    opened: Any = contextlib.nullcontext(display)
+    if not hasattr(display, "show"):
+        opened = Display((h, w), index=display)
+    with opened as screen:
         for done, shot in enumerate(shots):
             screen.show(images.read(folder / shot.pattern, encoding="linear"))
             if progress is not None:
@@ -210,10 +243,20 @@ def _shots_to_show(rig: FolderRig, advance: str | float) -> list[Shot]:
     if rig.shots:
         return [rig.shots[number - 1] for number in rig.missing()]
     folder: Path = rig.folder
+    if not folder.exists():
+        raise FileError(f"{folder}: no such file or folder")
     has_project = (folder / "acquisition.toml").exists()
     if advance == "arrival" or not folder.is_dir() or has_project:
         raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
-    return [Shot(frame.number, frame.name, 0.0, "") for frame in open_frames(folder)]
+    shots = []
+    if (folder / COMPENSATION_REPORT).exists():
+        patterns = sorted(folder.glob("*_pattern.png"), key=number_key)
+        for number, path in enumerate(patterns, start=1):
+            shots.append(Shot(number, path.name, 0.0, ""))
+        return shots
+    for frame in open_frames(folder):
+        shots.append(Shot(frame.number, frame.name, 0.0, ""))
+    return shots
 
 
 def _wait_for_next(screen: Any, rig: FolderRig, shot: Shot, advance: str | float) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition.rig import as_exposures, as_shot, shot_key
+from ltcl.acquisition.rigs.memory_card import in_order_of_capture
 from ltcl.acquisition.rigs.photographs import (
     PHOTOGRAPH_KINDS,
     PHOTOGRAPH_SUFFIXES,
@@ -56,6 +57,8 @@ class FolderRig:
         Bits of the pattern files.
     camera_bits : int, optional
         Bits in use in photographs of 16 bits; None for all.
+    white_level : float, optional
+        Code of photographs from which on pixels are saturated; None for the largest code.
     exposures : sequence of float, optional
         Seconds that the camera offers, ascending; None for any.
     projector : (int, int), optional
@@ -95,6 +98,7 @@ class FolderRig:
         *,
         pattern_bits: int = 8,
         camera_bits: int | None = None,
+        white_level: float | None = None,
         exposures: Any = None,
         projector: tuple[int, int] | None = None,
     ) -> None:
@@ -106,6 +110,9 @@ class FolderRig:
         self.bits = camera_bits
         if camera_bits is not None:
             self.bits = checks.count("camera_bits", camera_bits, least=9, most=16)
+        self.white_level = white_level
+        if white_level is not None:
+            checks.number("white_level", white_level, above=0.0)
         self.exposures = as_exposures("exposures", exposures)
         self.number = 0
         self._pattern_bits = checks.one_of("pattern_bits", pattern_bits, (8, 16))
@@ -159,7 +166,9 @@ class FolderRig:
         self._save()
         path = self._find_photograph(shot)
         name = f"photograph {shot.number} ({path.name})"
-        image = read_photograph(name, path, self.channels, shot.seconds)
+        image = read_photograph(
+            name, path, self.channels, shot.seconds, white_level=self.white_level
+        )
         self._photographed[key] += 1
         self.number = shot.number
         return image
@@ -173,13 +182,15 @@ class FolderRig:
     def missing(self) -> tuple[int, ...]:
         """Numbers on the list whose photographs are still missing."""
         self._files = self._list_photographs()
-        return tuple(shot.number for shot in self.shots if shot.number not in self._files)
+        numbers = [shot.number for shot in self.shots]
+        return tuple(number for number in numbers if number not in self._files)
 
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in place of those that are missing.
 
-        They are taken in the order of the numbers in their names. Files that were copied before are
-        left out: a memory card need not be emptied. Nothing is copied on an error.
+        They are taken in the order in which they were photographed (`memory_card`). Files that were
+        copied before are left out: a memory card need not be emptied. Nothing is copied on an
+        error.
 
         Parameters
         ----------
@@ -189,13 +200,13 @@ class FolderRig:
         Raises
         ------
         InputError
-            The number of files is another.
+            The number of files is another, or their order is not known.
         FileError
-            One is no photograph.
+            One is not a photograph.
         """
         numbers = self.missing()
         unique_files = dict.fromkeys(map(input_file, files))
-        paths = self._new_files(sorted(unique_files, key=_number_order))
+        paths = self._new_files(unique_files)
         if len(paths) != len(numbers):
             missing = f"{len(numbers)} are missing"
             if numbers:
@@ -218,6 +229,7 @@ class FolderRig:
             "projector": self._projector,
             "pattern_bits": self._pattern_bits,
             "camera_bits": self.bits,
+            "white_level": self.white_level,
             "exposures": self.exposures,
             "channels": self.channels,
         }
@@ -226,7 +238,8 @@ class FolderRig:
         """Put a shot on the list and its pattern in the folder, unless they are there."""
         codes, seconds = as_shot(self, codes, seconds)
         # The hash is that of the projected levels: shots that differ by less are the same.
-        levels = np.rint(codes * ((1 << self._pattern_bits) - 1)).astype("<u2")
+        largest_level = (1 << self._pattern_bits) - 1
+        levels = np.rint(codes * largest_level).astype("<u2")
         size = () if self._projector is None else self._projector
         key = ShotKey(shot_key(levels, *size), seconds)
         is_new = not self._list.has_pattern(key)
@@ -282,13 +295,14 @@ class FolderRig:
         )
         return PhotographMissing(text, shot.number, shot, len(missing))
 
-    def _new_files(self, files: list[Path]) -> list[Path]:
-        """Files that were not copied before; FileError for one that is no photograph."""
+    def _new_files(self, files: Iterable[Path]) -> list[Path]:
+        """Files that were not copied before, in order; FileError for one of another kind."""
         copied = [path for paths in self._files.values() for path in paths]
-        new = []
         for path in files:
             if path.suffix.lower() not in PHOTOGRAPH_SUFFIXES:
-                raise FileError(f"{path}: is no photograph; it must be {PHOTOGRAPH_KINDS}")
+                raise FileError(f"{path}: is not a photograph; it must be {PHOTOGRAPH_KINDS}")
+        new = []
+        for path in in_order_of_capture(list(files)):
             twin = _find_equal(path, copied)
             if twin is None:
                 new.append(path)
@@ -316,11 +330,6 @@ def _margins(pixels: int) -> tuple[int, int]:
     """Margins before and after a centred picture."""
     before = pixels // 2
     return before, pixels - before
-
-
-def _number_order(path: Path) -> str:
-    """Key to sort by: numbers in names compare as numbers."""
-    return re.sub("[0-9]+", lambda digits: digits[0].zfill(20), path.name)
 
 
 def _find_equal(path: Path, files: list[Path]) -> Path | None:

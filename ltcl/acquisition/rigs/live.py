@@ -62,7 +62,7 @@ MAX_PERIOD_DEVIATION = 0.02
 
 # Periods of the exposures that are offered: 2^k and 3 2^k, 1, 2, 3, 4, 6, 8, 12, ...
 POWERS_OF_TWO = [1 << k for k in range(20)]
-PERIOD_COUNTS = sorted([*POWERS_OF_TWO, *(3 * power for power in POWERS_OF_TWO)])
+PERIOD_COUNTS = sorted(POWERS_OF_TWO + [3 * power for power in POWERS_OF_TWO])
 
 
 class LiveRig(Closing):
@@ -75,7 +75,8 @@ class LiveRig(Closing):
         frames come by themselves and may wait in a queue; `expose(seconds)`; and `frame()`, which
         returns uint8, uint16 or float, (H, W) or (H, W, 3). Optional members: `exposures`, seconds,
         ascending (else any within `limits`, else 1e-4 to 30); `bits` of uint16 (else 16);
-        `describe()`, a dict of plain JSON; `close()`.
+        `white_level`, the code of saturated pixels (else the largest); `describe()`, a dict of
+        plain JSON; `close()`.
     display : object
         `Display`, or any object with `grid`, `period` and `show(codes)`.
     period : "display", float or None
@@ -111,7 +112,9 @@ class LiveRig(Closing):
         self.projector_grid = checks.grid("display.grid", display.grid)
         self.channels = checks.one_of("camera.channels", camera.channels, (1, 3))
         self.bits = getattr(camera, "bits", None)
-        self.exposures = as_exposures("camera.exposures", getattr(camera, "exposures", None))
+        self.white_level = getattr(camera, "white_level", None)
+        exposures = getattr(camera, "exposures", None)
+        self.exposures = as_exposures("camera.exposures", exposures)
         self._period = _check_period(period, display)
         if self._period is not None:
             limits = getattr(camera, "limits", (SHORTEST, LONGEST))
@@ -189,7 +192,10 @@ class LiveRig(Closing):
 
     def _measure(self) -> Survey:
         tests = SurveyTests(
-            self._link, self.exposures, patience=self._patience, max_drift=self._max_drift
+            self._link,
+            self.exposures,
+            patience=self._patience,
+            max_drift=self._max_drift,
         )
         return tests.run()
 
@@ -199,7 +205,9 @@ class LiveRig(Closing):
         last_frame = self._last_frame
         self._last_codes = None
         self._last_frame = None
-        has_new_codes = last_codes is None or not np.array_equal(last_codes, codes)
+        has_new_codes = True
+        if last_codes is not None:
+            has_new_codes = not np.array_equal(last_codes, codes)
         has_new_exposure = self._link.seconds != seconds
         self._link.expose(seconds)
         if has_new_codes:
@@ -229,15 +237,18 @@ class LiveRig(Closing):
         change = 0.0
         for _ in range(MAX_TRIALS + MAX_TWINS):
             second = self._link.frame()
-            twins = twins + 1 if np.array_equal(first.codes, second.codes) else 0
+            if np.array_equal(first.codes, second.codes):
+                twins += 1
+            else:
+                twins = 0
             change = largest_change(first, second)
             may_be_repeated = 0 < twins <= MAX_TWINS
             if change <= survey.tolerance and not may_be_repeated:
                 return second
             first = second
         raise AcquisitionError(
-            f"frames still change by {change:.1%} of full scale, {survey.tolerance:.1%} is noise: "
-            "half-changed frames, flicker, or something moves"
+            f"frames still change by {change:.1%} of full scale, noise explains "
+            f"{survey.tolerance:.1%}: half-changed frames, flicker, or something moves"
         )
 
     def _frame_after_flash(
@@ -260,9 +271,11 @@ class LiveRig(Closing):
             frame = self._steady_frame(survey)
             if not is_visible:
                 return frame
-            flash = min(largest_change(between, before), largest_change(between, frame))
-            is_flash_seen = flash > survey.tolerance
-            if is_flash_seen and largest_change(frame, before) <= survey.tolerance:
+            flash_begin = largest_change(between, before)
+            flash_end = largest_change(between, frame)
+            is_flash_seen = min(flash_begin, flash_end) > survey.tolerance
+            is_same = largest_change(frame, before) <= survey.tolerance
+            if is_flash_seen and is_same:
                 return frame
             self._latency = max(self._latency, self._patience)
         raise AcquisitionError(
@@ -271,7 +284,8 @@ class LiveRig(Closing):
 
     def _random_blocks(self) -> np.ndarray:
         h, w = self.projector_grid
-        blocks = self._random.integers(0, 2, (FLASH_BLOCKS, FLASH_BLOCKS)).astype(np.float32)
+        size = (FLASH_BLOCKS, FLASH_BLOCKS)
+        blocks = self._random.integers(0, 2, size).astype(np.float32)
         return cv2.resize(blocks, (w, h), interpolation=cv2.INTER_NEAREST)
 
     def _check_brightness(self, key: str, frame: CapturedFrame) -> None:
@@ -305,8 +319,9 @@ def _whole_periods(
     """Exposures that are whole periods: of those that the camera offers, else within its limits."""
     if exposures is None:
         least, most = limits
-        multiples = [count * period for count in PERIOD_COUNTS]
-        exposures = tuple(t for t in multiples if least <= t <= most * (1 + 1e-9))
+        multiples = period * np.array(PERIOD_COUNTS)
+        is_possible = (multiples >= least) & (multiples <= most * (1 + 1e-9))
+        exposures = tuple(multiples[is_possible].tolist())
     whole = []
     for seconds in exposures:
         nearest = max(round(seconds / period), 1) * period

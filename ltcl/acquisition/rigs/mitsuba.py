@@ -46,11 +46,14 @@ BRIGHT_VALUE = 0.5
 
 def _trihedral_walls() -> tuple[Any, ...]:
     """Three walls around the origin, whose edges lean towards the viewer."""
+    across = math.sqrt(2 / 3)
+    along = math.sqrt(1 / 3)
     edges = []
     for angle in np.pi * np.array([3, 7, 11]) / 6:
-        across = math.sqrt(2 / 3)
-        edges.append((across * math.cos(angle), across * math.sin(angle), math.sqrt(1 / 3)))
-    return tuple(((0, 0, 0), edges[k], edges[(k + 1) % 3]) for k in range(3))
+        edges.append((across * math.cos(angle), across * math.sin(angle), along))
+    a, b, c = edges
+    origin = (0, 0, 0)
+    return (origin, a, b), (origin, b, c), (origin, c, a)
 
 
 HALF = math.sqrt(1 / 2)
@@ -109,7 +112,7 @@ class MitsubaRig(SimulatedRig):
     InputError, InputTypeError
         An argument or the scene cannot be used.
     FileError
-        The scene is no file.
+        The file of the scene is missing.
     AcquisitionError
         Mitsuba is not installed.
 
@@ -135,7 +138,8 @@ class MitsubaRig(SimulatedRig):
         **sensor: Any,
     ) -> None:
         grid = checks.grid("projector_grid", projector_grid)
-        super().__init__(grid, checks.one_of("channels", channels, (1, 3)), sensor)
+        checks.one_of("channels", channels, (1, 3))
+        super().__init__(grid, channels, sensor)
         if camera_grid is not None:
             camera_grid = checks.grid("camera_grid", camera_grid)
         if sensitivity is not None:
@@ -146,15 +150,20 @@ class MitsubaRig(SimulatedRig):
             )
         self._samples = checks.count("samples", samples)
         self._mi = load_extra("mitsuba", "rig", "MitsubaRig")
+        name = "dict"
+        if not isinstance(scene, dict):
+            name = os.path.basename(os.fspath(scene))
         self._facts = {
             "kind": "mitsuba",
-            "scene": "dict" if isinstance(scene, dict) else os.path.basename(os.fspath(scene)),
+            "scene": name,
             "mitsuba": self._mi.__version__,
             "variant": VARIANT,
             "samples": self._samples,
         }
-        options = {"albedo": albedo, "baseline": baseline, "depth": depth}
-        options = {name: value for name, value in options.items() if value is not None}
+        options = {}
+        for option, value in (("albedo", albedo), ("baseline", baseline), ("depth", depth)):
+            if value is not None:
+                options[option] = value
         with self._mitsuba(InputError, "scene cannot be loaded"):
             self._load(scene, camera_grid, options)
         if sensitivity is None:
@@ -172,13 +181,14 @@ class MitsubaRig(SimulatedRig):
             scene = _named_scene(mi, scene, grid, film_grid, **options)
         elif options:
             first = next(iter(options))
-            raise InputError(f"{first} is of {', '.join(SCENES)}; others have their own")
+            names = ", ".join(SCENES)
+            raise InputError(f"{first} is given; only the named scenes {names} take it")
         self._scene = _load_scene(mi, scene, grid)
         self._parameters = mi.traverse(self._scene)
         if camera_grid is not None:
             height, width = camera_grid
-            self._parameters[self._parameter("film.size")] = mi.ScalarVector2u(width, height)
-            self._parameters.update()
+            size = mi.ScalarVector2u(width, height)
+            self._set_parameter("film.size", size)
 
     def _default_sensitivity(self) -> float:
         white = self.radiance(np.ones(self.projector_grid))
@@ -187,11 +197,12 @@ class MitsubaRig(SimulatedRig):
             raise InputError("scene shows no light of its projector: its sensor looks elsewhere")
         return BRIGHT_VALUE / bright
 
-    def _parameter(self, ending: str) -> str:
-        """Name of the one parameter of the scene with this ending."""
+    def _set_parameter(self, ending: str, value: Any) -> None:
+        """Set the one parameter of the scene whose name has this ending."""
         names = self._parameters.keys()
-        (name,) = filter(lambda name: name.endswith(ending), names)
-        return name
+        (name,) = [name for name in names if name.endswith(ending)]
+        self._parameters[name] = value
+        self._parameters.update()
 
     @contextlib.contextmanager
     def _mitsuba(self, kind: type[Exception], subject: str) -> Iterator[None]:
@@ -213,11 +224,12 @@ class MitsubaRig(SimulatedRig):
             light = np.repeat(light[..., None], 3, axis=-1)
         light = np.ascontiguousarray(light)
         with self._mitsuba(AcquisitionError, "the scene cannot be rendered"):
-            self._parameters[self._parameter("irradiance.data")] = self._mi.TensorXf(light)
-            self._parameters.update()
-            rendered = self._mi.render(self._scene, spp=self._samples, seed=self.sensor.seed)
+            self._set_parameter("irradiance.data", self._mi.TensorXf(light))
+            seed = self.sensor.seed
+            rendered = self._mi.render(self._scene, spp=self._samples, seed=seed)
             image = np.array(rendered, np.float64)
-        if image.ndim != 3 or image.shape[2] < 3 or not np.isfinite(image).all():
+        is_colour = image.ndim == 3 and image.shape[2] >= 3
+        if not is_colour or not np.isfinite(image).all():
             raise AcquisitionError(
                 f"Mitsuba rendered {image.shape}, or NaN; it must be finite (H, W, 3)"
             )
@@ -250,7 +262,8 @@ def _named_scene(
     start = walls[:, 0]
     right = walls[:, 1]
     up = walls[:, 2]
-    corners = np.concatenate([start, start + up, start + right, start + right + up])
+    end = start + right
+    corners = np.concatenate([start, start + up, end, end + up])
     height, width = camera_grid
     film = {
         "type": "hdrfilm",
@@ -272,9 +285,8 @@ def _wall_colours(albedo: Any, walls: int) -> np.ndarray:
     colours = checks.finite("albedo", checks.real("albedo", albedo))
     checks.shape("albedo", colours, (), (3,), (walls, 3))
     if colours.min() < 0 or colours.max() >= 1:
-        raise InputError(
-            f"albedo reaches from {colours.min():g} to {colours.max():g}; it must be in [0, 1)"
-        )
+        reach = f"{colours.min():g} to {colours.max():g}"
+        raise InputError(f"albedo reaches from {reach}; it must be in [0, 1)")
     return np.broadcast_to(colours, (walls, 3))
 
 
@@ -284,10 +296,12 @@ def _wall(mi: Any, wall: np.ndarray, colour: list[float]) -> dict[str, Any]:
     normal = np.cross(right, up)
     middle = start + (right + up) / 2
     columns = np.stack([right / 2, up / 2, normal, middle], axis=1)
+    place = np.vstack([columns, [0, 0, 0, 1]])
+    reflectance = {"type": "rgb", "value": colour}
     return {
         "type": "rectangle",
-        "to_world": mi.ScalarTransform4f(np.vstack([columns, [0, 0, 0, 1]])),
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}},
+        "to_world": mi.ScalarTransform4f(place),
+        "bsdf": {"type": "diffuse", "reflectance": reflectance},
     }
 
 
@@ -303,7 +317,8 @@ def _pinhole(mi: Any, x: float, grid: tuple[int, int], corners: np.ndarray) -> d
     half_height = np.abs(corners[:, 1] / distance).max()
     tangent = FRAME_MARGIN * max(half_width, half_height * width / height)
     place = mi.ScalarTransform4f().look_at(origin=list(eye), target=[0, 0, 0], up=[0, 1, 0])
-    return {"fov": math.degrees(2 * math.atan(tangent)), "fov_axis": "x", "to_world": place}
+    angle = math.degrees(2 * math.atan(tangent))
+    return {"fov": angle, "fov_axis": "x", "to_world": place}
 
 
 def _load_scene(mi: Any, scene: Any, grid: tuple[int, int]) -> Any:
@@ -313,11 +328,13 @@ def _load_scene(mi: Any, scene: Any, grid: tuple[int, int]) -> Any:
         parsed = mi.parser.parse_dict(settings, scene)
     else:
         parsed = mi.parser.parse_file(settings, str(input_file(scene)))
-    projectors = [node for node in parsed.nodes if node.props.plugin_name() == "projector"]
+    projectors = []
+    for node in parsed.nodes:
+        if node.props.plugin_name() == "projector":
+            projectors.append(node)
     if len(projectors) != 1:
-        raise InputError(
-            f"scene has {len(projectors)} projectors; it must have one emitter of that type"
-        )
+        count = len(projectors)
+        raise InputError(f"scene has {count} projectors; it must have one emitter of that type")
     white = {
         "type": "bitmap",
         "bitmap": mi.Bitmap(np.ones((*grid, 3), np.float32)),

@@ -8,7 +8,9 @@ other files are decoded as `ltcl.images.read_codes` does.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -16,6 +18,8 @@ from PIL import Image, UnidentifiedImageError
 from ltcl import images
 from ltcl.acquisition.rig import load_extra
 from ltcl.errors import AcquisitionError, FileError, MemoryLimitError
+
+T = TypeVar("T")
 
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 PHOTOGRAPH_SUFFIXES = (*images.BITS, *RAW_SUFFIXES)
@@ -37,7 +41,13 @@ EXPOSURE_TIME_TAG = 33434
 EXPOSURE_TOLERANCE = 0.05
 
 
-def read_photograph(name: str, path: Path, channels: int, seconds: float | None) -> np.ndarray:
+def read_photograph(
+    name: str,
+    path: Path,
+    channels: int,
+    seconds: float | None,
+    white_level: float | None = None,
+) -> np.ndarray:
     """Codes of a file, for a rig of 1 or 3 channels.
 
     One channel of a colour photograph is the green one: a mean of channels with different response
@@ -47,10 +57,12 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     codes, exposure = _read_with_exposure(name, path)
     if seconds is not None:
         _check_exposure(name, exposure, seconds)
-    if codes.dtype.kind == "f" and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
+    is_float = codes.dtype.kind == "f"
+    is_unscaled = is_float and white_level is None
+    if is_unscaled and np.mean(codes > MAX_FLOAT_CODE) > MAX_DEFECT_SHARE:
         raise AcquisitionError(
             f"{name} reaches {codes.max():.4g}; full scale of float photographs is 1: "
-            "divide all by the largest value of the camera"
+            "divide all by the largest value of the camera, or give it as white_level"
         )
     if codes.ndim == 3 and channels == 1:
         return np.ascontiguousarray(codes[..., 1])
@@ -82,7 +94,8 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
 
     The black level stays, as subtracting it would clip noise; 65535 is the sensor's white level.
     """
-    rawpy = load_extra("rawpy", "camera", f"{path}, camera RAW instead of 16-bit TIFF,")
+    user = f"{path}, camera RAW instead of 16-bit TIFF,"
+    rawpy = load_extra("rawpy", "camera", user)
     try:
         with rawpy.imread(str(path)) as raw:
             codes = raw.postprocess(
@@ -98,28 +111,40 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
                 user_cblack=[0, 0, 0, 0],
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
+            if codes.shape[2] == 1:
+                # A monochrome camera.
+                codes = codes[..., 0]
             return codes, raw.other.shutter_speed
     except (rawpy.LibRawError, rawpy.NotSupportedError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        if not reason:
-            reason = type(error).__name__
-        raise FileError(f"{path}: is no readable camera RAW file: {reason}") from error
+        text = str(error)
+        if not text.strip():
+            text = type(error).__name__
+        reason = " ".join(text.split())
+        raise FileError(f"{path}: is not a readable camera RAW file: {reason}") from error
 
 
 def _exif_exposure(path: Path) -> float | None:
-    """ExposureTime in seconds; None if Pillow reads no header.
+    """ExposureTime in seconds; None if the header has none.
 
-    It reads none of EXR, float TIFF, and pictures of more than 179 million pixels.
+    Pillow reads no header of EXR, float TIFF, and pictures of more than 179 million pixels.
+    """
+
+    def seconds(tags: Mapping[int, Any]) -> float | None:
+        value = tags.get(EXPOSURE_TIME_TAG)
+        return None if value is None else float(value)
+
+    return read_exif(path, seconds)
+
+
+def read_exif(path: Path, convert: Callable[[Mapping[int, Any]], T]) -> T | None:
+    """The value that `convert` makes of the tags in an EXIF header; None if Pillow reads none.
+
+    FileError for hostile tags.
     """
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
             exif = picture.getexif()
-            seconds = exif.get_ifd(EXIF_IFD_TAG).get(EXPOSURE_TIME_TAG)
-            if seconds is None:
-                seconds = exif.get(EXPOSURE_TIME_TAG)
-            if seconds is None:
-                return None
-            return float(seconds)
+            return convert({**exif, **exif.get_ifd(EXIF_IFD_TAG)})
     except (UnidentifiedImageError, Image.DecompressionBombError, ZeroDivisionError):
         return None
     except Exception as error:  # hostile tags raise anything

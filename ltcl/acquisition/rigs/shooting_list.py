@@ -132,5 +132,5 @@ def _read_keys(path: Path) -> list[ShotKey]:
             keys.append(ShotKey(str(shot["codes"]), seconds))
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise FileError(f"{path}: is no shooting list, or a damaged one ({reason})") from None
+        raise FileError(f"{path}: is not a shooting list, or a damaged one ({reason})") from None
     return keys

@@ -8,7 +8,9 @@ Codes x (h, w[, 3]) in [0, 1], channels c and d, projector curve g with light b 
     v    = max(sensitivity seconds L, 0)     linear value; 1 fills a pixel of E electrons
     n    = Poisson(E v) / E + Normal(0, r)   photons, and read noise r
     c    = o + (1 - o) f(min(n, 1))          offset o and camera curve f; -f(-n) for n < 0
-    code = round(c (2^bits - 1))             in [0, 2^bits - 1]; or c itself for a float camera
+    code = round(c F)                        in [0, F], F = 2^bits - 1; c for a float camera
+
+or F the white level of a camera that is full below its largest code.
 """
 
 from __future__ import annotations
@@ -74,6 +76,8 @@ class Sensor:
         Curve of the projector, from code to light.
     bits : int or "float"
         8 gives uint8, 9 to 16 uint16, "float" float32.
+    white_level : float, optional
+        Code of a full pixel; None for the largest code, or 1 of floats.
     black : float
         Offset of the codes, of full scale.
     projector_black : float
@@ -96,6 +100,7 @@ class Sensor:
     response: Any = "srgb"
     projector_response: Any = "srgb"
     bits: int | str = 8
+    white_level: float | None = None
     black: float = 0.004
     projector_black: float = 0.0
     gain: float | None = 10000.0
@@ -104,8 +109,12 @@ class Sensor:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.bits != "float" and (type(self.bits) is not int or self.bits not in range(8, 17)):
+        is_whole = type(self.bits) is int and self.bits in range(8, 17)
+        if self.bits != "float" and not is_whole:
             raise InputError(f'bits is {self.bits!r}; it must be 8 to 16, or "float"')
+        if self.white_level is not None:
+            most = (1 << int(self.bits)) - 1 if is_whole else np.inf
+            checks.number("white_level", self.white_level, above=0.0, most=most)
         for name in ("black", "projector_black", "read"):
             checks.number(name, getattr(self, name), least=0.0, below=1.0)
         if self.gain is not None:
@@ -129,11 +138,14 @@ class SimulatedRig(abc.ABC):
         self.projector_grid = projector_grid
         self.channels = channels
         self.exposures = as_exposures("exposures", self.sensor.exposures)
-        self.bits = None if isinstance(self.sensor.bits, str) else self.sensor.bits
-        camera_curves = _curves("response", self.sensor.response, channels)
-        projector_curves = _curves("projector_response", self.sensor.projector_response, channels)
-        self._encoders = [curve.encode for curve in camera_curves]
-        self._decoders = [curve.decode for curve in projector_curves]
+        self.bits: int | None = None
+        if isinstance(self.sensor.bits, int):
+            self.bits = self.sensor.bits
+        self.white_level = self.sensor.white_level
+        camera = _curves("response", self.sensor.response, channels)
+        projector = _curves("projector_response", self.sensor.projector_response, channels)
+        self._encoders = [curve.encode for curve in camera]
+        self._decoders = [curve.decode for curve in projector]
         self._facts: dict[str, Any] = {}
         self._repeats: Counter[str] = Counter()
         # Codes and radiance of the last photograph, as a bracket repeats its codes.
@@ -150,19 +162,23 @@ class SimulatedRig(abc.ABC):
         """
         codes = as_codes(codes, self.projector_grid, self.channels)
         checks.number("seconds", seconds, above=0.0)
-        value = np.maximum(self.sensitivity * seconds * self.radiance(codes), 0.0)
-        value = self._add_noise(value, self._noise_stream(codes, seconds))
+        value = self.sensitivity * seconds * self.radiance(codes)
+        noise = self._noise_stream(codes, seconds)
+        value = self._add_noise(np.maximum(value, 0.0), noise)
         black = self.sensor.black
-        code = black + (1.0 - black) * _apply(self._encoders, np.minimum(value, 1.0))
+        encoded = _apply(self._encoders, np.minimum(value, 1.0))
+        code = black + (1.0 - black) * encoded
         if self.bits is None:
-            return code.astype(np.float32)
-        largest_code = (1 << self.bits) - 1
+            full = 1.0 if self.white_level is None else self.white_level
+            return (code * full).astype(np.float32)
+        full = (1 << self.bits) - 1 if self.white_level is None else self.white_level
         dtype = np.uint8 if self.bits == 8 else np.uint16
-        return np.rint(np.clip(code, 0.0, 1.0) * largest_code).astype(dtype)
+        return np.rint(np.clip(code, 0.0, 1.0) * full).astype(dtype)
 
     def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
         """Skip the noise of a photograph that was taken in an earlier session."""
-        self._noise_stream(as_codes(codes, self.projector_grid, self.channels), seconds)
+        codes = as_codes(codes, self.projector_grid, self.channels)
+        self._noise_stream(codes, seconds)
 
     def radiance(self, codes: Any) -> np.ndarray:
         """L without a sensor, to compare photographs with: float64, (H, W) or (H, W, 3)."""
@@ -201,22 +217,30 @@ class SimulatedRig(abc.ABC):
     def _noise_stream(self, codes: np.ndarray, seconds: float) -> np.random.Generator:
         """The counter-based stream (Philox) of the next photograph of `codes` for `seconds`."""
         shot = shot_key(codes, seconds)
-        text = bytes.fromhex(shot) + f"{self.sensor.seed} {self._repeats[shot]}".encode()
+        text = f"{self.sensor.seed} {self._repeats[shot]}"
         self._repeats[shot] += 1
-        key = int.from_bytes(hashlib.blake2b(text, digest_size=16).digest(), "little")
+        content = bytes.fromhex(shot) + text.encode()
+        digest = hashlib.blake2b(content, digest_size=16).digest()
+        key = int.from_bytes(digest, "little")
         return np.random.Generator(np.random.Philox(key=key))
 
 
 def _curves(argument: str, value: Any, channels: int) -> list[Curve]:
     """Curves by name, one for each channel."""
-    names = list(value) if isinstance(value, (list, tuple)) else [value] * channels
+    names = value
+    if not isinstance(value, (list, tuple)):
+        names = [value] * channels
     if len(names) != channels:
         raise InputError(f"{argument} has {len(names)} curves; it must be one curve, or {channels}")
-    return [CURVES[checks.one_of(argument, name, CURVES)] for name in names]
+    for name in names:
+        checks.one_of(argument, name, CURVES)
+    return [CURVES[name] for name in names]
 
 
 def _apply(functions: Sequence[Function], value: np.ndarray) -> np.ndarray:
     """Apply the function of each channel, odd about 0."""
     planes = np.abs(value).reshape(*value.shape[:2], -1)
-    applied = [function(planes[..., c]) for c, function in enumerate(functions)]
-    return np.copysign(np.stack(applied, axis=-1).reshape(value.shape), value)
+    applied = np.empty_like(planes)
+    for c, function in enumerate(functions):
+        applied[..., c] = function(planes[..., c])
+    return np.copysign(applied.reshape(value.shape), value)

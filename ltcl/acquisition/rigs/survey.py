@@ -105,9 +105,13 @@ class SurveyTests:
         self._check_dimming(white, tolerance)
         accuracy = max(tolerance, ARRIVED_SHARE * contrast)
         latency = self._measure_latency(black, white, accuracy)
-        drift = self._measure_drift(white, white_frames.mean(axis=(0, 1, 2)), accuracy)
+        mean_at_rest = white_frames.mean(axis=(0, 1, 2))
         return Survey(
-            latency=latency, seconds=seconds, tolerance=tolerance, contrast=contrast, drift=drift
+            latency=latency,
+            seconds=seconds,
+            tolerance=tolerance,
+            contrast=contrast,
+            drift=self._measure_drift(white, mean_at_rest, accuracy),
         )
 
     def _choose_exposure(self) -> float:

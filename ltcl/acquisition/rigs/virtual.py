@@ -75,15 +75,17 @@ class VirtualRig(SimulatedRig):
             raise InputError(
                 "T has blocks between colours; it must have one matrix a channel, and a mixing"
             )
-        self._matrices = [_as_floats(A) for A in check_matrices(getattr(T, "matrices", T), "T")]
+        matrices = check_matrices(getattr(T, "matrices", T), "T")
+        self._matrices = [_as_floats(A) for A in matrices]
         rows, columns = self._matrices[0].shape
-        super().__init__(checks.grid("grid", grid, columns), len(self._matrices), sensor)
+        grid = checks.grid("grid", grid, columns)
+        super().__init__(grid, len(self._matrices), sensor)
 
         self._map = _check_camera_map(camera_map, rows)
-        camera_pixels = rows if self._map is None else self._map.shape[0]
+        pixels = rows if self._map is None else self._map.shape[0]
         if camera_grid is None:
             camera_grid = grid
-        self.camera_grid = checks.grid("camera_grid", camera_grid, camera_pixels)
+        self.camera_grid = checks.grid("camera_grid", camera_grid, pixels)
 
         if mixing is None:
             mixing = getattr(T, "mixing", None)
@@ -95,11 +97,13 @@ class VirtualRig(SimulatedRig):
         self._facts = self._describe_scene()
 
     def _describe_scene(self) -> dict[str, Any]:
-        digests = {
+        digests: dict[str, Any] = {
             "transport": fingerprint(*self._matrices),
             "ambient": fingerprint(self.ambient),
-            "camera_map": None if self._map is None else fingerprint(self._map),
+            "camera_map": None,
         }
+        if self._map is not None:
+            digests["camera_map"] = fingerprint(self._map)
         return {
             "kind": "virtual",
             "digests": digests,
@@ -113,7 +117,9 @@ class VirtualRig(SimulatedRig):
         if self._mixing is not None:
             light = light @ self._mixing.T
         q = light.reshape(-1, self.channels)
-        planes = [A @ q[:, c].astype(A.dtype) for c, A in enumerate(self._matrices)]
+        planes = []
+        for c, A in enumerate(self._matrices):
+            planes.append(A @ q[:, c].astype(A.dtype))
         L = np.stack(planes, axis=-1) + self.ambient
         if self._map is not None:
             L = self._map @ L
@@ -144,7 +150,8 @@ def _check_camera_map(camera_map: Any, rows: int) -> Any:
 
 def _check_ambient(ambient: Any, rows: int, channels: int) -> np.ndarray:
     """Ambient light as (1 or rows, 1 or channels) float64."""
-    light = checks.finite("ambient", checks.real("ambient", ambient)).astype(np.float64)
+    light = checks.real("ambient", ambient).astype(np.float64)
+    checks.finite("ambient", light)
     checks.shape("ambient", light, (), (channels,), (rows,), (rows, channels))
     if light.min() < 0:
         raise InputError(f"ambient is as low as {light.min():g}; light is never negative")

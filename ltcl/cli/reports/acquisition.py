@@ -7,10 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ltcl.cli.reports.parts import Channels, Files, FolderReport, Options, VerdictReport, Versions
+from ltcl.cli.reports.parts import (
+    Channels,
+    Files,
+    FolderReport,
+    Options,
+    ProjectorGrid,
+    VerdictReport,
+    Versions,
+)
 from ltcl.cli.reports.report import Report
 
 RigKind = Annotated[Literal["virtual", "mitsuba", "folder", "live"], "Kind of the rig."]
+Strategy = Annotated[Literal["adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."]
+Exposures = Annotated[list[float], "Seconds of the photographs of a pattern."]
 
 
 @dataclass(kw_only=True)
@@ -21,8 +31,8 @@ class SimulateReport(FolderReport):
     versions: Versions
     scene: Annotated[str, "Requested scene."]
     options: Options
-    projector_grid: Annotated[tuple[int, int], "Projector pixels: height, width."]
-    channels: Annotated[Channels, "1, or 3 for red, green and blue."]
+    projector_grid: ProjectorGrid
+    channels: Channels
     files: Files = field(default_factory=list)
 
 
@@ -30,8 +40,8 @@ class SimulateReport(FolderReport):
 class CameraNoise(Report):
     """Noise of the camera."""
 
-    electrons: Annotated[float, "Electrons at full scale; null: no photon noise."]
-    read: Annotated[float, "Standard deviation without light, in units of full scale."]
+    electrons: Annotated[float, "Electrons at full scale, or null."]
+    read: Annotated[float, "Noise without light, in units of full scale."]
     black: Annotated[float, "Value without light."]
     saturation: Annotated[float, "Largest valid value."]
     levels: Annotated[int, "Number of codes of the camera; 0: floats."]
@@ -41,8 +51,8 @@ class CameraNoise(Report):
 class ScanLight(Report):
     """Light in sensor values a second."""
 
-    direct: Annotated[float, "Light of a projector pixel where it arrives."]
-    indirect: Annotated[float, "Light of all other projector pixels together."]
+    direct: Annotated[float, "Light where a projector pixel arrives."]
+    indirect: Annotated[float, "Light of all other projector pixels."]
     ambient: Annotated[float, "Light without the projector."]
 
 
@@ -53,8 +63,8 @@ class StrategyPlan(Report):
     strategy: Annotated[str, "Name of the strategy."]
     grid: Annotated[tuple[int, int], "Pixels of T: height, width."]
     patterns: Annotated[int, "Number of patterns."]
-    calibration: Annotated[int, "Number of photographs of the calibration."]
-    photographs: Annotated[int, "Number of all photographs."]
+    calibration: Annotated[int, "Photographs of the calibration."]
+    photographs: Annotated[int, "All photographs."]
     seconds: Annotated[float, "Duration of all photographs."]
     disk: Annotated[int, "Bytes on disk at most."]
     error: Annotated[float, "Relative error of T p by noise."]
@@ -65,17 +75,17 @@ class PlanReport(FolderReport):
     """`ltcl acquire plan`."""
 
     rig: RigKind
-    measured: Annotated[bool, "Whether noise and light were measured; else they are guessed."]
+    measured: Annotated[bool, "Noise and light were measured, not guessed."]
     asked_for: Annotated[str, "Strategy in acquisition.toml."]
     auto: Annotated[str, "Strategy that `auto` uses."]
     why: Annotated[str, "Reason for that strategy."]
-    exposures: Annotated[list[float], "Seconds of the photographs of each pattern."]
+    exposures: Exposures
     noise: Annotated[CameraNoise, "Noise of the camera."]
     light: Annotated[ScanLight, "Light in sensor values a second."]
-    channels: Annotated[Channels, "1, or 3 for red, green and blue."]
+    channels: Channels
     plans: Annotated[
         dict[str, StrategyPlan],
-        "Plans by strategy: the attributes of `ltcl.acquisition.scanning.Plan`.",
+        "Plans by strategy, as `ltcl.acquisition.scanning.Plan`.",
     ]
 
 
@@ -84,38 +94,28 @@ class ScanReport(FolderReport):
     """`ltcl acquire report`: the attributes of `ltcl.acquisition.Report`."""
 
     store: Annotated[Path, "Folder of the transport."]
-    strategy: Annotated[Literal["adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."]
+    strategy: Strategy
     why: Annotated[str, "Reason for the strategy."]
-    grid: Annotated[tuple[int, int], "Projector pixels of T: height, width."]
-    channels: Annotated[Channels, "1, or 3 for red, green and blue."]
+    grid: ProjectorGrid
+    channels: Channels
     patterns: Annotated[int, "Number of patterns of the scan."]
-    photographs: Annotated[int, "Photographs of the scan, without those of the calibration."]
-    exposures: Annotated[list[float], "Seconds of the photographs of each pattern."]
-    coverage: Annotated[float, "Share of the projector's pixels that the camera sees."]
-    doubtful: Annotated[
-        float, "Share of these pixels that are too dark next to bright ones, and masked."
-    ]
-    sharpness: Annotated[
-        float, "Share of the light at a pixel that is its own; null for an aligned camera."
-    ]
-    blur: Annotated[
-        float, "Relative error of a picture of fine detail; null for an aligned camera."
-    ]
-    masked: Annotated[float, "Share of the projector's pixels without a first bounce."]
-    saturated: Annotated[
-        float, "Share of the camera's pixels that saturate in all exposures under white."
-    ]
-    entries: Annotated[int, "Number of stored entries of all channels."]
-    unknown: Annotated[float, "Share of the entries without a valid photograph; they are 0."]
-    noise_direct: Annotated[float, "Median relative standard deviation of the first bounce."]
-    noise_sum: Annotated[float, "Median relative standard deviation of row sums."]
-    sum_deviation: Annotated[
-        float | None, "Relative deviation of column sums from white; null for an adaptive scan."
-    ]
+    photographs: Annotated[int, "Photographs without the calibration."]
+    exposures: Exposures
+    coverage: Annotated[float, "Share of projector pixels that are seen."]
+    doubtful: Annotated[float, "Share of these that are masked: too dark next to bright ones."]
+    sharpness: Annotated[float, "Share of a pixel's own light; null for an aligned camera."]
+    blur: Annotated[float, "Relative error of fine detail; null for an aligned camera."]
+    masked: Annotated[float, "Share of pixels without a first bounce."]
+    saturated: Annotated[float, "Share of camera pixels saturated in all exposures of white."]
+    entries: Annotated[int, "Number of stored entries."]
+    unknown: Annotated[float, "Share of entries never well exposed; they are 0."]
+    noise_direct: Annotated[float, "Median relative noise of the first bounce."]
+    noise_sum: Annotated[float, "Median relative noise of row sums."]
+    sum_deviation: Annotated[float | None, "Deviation of column sums from white; null if adaptive."]
     verdict: VerdictReport
-    error: Annotated[
-        list[float] | None, "Relative error of T p by channel, for a virtual rig only."
-    ] = None
+    error: Annotated[list[float] | None, "Relative error of T p by channel; virtual rigs only."] = (
+        None
+    )
 
 
 @dataclass(kw_only=True)

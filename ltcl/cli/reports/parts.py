@@ -12,24 +12,30 @@ from ltcl.solvers import Solution
 from ltcl.tasks import report
 from ltcl.transport.verdict import Verdict
 
-Channels = Literal[1, 3]
+Channels = Annotated[Literal[1, 3], "1, or 3 for red, green and blue."]
+ProjectorGrid = Annotated[tuple[int, int], "Projector pixels: height, width."]
+Shape = Annotated[tuple[int, int], "Number of camera and of projector pixels."]
+Gain = Annotated[float, "Factor between the picture and what the scene shows."]
+Clipped = Annotated[float, "Share of the pattern at a bound."]
+SceneError = Annotated[float, "Relative error of what the scene will show."]
+TransportError = Annotated[float, "Relative error of T itself by compression."]
+DeviceKind = Annotated[Literal["gpu", "accelerator", "cpu", "simulator"], "Kind of the device."]
 Options = Annotated[
     dict[str, Any],
-    "Every option of the command by its name in Python (`--on-dark` is `on_dark`), with the value "
-    "that was used. The page on the command line describes each.",
+    "Every option of the command by its name in Python (`--on-dark` is "
+    "`on_dark`), with the value that was used. The page on the command line "
+    "describes each.",
 ]
-Files = Annotated[list[str], "All files that this run wrote, relative to `folder`."]
+Files = Annotated[list[str], "Files that this run wrote, relative to `folder`."]
 
 
 @dataclass(kw_only=True)
 class ErrorReport(Report):
     """A command that failed; the exit code is not 0."""
 
-    error: Annotated[str, "The problem in one line; the same line is on stderr."]
-    type: Annotated[
-        str, "A class in `ltcl.errors`, or `UsageError`, or another exception of Python."
-    ]
-    exit_code: Annotated[int, "Exit code of the program; the page on exit codes lists all."]
+    error: Annotated[str, "The problem in one line, as on stderr."]
+    type: Annotated[str, "A class in `ltcl.errors`, `UsageError`, or another exception."]
+    exit_code: Annotated[int, "Exit code; the page on exit codes lists all."]
 
 
 @dataclass(kw_only=True)
@@ -48,9 +54,9 @@ class Versions(Report):
 class Device(Report):
     """The OpenCL device that was used."""
 
-    index: Annotated[str, "Platform and device, as `--device` takes it."]
+    index: Annotated[str, "Platform and device, as for `--device`."]
     name: Annotated[str, "Name of the device."]
-    kind: Annotated[Literal["gpu", "accelerator", "cpu", "simulator"], "Kind of the device."]
+    kind: DeviceKind
     driver: Annotated[str, "Name and version of the OpenCL platform."]
 
 
@@ -59,12 +65,12 @@ class TransportFacts(Report):
     """The transport that was read."""
 
     file: Annotated[Path, "Path of the file."]
-    shape: Annotated[tuple[int, int], "Number of camera pixels and of projector pixels."]
-    channels: Annotated[Channels, "1, or 3 for red, green and blue."]
-    grid: Annotated[tuple[int, int], "Projector pixels: height, width."]
+    shape: Shape
+    channels: Channels
+    grid: ProjectorGrid
     camera_grid: Annotated[tuple[int, int], "Camera pixels: height, width."]
-    error: Annotated[float, "Relative error of solutions by compression; 0 if T is not compressed."]
-    masked: Annotated[int, "Number of projector pixels that are too dark and stay unlit."]
+    error: Annotated[float, "Relative error of solutions by compression, or 0."]
+    masked: Annotated[int, "Number of dark projector pixels; they stay unlit."]
     compressed: Annotated[bool, "Whether T is compressed."]
 
 
@@ -90,27 +96,23 @@ class Heading(Report):
 class StandardErrors(Report):
     """Standard errors over the pixels."""
 
-    largest: Annotated[float, "Largest standard error of the pixels for which it is known."]
-    median: Annotated[float, "Median standard error of these pixels."]
-    unknown: Annotated[int, "Number of pixels without a known standard error."]
+    largest: Annotated[float, "Largest known standard error."]
+    median: Annotated[float, "Median of the known standard errors."]
+    unknown: Annotated[int, "Number of pixels for which it is unknown."]
 
 
 @dataclass(kw_only=True)
 class Solve(Report):
     """A solve of a colour channel."""
 
-    method: Annotated[str, "Method that ran, also if `auto` was requested."]
+    method: Annotated[str, "Method that ran, also for `auto`."]
     iterations: Annotated[int, "Number of iterations of the method."]
-    products: Annotated[int, "Number of products with S, those for checks included."]
+    products: Annotated[int, "Number of products with S, with those of checks."]
     residual: Annotated[float, "Relative residual of the result."]
-    residuals: Annotated[list[float], "Relative residuals before each iteration and at the end."]
+    residuals: Annotated[list[float], "Relative residuals, from start to end."]
     seconds: Annotated[float, "Wall time."]
-    reason: Annotated[
-        str, "Why `auto` chose the method, or what a sampling method reached; else empty."
-    ]
-    error: Annotated[
-        float | None, "Bound on the relative error, if one is known, as with an inverse."
-    ]
+    reason: Annotated[str, "Reason for the choice of `auto`, or what sampling reached."]
+    error: Annotated[float | None, "Bound on the relative error, as with an inverse."]
     status: Annotated[
         Literal[
             "converged",
@@ -125,9 +127,10 @@ class Solve(Report):
         ],
         "Reason for the end of the solve.",
     ]
-    standard_error: Annotated[
-        StandardErrors | None, "Standard errors of random walks; null for other methods."
-    ]
+    standard_error: Annotated[StandardErrors | None, "Noise of random walks; else null."]
+
+
+ChannelSolves = Annotated[list[Solve], "Solves, one for each colour channel."]
 
 
 def solves(solution: Solution | tuple[Solution, ...]) -> list[Solve]:
@@ -147,75 +150,71 @@ class PictureFiles(Report):
 class PictureWithStd(PictureFiles):
     """A picture in two files, with its standard deviations if the noise of T is known."""
 
-    std: Annotated[PictureFiles | None, "Standard deviations by the noise of T."] = None
+    std: Annotated[PictureFiles | None, "Deviations by the noise of T."] = None
+
+
+# None if it was not measured.
+Measured = float | None
 
 
 @dataclass(kw_only=True)
 class VerdictNumbers(Report):
     """Measurements that decide on the verdict, for the worst channel, as far as they are known."""
 
-    pictures: Annotated[
-        float | None, "Relative error of a compensated picture by noise. Good up to 0.02."
+    pictures: Annotated[Measured, "Error of a compensated picture by noise. Good up to 0.02."] = (
+        None
+    )
+    bounces: Annotated[Measured, "Largest of `bounce_1` to `bounce_3`. Good up to 0.05."] = None
+    bounce_1: Annotated[Measured, "Error of bounce 1, by noise."] = None
+    bounce_2: Annotated[Measured, "Error of bounce 2, by noise."] = None
+    bounce_3: Annotated[Measured, "Error of bounce 3, by noise."] = None
+    spread: Annotated[
+        Measured, "Largest of `spread_1` to `spread_3` if F is diag(T), else 0. Good up to 0.05."
     ] = None
-    bounces: Annotated[
-        float | None, "Largest value of `bounce_1` to `bounce_3`. Good up to 0.05."
-    ] = None
-    bounce_1: Annotated[float | None, "Relative error of bounce 1 under white, by noise."] = None
-    bounce_2: Annotated[float | None, "Relative error of bounce 2 under white, by noise."] = None
-    bounce_3: Annotated[float | None, "Relative error of bounce 3 under white, by noise."] = None
-    other_grid: Annotated[float | None, "1 if T fits another grid better. Good: 0."] = None
-    exchanged: Annotated[
-        float | None, "Number of colour channels that look exchanged. Good: 0."
-    ] = None
-    no_bounces: Annotated[float | None, "1 if T has no S, hence no bounces. Good: 0."] = None
+    spread_1: Annotated[Measured, "Difference of bounce 1 by F = diag(T) or 1 / diag(T^-1)."] = None
+    spread_2: Annotated[Measured, "The same for bounce 2."] = None
+    spread_3: Annotated[Measured, "The same for bounce 3."] = None
+    other_grid: Annotated[Measured, "1 if another grid fits better."] = None
+    exchanged: Annotated[Measured, "Colour channels that look exchanged. Good: 0."] = None
+    no_bounces: Annotated[Measured, "1 if T is not square."] = None
     shifted: Annotated[
-        float | None,
-        "Share of the camera's pixels whose brightest projector pixel is displaced in a common "
-        "direction. Good up to 0.2.",
+        Measured,
+        "Share of the camera's pixels whose brightest projector pixel is "
+        "displaced in a common direction. Good up to 0.2.",
     ] = None
-    hot_rows: Annotated[
-        float | None, "Number of camera pixels with one value in all patterns. Good: 0."
+    hot_rows: Annotated[Measured, "Camera pixels with one value in all patterns. Good: 0."] = None
+    saturated: Annotated[Measured, "Entries equal to the brightest one. Good up to 2."] = None
+    quantized: Annotated[
+        Measured, "Step of the codes of T over its mean indirect light. Good up to 0.3."
     ] = None
-    saturated: Annotated[
-        float | None, "Number of entries of T equal to its largest direct light. Good up to 2."
+    row_offset: Annotated[
+        Measured, "Offset of the camera's pixels over the light under white. Good up to 0.015."
     ] = None
     ambient: Annotated[
-        float | None,
-        "Least light that parts of the picture exchange in one bounce, over the mean; "
-        "0 for flat walls. Good up to 0.05.",
+        Measured,
+        "Least light that parts of the picture exchange in one bounce, over "
+        "the mean; 0 for flat walls. Good up to 0.05.",
     ] = None
-    offset: Annotated[
-        float | None, "Distance of the lowest light below 0, over the mean. Good up to 0.02."
-    ] = None
-    flicker: Annotated[
-        float | None, "Relative change of the light from column to column. Good up to 0.02."
-    ] = None
+    offset: Annotated[Measured, "Lowest light below 0, over the mean. Good up to 0.02."] = None
+    flicker: Annotated[Measured, "Change of the light between columns. Good up to 0.02."] = None
     outliers: Annotated[
-        float | None,
-        "Relative change of a picture by single entries that their neighbours do not confirm. "
-        "Good: 0.",
+        Measured,
+        "Relative change of a picture by single entries that their "
+        "neighbours do not confirm. Good: 0.",
     ] = None
-    irreciprocal: Annotated[
-        float | None, "`reciprocity_defect` beyond the part due to noise. Good up to 0.1."
-    ] = None
-    dark: Annotated[
-        float | None, "Share of the projector's pixels that are masked. Good up to 0.05."
-    ] = None
-    gain: Annotated[
-        float | None, "Brightness of a plain picture within reach, over the median under white."
-    ] = None
+    irreciprocal: Annotated[Measured, "`reciprocity_defect` beyond noise. Good up to 0.1."] = None
+    dark: Annotated[Measured, "Share of projector pixels that light nothing. Good up to 0.05."] = (
+        None
+    )
+    gain: Annotated[Measured, "Brightness of a plain picture within reach, over white."] = None
     negative_bounce: Annotated[
-        float | None, "Largest `negative_bounce` of `channels` in `ltcl analyze`. Good up to 0.005."
+        Measured, "Share of light that a bounce takes away. Good up to 0.005."
     ] = None
     bounce_highest: Annotated[
-        float | None, "Largest `bounce_highest` of `channels` in `ltcl analyze`. Good up to 1."
+        Measured, "Light that 98 % of pixels return, at most. Good up to 1."
     ] = None
-    sum_deviation: Annotated[
-        float | None, "`sum_deviation` of `ltcl acquire report`. Good up to 0.03."
-    ] = None
-    saturation: Annotated[
-        float | None, "`saturated` of `ltcl acquire report`. Good up to 0.01."
-    ] = None
+    sum_deviation: Annotated[Measured, "`sum_deviation` of the scan. Good up to 0.03."] = None
+    saturation: Annotated[Measured, "`saturated` of the scan. Good up to 0.01."] = None
 
 
 @dataclass(kw_only=True)
@@ -228,14 +227,10 @@ class VerdictReport(Report):
     """
 
     text: Annotated[str, "Two sentences."]
-    compensation: Annotated[bool | None, "Whether T can be used for compensation; null if unknown."]
-    bounces: Annotated[bool | None, "Whether T can be used for bounces 1 to 3; null if unknown."]
-    causes: Annotated[
-        list[str], "Names of `numbers` beyond their limits, the most important first."
-    ]
-    numbers: Annotated[
-        VerdictNumbers, "Measurements of the worst channel, as far as they are known."
-    ]
+    compensation: Annotated[bool | None, "Whether T is good for compensation."]
+    bounces: Annotated[bool | None, "Whether T is good for bounces 1 to 3."]
+    causes: Annotated[list[str], "Names of `numbers` beyond limits, the worst first."]
+    numbers: Annotated[VerdictNumbers, "Measurements of the worst channel."]
 
     @classmethod
     def from_verdict(cls, verdict: Verdict) -> VerdictReport:

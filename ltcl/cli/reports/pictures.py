@@ -8,21 +8,25 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ltcl.cli.reports.parts import (
+    ChannelSolves,
+    Clipped,
     Files,
     FolderReport,
+    Gain,
     Heading,
     PictureFiles,
     PictureWithStd,
+    SceneError,
     Solve,
+    TransportError,
 )
 from ltcl.cli.reports.report import Report
 
 PatternCodes = Annotated[
-    Literal["sRGB", "codes of the measured projector"], "Encoding of a pattern's .png."
+    Literal["sRGB", "codes of the measured projector"],
+    "Encoding of a pattern's .png.",
 ]
-Exposure = Annotated[
-    float, "Factor between the linear picture and the picture in a .png for viewing."
-]
+Exposure = Annotated[float, "Factor from a linear picture to its .png."]
 
 
 @dataclass(kw_only=True)
@@ -30,26 +34,22 @@ class CompensatedPicture(Report):
     """A picture with its pattern."""
 
     file: Annotated[Path, "Input file."]
-    gain: Annotated[float, "Factor between the picture and what the scene shows."]
-    clipped: Annotated[float, "Share of the pattern at a bound."]
+    gain: Gain
+    clipped: Clipped
     error: Annotated[
         float,
-        "Relative error of what the scene will show; masked pixels do not count, unless "
-        "`--weights` weigh them.",
+        "Relative error of what the scene will show; masked pixels do not "
+        "count, unless `--weights` weigh them.",
     ]
-    transport_error: Annotated[
-        float, "Relative error of T itself by compression, which `error` does not contain."
-    ]
-    gap: Annotated[float, "Bound on the distance of the error from the least possible one."]
+    transport_error: TransportError
+    gap: Annotated[float, "Bound on the error beyond the least one."]
     too_dark: Annotated[float, "Share of the picture that stays too dark."]
     too_bright: Annotated[float, "Share of the picture that stays too bright."]
-    channels: Annotated[list[Solve], "Solves without bounds, one for each colour channel."]
-    limited: Annotated[list[Solve], "Solves within the projector's range, if these were needed."]
+    channels: ChannelSolves
+    limited: Annotated[list[Solve], "Solves within bounds, if needed."]
     pattern: Annotated[PictureWithStd, "The pattern."]
-    appearance: Annotated[
-        PictureWithStd, "Picture that the scene will show, at `exposure` / `gain`."
-    ]
-    out_of_reach: Annotated[PictureFiles, "The picture less what the scene will show."]
+    appearance: Annotated[PictureWithStd, "What the scene will show, at `exposure` / `gain`."]
+    out_of_reach: Annotated[PictureFiles, "Picture less `appearance`."]
 
 
 @dataclass(kw_only=True)
@@ -58,7 +58,7 @@ class CompensateReport(Heading, FolderReport):
 
     pattern_png: PatternCodes
     exposure: Exposure
-    pictures: Annotated[list[CompensatedPicture], "One entry for each input, in their order."]
+    pictures: Annotated[list[CompensatedPicture], "One for each input."]
     files: Files = field(default_factory=list)
 
 
@@ -66,9 +66,7 @@ class CompensateReport(Heading, FolderReport):
 class ScenesReport(FolderReport):
     """`ltcl compensate --transports`."""
 
-    scenes: Annotated[
-        list[CompensateReport], "One entry for each transport, in the order of their names."
-    ]
+    scenes: Annotated[list[CompensateReport], "One for each transport, ordered by name."]
 
 
 @dataclass(kw_only=True)
@@ -78,8 +76,9 @@ class FrameReport(Report):
     number: Annotated[int, "Number of the frame, from 1."]
     name: Annotated[str, "Name of its file, or of the film."]
     digest: Annotated[str, "SHA-256 of the data that was read."]
-    error: Annotated[float, "Relative error of what the scene will show."]
-    clipped: Annotated[float, "Share of the pattern at a bound."]
+    output_digest: Annotated[str, "SHA-256 of the files that were written."]
+    error: SceneError
+    clipped: Clipped
 
 
 @dataclass(kw_only=True)
@@ -88,14 +87,14 @@ class FilmReport(Heading, FolderReport):
 
     pattern_png: PatternCodes
     source: Annotated[Path, "The folder or the video."]
-    video: Annotated[Path | None, "Video of the patterns, if one was requested."]
+    video: Annotated[Path | None, "Video of the patterns."]
     gain: Annotated[float, "Gain of all frames."]
-    solved: Annotated[int, "Frames of this run; the others were there already."]
+    solved: Annotated[int, "Number of frames that this run solved."]
     seconds: Annotated[float, "Duration of this run."]
-    frames_per_second: Annotated[float, "Pace of this run; null if it solved no frame."]
-    transport_error: Annotated[float, "Relative error of T itself by compression."]
+    frames_per_second: Annotated[float, "Pace; null if no frame was solved."]
+    transport_error: TransportError
     worst: Annotated[FrameReport, "Frame with the largest error."]
-    most_clipped: Annotated[FrameReport, "Frame with the largest clipped share."]
+    most_clipped: Annotated[FrameReport, "Frame with most clipping."]
     frames: Annotated[list[FrameReport], "All frames, in order."]
 
 
@@ -104,12 +103,10 @@ class LightPart(PictureFiles):
     """A part of the light."""
 
     part: Annotated[str, "Name of the part."]
-    lowest: Annotated[float, "Lowest value, which noise may bring below 0."]
-    share: Annotated[float | None, "Share of the light of the whole picture."]
-    channels: Annotated[list[Solve], "Solves, one for each colour channel."]
-    std: Annotated[
-        PictureFiles | None, "Standard deviations by the noise of T, if that is known."
-    ] = None
+    lowest: Annotated[float, "Lowest value; noise may be below 0."]
+    share: Annotated[float | None, "Share of all light."]
+    channels: ChannelSolves
+    std: Annotated[PictureFiles | None, "Deviations by the noise of T."] = None
 
 
 @dataclass(kw_only=True)
@@ -117,8 +114,9 @@ class SeparatedPicture(Report):
     """A picture and its parts."""
 
     file: Annotated[Path, "Input file."]
-    transport_error: Annotated[float, "Relative error of T itself by compression."]
-    parts: Annotated[list[LightPart], "`direct`, `indirect`, `bounce_1`, ... and `rest`."]
+    transport_error: TransportError
+    warning: Annotated[str, "What T leaves unknown of the bounces."]
+    parts: Annotated[list[LightPart], "Direct light, bounces and the rest."]
 
 
 @dataclass(kw_only=True)
@@ -126,7 +124,7 @@ class SeparateReport(Heading, FolderReport):
     """`ltcl separate`; also written as separate.json, without `folder`."""
 
     exposure: Exposure
-    pictures: Annotated[list[SeparatedPicture], "One entry for each input, in their order."]
+    pictures: Annotated[list[SeparatedPicture], "One for each input."]
     files: Files = field(default_factory=list)
 
 
@@ -143,5 +141,5 @@ class RelightReport(Heading, FolderReport):
     """`ltcl relight`; also written as relight.json, without `folder`."""
 
     exposure: Exposure
-    pictures: Annotated[list[RelitPicture], "One entry for each pattern, in their order."]
+    pictures: Annotated[list[RelitPicture], "One for each pattern."]
     files: Files = field(default_factory=list)

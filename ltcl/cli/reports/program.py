@@ -7,7 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ltcl.cli.reports.parts import Device, Files, FolderReport, Solve, Versions
+from ltcl.cli.reports.parts import (
+    ChannelSolves,
+    Clipped,
+    Device,
+    Files,
+    FolderReport,
+    Gain,
+    ProjectorGrid,
+    Solve,
+    Versions,
+)
 from ltcl.cli.reports.report import Report
 from ltcl.cli.reports.transports import AnalysisReport
 
@@ -37,16 +47,16 @@ class DoctorReport(Report):
     """`ltcl doctor`; the exit code is 1 if a check fails."""
 
     passed: Annotated[bool, "Whether all checks passed."]
-    checks: Annotated[list[Check], "All checks, in the order in which they ran."]
+    checks: Annotated[list[Check], "All checks, in their order."]
 
 
 @dataclass(kw_only=True)
 class DemoScene(Report):
     """The room corner."""
 
-    grid: Annotated[tuple[int, int], "Projector pixels: height, width."]
+    grid: ProjectorGrid
     pixels: Annotated[int, "Number of pixels."]
-    albedo: Annotated[dict[str, list[float]], "Red, green and blue, by wall."]
+    albedo: Annotated[dict[str, list[float]], "RGB, by wall."]
 
 
 @dataclass(kw_only=True)
@@ -62,34 +72,34 @@ class ColourRadii(Report):
 class DemoTarget(Report):
     """The desired picture."""
 
-    mist: Annotated[float, "Share of the mist that brings the picture within reach."]
+    mist: Annotated[float, "Share of mist in the picture."]
 
 
 @dataclass(kw_only=True)
 class DemoErrors(Report):
     """Relative errors of the picture that a viewer sees."""
 
-    uncompensated: Annotated[float, "Error of the picture projected as it is."]
-    colours_only: Annotated[float, "Error with wall colours undone and bounces left."]
-    compensated: Annotated[float, "Error with compensation."]
+    uncompensated: Annotated[float, "Picture projected as it is."]
+    colours_only: Annotated[float, "Wall colours undone, bounces left."]
+    compensated: Annotated[float, "With compensation."]
 
 
 @dataclass(kw_only=True)
 class DemoCompensation(Report):
     """The pattern."""
 
-    gain: Annotated[float, "Factor between the picture and what the scene shows."]
-    clipped: Annotated[float, "Share of the pattern at a bound."]
-    channels: Annotated[list[Solve], "Solves, one for each colour channel."]
+    gain: Gain
+    clipped: Clipped
+    channels: ChannelSolves
 
 
 @dataclass(kw_only=True)
 class DemoBounce(Report):
     """A bounce."""
 
-    bounce: Annotated[int, "Number of the bounce; 0 is the direct light."]
+    bounce: Annotated[int, "Its number; 0: direct light."]
     share: Annotated[float, "Share of all light."]
-    error: Annotated[float, "Relative error against the scene's form factors."]
+    error: Annotated[float, "Relative error by form factors."]
 
 
 @dataclass(kw_only=True)
@@ -108,15 +118,15 @@ class DemoReport(FolderReport):
     versions: Versions
     device: Device
     scene: Annotated[DemoScene, "The room corner."]
-    spectral_radius: Annotated[ColourRadii, "Spectral radius of R in each colour."]
+    spectral_radius: Annotated[ColourRadii, "Spectral radii of R."]
     analysis: AnalysisReport
     target: Annotated[DemoTarget, "The desired picture."]
-    errors: Annotated[DemoErrors, "Relative errors of the picture that a viewer sees."]
+    errors: Annotated[DemoErrors, "Errors of what a viewer sees."]
     exposure_of_views: Annotated[
-        dict[str, float], "Factor between the linear picture and its .png, by view."
+        dict[str, float], "Factor from a linear picture to its .png, by view."
     ]
     compensation: Annotated[DemoCompensation, "The pattern."]
-    bounces: Annotated[list[DemoBounce], "Direct light, and bounces 1 to 4."]
+    bounces: Annotated[list[DemoBounce], "Direct light, bounces 1 to 4."]
     convergence: Annotated[DemoConvergence, "Comparison of the methods."]
     seconds: Annotated[dict[str, float], "Duration, by step."]
 
@@ -133,13 +143,13 @@ class PlayReport(Report):
     """`ltcl play`; all fields but `film` are there only if the film came to its end."""
 
     film: Annotated[Path, "The folder or the video."]
-    shown: Annotated[int | None, "Number of frames that were shown."] = None
-    dropped: Annotated[int | None, "Number of frames that would have been late."] = None
+    shown: Annotated[int | None, "Number of shown frames."] = None
+    dropped: Annotated[int | None, "Number of late frames."] = None
     gain: Annotated[float | None, "Gain of all frames."] = None
-    frames_per_second: Annotated[float | None, "Pace of the frames that were shown."] = None
-    latency: Annotated[
-        float | None, "Median of the seconds between the due time of a frame and its drawing."
-    ] = None
+    frames_per_second: Annotated[float | None, "Pace."] = None
+    latency: Annotated[float | None, "Median seconds from a frame's due time to its drawing."] = (
+        None
+    )
 
 
 @dataclass(kw_only=True)

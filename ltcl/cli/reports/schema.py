@@ -18,9 +18,9 @@ from ltcl.cli.reports import acquisition, parts, pictures, program, transports
 from ltcl.cli.reports.report import Report
 
 DESCRIPTION = (
-    "Validate the output of a command against `#/$defs/` and its name (`acquire-run` for "
-    "`ltcl acquire run`), or against `#/$defs/error` if it failed. A number that is not finite is "
-    "null."
+    "Validate the output of a command against `#/$defs/` and its name "
+    "(`acquire-run` for `ltcl acquire run`), or against `#/$defs/error` if it "
+    "failed. A number that is not finite is null."
 )
 # The output of each command; words of the command line are joined by hyphens.
 COMMANDS: dict[str, Any] = {
@@ -30,11 +30,12 @@ COMMANDS: dict[str, Any] = {
     "simulate": acquisition.SimulateReport,
     "info": Annotated[
         list[transports.GoodFile | transports.BadFile],
-        "`ltcl info`: one entry for each file. Good files are shown also if others are bad; the "
-        "exit code is then 1.",
+        "`ltcl info`: one entry for each file. Good files are shown also if "
+        "others are bad; the exit code is then 1.",
     ],
     "analyze": Annotated[list[transports.AnalyzedFile], "`ltcl analyze`: one entry for each file."],
     "convert": transports.ConvertReport,
+    "align": transports.AlignReport,
     "compress": transports.CompressReport,
     "invert": transports.InvertReport,
     "denoise": transports.DenoiseReport,
@@ -73,7 +74,13 @@ PARTS: dict[str, type[Report]] = {
     "channel_analysis": transports.ChannelAnalysisReport,
     "photograph_missing": acquisition.PhotographMissing,
 }
-JSON_TYPES = {str: "string", Path: "string", bool: "boolean", int: "integer"}
+JSON_TYPES = {
+    str: "string",
+    Path: "string",
+    bool: "boolean",
+    int: "integer",
+    types.NoneType: "null",
+}
 
 
 def schema() -> dict[str, Any]:
@@ -149,16 +156,15 @@ def _describe_dictionary(kind: Any) -> dict[str, Any]:
 
 def _describe_union(kinds: tuple[Any, ...]) -> dict[str, Any]:
     """Describe one of several types: by a list of types if all are simple."""
-    choices = []
-    for kind in kinds:
-        choices.append({"type": "null"} if kind is types.NoneType else _describe(kind))
-    if any(choice.keys() != {"type"} for choice in choices):
-        return {"anyOf": choices}
-    names: list[str] = []
+    choices = [_describe(kind) for kind in kinds]
+    # Names of simple types, in their order.
+    names: dict[str, None] = {}
     for choice in choices:
-        types_of_choice = choice["type"]
-        names += types_of_choice if isinstance(types_of_choice, list) else [types_of_choice]
-    return {"type": list(dict.fromkeys(names))}
+        if choice.keys() != {"type"}:
+            return {"anyOf": choices}
+        name = choice["type"]
+        names |= dict.fromkeys([name] if isinstance(name, str) else name)
+    return {"type": [*names]}
 
 
 def _describe_part(report: type[Report]) -> dict[str, Any]:

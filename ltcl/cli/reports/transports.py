@@ -7,8 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ltcl.cli.reports.parts import Channels, ErrorReport, Heading, VerdictReport
+from ltcl.cli.reports.parts import (
+    Channels,
+    ErrorReport,
+    Heading,
+    ProjectorGrid,
+    Shape,
+    VerdictReport,
+)
 from ltcl.cli.reports.report import Report
+
+SolutionError = Annotated[float, "Bound on the error of solutions, by `--norm`."]
+ErrorBound = Annotated[float, "Bound on the error of solutions for any light."]
+StoredForm = Annotated[
+    Literal["dense", "sparse", "row blocks", "compressed", "inverse"],
+    "Form of storage.",
+]
 
 
 @dataclass(kw_only=True)
@@ -16,31 +30,19 @@ class FileFacts(Report):
     """Contents of a transport file or of an inverse."""
 
     file: Annotated[Path, "Path of the file."]
-    shape: Annotated[tuple[int, int], "Number of camera pixels and of projector pixels."]
-    grid: Annotated[tuple[int, int] | None, "Projector pixels, if the file has them."]
-    camera_grid: Annotated[tuple[int, int] | None, "Camera pixels, if the file has them."]
-    mixing: Annotated[
-        list[list[float]] | None, "Mixing of the projector's colours, 3 x 3, if the file has it."
-    ]
-    channels: Annotated[Channels, "1, or 3 for red, green and blue."]
-    stored: Annotated[
-        Literal["dense", "sparse", "row blocks", "compressed", "inverse"], "Form of storage."
-    ]
-    dtype: Annotated[
-        str, "Type of the values; for a compressed T the kinds of its parts and its error."
-    ]
-    entries: Annotated[int, "Number of entries that are not 0, or are stored."]
+    shape: Shape
+    grid: Annotated[tuple[int, int] | None, "Projector pixels, if known."]
+    camera_grid: Annotated[tuple[int, int] | None, "Camera pixels, if known."]
+    mixing: Annotated[list[list[float]] | None, "Mixing of the projector's colours, 3 x 3."]
+    channels: Channels
+    stored: StoredForm
+    dtype: Annotated[str, "Type of the values; of a compressed T its parts and error."]
+    entries: Annotated[int, "Number of nonzero or stored entries."]
     nbytes: Annotated[int, "Bytes in memory."]
-    first_bounce_from: Annotated[Literal["file", "diagonal"], "Source of the direct light."]
-    solution_error: Annotated[
-        float, "Relative error of solutions by compression; 0 if T is not compressed."
-    ]
-    first_bounce: Annotated[
-        tuple[float, float] | None, "Smallest and largest direct light; null if T is not square."
-    ]
-    dark_pixels: Annotated[
-        int | None, "Number of projector pixels without direct light; null if T is not square."
-    ]
+    first_bounce_from: Annotated[Literal["file", "diagonal"], "Source of F."]
+    solution_error: Annotated[float, "Relative error of solutions by compression, or 0."]
+    first_bounce: Annotated[tuple[float, float] | None, "Range of direct light of a square T."]
+    dark_pixels: Annotated[int | None, "Pixels without direct light of a square T."]
 
 
 @dataclass(kw_only=True)
@@ -69,22 +71,20 @@ class SeriesTerms(Report):
     """Errors after a number of terms."""
 
     n: Annotated[int, "Number of terms."]
-    next_bounce: Annotated[int, "Coefficient of bounce n + 1 in the inverse."]
-    forward: Annotated[float, "Bound on the error of the forward series."]
-    inverse: Annotated[
-        float | None, "Bound on the error of the inverse series; null if none is known."
-    ]
+    next_bounce: Annotated[int, "Bounce n + 1 in the inverse."]
+    forward: Annotated[float, "Error bound, forward series."]
+    inverse: Annotated[float | None, "Error bound, inverse series; null if unknown."]
 
 
 @dataclass(kw_only=True)
 class EnergyChecks(Report):
     """Checks of the conservation of energy."""
 
-    bounce_lowest: Annotated[float, "Smallest row sum of a bounce; below 0 it is unphysical."]
-    bounce_highest: Annotated[float, "Largest row sum of a bounce; from 1 on it is unphysical."]
-    albedo_from_columns: Annotated[float, "Albedo by the largest column sum of R."]
-    negative_entries: Annotated[float, "Share of the entries of T that are below 0."]
-    negative_light: Annotated[float, "Share of these entries in all light."]
+    bounce_lowest: Annotated[float, "Smallest row sum; unphysical below 0."]
+    bounce_highest: Annotated[float, "Largest row sum; unphysical from 1."]
+    albedo_from_columns: Annotated[float, "Albedo by column sums of R."]
+    negative_entries: Annotated[float, "Share of entries below 0."]
+    negative_light: Annotated[float, "Their share of all light."]
 
 
 @dataclass(kw_only=True)
@@ -92,42 +92,40 @@ class ChannelAnalysisReport(Report):
     """Analysis of a colour channel: the attributes of `ltcl.analysis.ChannelAnalysis`."""
 
     norm_one: Annotated[float, "1-norm of R."]
-    norm_inf: Annotated[float, "Largest row sum of R; below 1 the series converges."]
+    norm_inf: Annotated[float, "Largest row sum of R."]
     norm_frobenius: Annotated[float, "Frobenius norm of R."]
-    spectral_radius: Annotated[
-        float, "Spectral radius of R; the paper's iteration converges below 1."
-    ]
-    spectral_radius_change: Annotated[float, "Last relative change in the power iteration."]
+    spectral_radius: Annotated[float, "Spectral radius of R; the paper's iteration needs below 1."]
+    spectral_radius_change: Annotated[float, "Last change in its iteration."]
     spectral_radius_bounds: Annotated[
         tuple[float, float], "Lower and upper bound on the spectral radius."
     ]
-    spectral_radius_certificate: Annotated[str, "Basis of these bounds."]
-    albedo: Annotated[float, "Uniform albedo of a closed scene with this spectral radius."]
-    bounds: Annotated[tuple[float, float], "Lower and upper bound on the spectrum of S."]
+    spectral_radius_certificate: Annotated[str, "Source of the bounds."]
+    albedo: Annotated[float, "Uniform albedo of such a closed scene."]
+    bounds: Annotated[tuple[float, float], "Bounds on the spectrum of S."]
     products: Annotated[
         dict[str, float],
-        "Products by method, to `rtol`; null: it diverges, or there is no forecast.",
+        "Products to `rtol`, by method; null: none forecast, or it diverges.",
     ]
-    certificates: Annotated[dict[str, str], "Basis of the forecast, by method."]
-    series: Annotated[list[SeriesTerms], "Errors of the series after some terms."]
+    certificates: Annotated[dict[str, str], "Sources of these forecasts."]
+    series: Annotated[list[SeriesTerms], "Errors of the series."]
     first_bounce: Annotated[
         tuple[float, float, float], "Smallest, median and largest direct light."
     ]
-    reciprocity_defect: Annotated[float, "0 for a Lambertian scene without noise."]
-    negative_bounce: Annotated[float, "Negative share of a bounce; above 0.005 for glossy scenes."]
-    energy: Annotated[EnergyChecks, "Checks of the conservation of energy."]
+    reciprocity_defect: Annotated[float, "0 for matt scenes without noise."]
+    negative_bounce: Annotated[float, "Negative share of a bounce."]
+    energy: Annotated[EnergyChecks, "Checks of conservation of energy."]
 
 
 @dataclass(kw_only=True)
 class AnalysisReport(Report):
     """The attributes of `ltcl.Analysis`."""
 
-    shape: Annotated[tuple[int, int], "Number of camera pixels and of projector pixels."]
-    grid: Annotated[tuple[int, int], "Projector pixels: height, width."]
+    shape: Shape
+    grid: ProjectorGrid
     rtol: Annotated[float, "Relative residual of the forecasts."]
     nbytes: Annotated[int, "Bytes of T."]
-    masked: Annotated[int, "Number of projector pixels that stay unlit."]
-    channels: Annotated[list[ChannelAnalysisReport], "One entry for each colour channel."]
+    masked: Annotated[int, "Projector pixels that stay unlit."]
+    channels: Annotated[list[ChannelAnalysisReport], "By colour channel."]
     verdict: VerdictReport
 
 
@@ -151,10 +149,10 @@ class TrialReport(Report):
     nbytes: Annotated[int, "Bytes of the core."]
     error: Annotated[
         float | None,
-        "Bound on the 2-norm of the dropped part of R; null if pictures decided, or the basis was "
-        "abandoned.",
+        "Bound on the 2-norm of the dropped part of R; null if pictures "
+        "decided, or the basis was abandoned.",
     ]
-    left: Annotated[str, "Reason for which the basis was abandoned; else empty."]
+    left: Annotated[str, "Reason why it was abandoned, if it was."]
 
 
 @dataclass(kw_only=True)
@@ -171,13 +169,13 @@ class PictureErrorReport(Report):
 class ChannelCompressionReport(TrialReport):
     """Compression of a colour channel: the attributes of `ltcl.compression.ChannelCompression`."""
 
-    threshold: Annotated[float, "Threshold below which numbers were dropped."]
-    dropped: Annotated[float, "Bound on the Frobenius norm of the dropped part."]
+    threshold: Annotated[float, "Largest size of dropped numbers."]
+    dropped: Annotated[float, "Frobenius norm of the dropped part."]
     quantisation: Annotated[float, "Change of the core by rounding."]
-    inverse_norm: Annotated[float, "Bound on the 2-norm of the inverse of S."]
-    solution_error: Annotated[float, "Bound on the relative error of solutions, by `--norm`."]
-    error_bound: Annotated[float, "Bound on the relative error of solutions for any light."]
-    pictures: Annotated[PictureErrorReport | None, "Loss of pictures; null with `--norm worst`."]
+    inverse_norm: Annotated[float, "Bound on the norm of S^-1."]
+    solution_error: SolutionError
+    error_bound: ErrorBound
+    pictures: Annotated[PictureErrorReport | None, "Loss of pictures."]
     confidence: Annotated[float, "Confidence in all bounds."]
     trials: Annotated[list[TrialReport], "The bases that were tried."]
 
@@ -186,13 +184,13 @@ class ChannelCompressionReport(TrialReport):
 class CompressionReport(Report):
     """The attributes of `ltcl.Compression`."""
 
-    rtol: Annotated[float | str, "Requested error: a number, or `noise`."]
+    rtol: Annotated[float | str, "Requested error, or `noise`."]
     norm: Annotated[Literal["pictures", "worst"], "Requested norm."]
     budget: Annotated[int | None, "Requested limit, in bytes."]
     uncompressed: Annotated[int, "Bytes of T before."]
-    window: Annotated[tuple[int, int], "Pixels on which bases were tried: height, width."]
+    window: Annotated[tuple[int, int], "Pixels of trials."]
     seconds: Annotated[float, "Duration of the compression."]
-    channels: Annotated[list[ChannelCompressionReport], "One entry for each colour channel."]
+    channels: Annotated[list[ChannelCompressionReport], "By channel."]
 
 
 @dataclass(kw_only=True)
@@ -201,10 +199,10 @@ class CompressReport(Heading):
 
     out: Annotated[Path, "File that was written."]
     bytes: Annotated[int, "Bytes of T before."]
-    bytes_compressed: Annotated[int, "Bytes of T in memory, with its first bounce."]
+    bytes_compressed: Annotated[int, "Bytes of T in memory."]
     bytes_on_disk: Annotated[int, "Bytes of the file."]
-    solution_error: Annotated[float, "Bound on the relative error of solutions, by `--norm`."]
-    error_bound: Annotated[float, "Bound on the relative error of solutions for any light."]
+    solution_error: SolutionError
+    error_bound: ErrorBound
     compression: CompressionReport
 
 
@@ -215,7 +213,7 @@ class InvertReport(Heading):
     out: Annotated[Path, "File that was written."]
     bytes: Annotated[int, "Bytes in memory."]
     bytes_on_disk: Annotated[int, "Bytes of the file."]
-    errors: Annotated[list[float], "Bounds on the relative error of solutions, by channel."]
+    errors: Annotated[list[float], "Error bounds, by channel."]
     confidence: Annotated[float, "Confidence in all bounds."]
 
 
@@ -224,8 +222,18 @@ class NoiseReport(Report):
     """Standard deviations of an entry of T."""
 
     source: Annotated[str, "Source of the noise of T."]
-    before: Annotated[list[float], "Standard deviation of an entry of T, by channel."]
-    after: Annotated[list[float], "Remaining standard deviation in pictures, by channel."]
+    before: Annotated[list[float], "Noise of an entry, by channel."]
+    after: Annotated[list[float], "Noise left in pictures, by channel."]
+
+
+@dataclass(kw_only=True)
+class AlignReport(Heading):
+    """`ltcl align`."""
+
+    out: Annotated[Path, "File that was written."]
+    seen: Annotated[float, "Share of the projector's pixels that the camera sees."]
+    decoded: Annotated[float, "Share of the camera's pixels whose place is known."]
+    pictures: Annotated[list[Path], "Aligned pictures, in their order."]
 
 
 @dataclass(kw_only=True)

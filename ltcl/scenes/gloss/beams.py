@@ -65,15 +65,15 @@ def exchange(
     patches = cut(walls, n)
     bins = k * k
     beams = len(patches) * bins
-    what = f"an exchange of {beams} beams by {rays} rays each"
-    checks.fits_host(what, BYTES_PER_RAY * beams * rays)
+    light_field = f"an exchange of {beams} beams by {rays} rays each"
+    checks.fits_host(light_field, BYTES_PER_RAY * beams * rays)
     hits = scipy.sparse.csr_array((beams, beams))
     patches_at_once = max(1, RAYS_AT_ONCE // (bins * rays))
     generator = np.random.default_rng(seed)
     for start in range(0, len(patches), patches_at_once):
-        some = np.arange(start, min(start + patches_at_once, len(patches)))
-        places = _places(len(some), k, rays, generator)
-        hits = hits + _count_hits(walls, n, patches, some, places, boxes)
+        sources = np.arange(start, min(start + patches_at_once, len(patches)))
+        places = _places(len(sources), k, rays, generator)
+        hits = hits + _count_hits(walls, n, patches, sources, places, boxes)
     etendue = np.repeat(patches.area / bins, bins)  # e
     E = scipy.sparse.diags_array(etendue / rays) @ hits
     return _scaled_exchange(E, etendue)
@@ -113,31 +113,32 @@ def _count_hits(
     walls: Sequence[Wall],
     n: int,
     patches: Patches,
-    some: np.ndarray,
+    sources: np.ndarray,
     places: np.ndarray,
     blocks: Any,
 ) -> scipy.sparse.csr_array:
-    """Number of rays of each beam of `some` patches that end in each beam, (N M, N M)."""
+    """Number of rays of each beam of the patches `sources` that end in each beam, (N M, N M)."""
     _, bins, rays, _ = places.shape
     k = int(np.sqrt(bins))
     axes = patches.frames
     u = places[..., :1] - 0.5
     v = places[..., 1:2] - 0.5
-    right = patches.right[some, None, None]
-    down = patches.down[some, None, None]
-    centre = patches.centre[some, None, None]
+    right = patches.right[sources, None, None]
+    down = patches.down[sources, None, None]
+    centre = patches.centre[sources, None, None]
     origins = (centre + u * right + v * down).reshape(-1, 3)
-    directions = brdf.from_square(places[..., 2:]).reshape(len(some), -1, 3)
-    vectors = (directions @ axes[some]).reshape(-1, 3)
+    directions = brdf.from_square(places[..., 2:])
+    directions = directions.reshape(len(sources), -1, 3)
+    vectors = (directions @ axes[sources]).reshape(-1, 3)
     hits = cast(walls, origins, vectors, blocks)
     ray = np.flatnonzero(hits.wall >= 0)
     row = np.minimum((hits.v[ray] * n).astype(np.intp), n - 1)
     column = np.minimum((hits.u[ray] * n).astype(np.intp), n - 1)
     target = row * (n * len(walls)) + hits.wall[ray] * n + column
     towards_source = np.einsum("rij,rj->ri", axes[target], -vectors[ray])
-    source = some[ray // (bins * rays)]
+    source = sources[ray // (bins * rays)]
     source_beam = source * bins + ray // rays % bins
     target_beam = target * bins + brdf.bins(towards_source, k)
     beams = len(patches) * bins
-    ones = np.ones(len(ray))
-    return scipy.sparse.csr_array((ones, (source_beam, target_beam)), shape=(beams, beams))
+    entries = (np.ones(len(ray)), (source_beam, target_beam))
+    return scipy.sparse.csr_array(entries, shape=(beams, beams))

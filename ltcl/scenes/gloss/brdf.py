@@ -64,8 +64,8 @@ def from_square(square: np.ndarray) -> np.ndarray:
     a, b = np.moveaxis(2.0 * square - 1.0, -1, 0)
     is_steep = np.abs(a) <= np.abs(b)
     radius = np.where(is_steep, b, a)  # signed
-    other = np.where(is_steep, a, b)
-    ratio = np.divide(other, radius, out=np.zeros_like(radius), where=radius != 0)
+    shorter = np.where(is_steep, a, b)
+    ratio = _ratio(shorter, radius)
     angle = np.pi / 4 * ratio
     along = radius * np.cos(angle)
     across = radius * np.sin(angle)
@@ -83,11 +83,15 @@ def bins(vectors: np.ndarray, k: int) -> np.ndarray:
     longer = np.where(is_steep, y, x)
     shorter = np.where(is_steep, x, y)
     radius = np.hypot(x, y) * np.sign(longer)
-    slope = np.divide(shorter, longer, out=np.zeros_like(x), where=radius != 0)
-    other = radius * np.arctan(slope) * 4 / np.pi
-    column = _cell(np.where(is_steep, other, radius), k)
-    row = _cell(np.where(is_steep, radius, other), k)
+    turn = radius * np.arctan(_ratio(shorter, longer)) * 4 / np.pi
+    column = _cell(np.where(is_steep, turn, radius), k)
+    row = _cell(np.where(is_steep, radius, turn), k)
     return column * k + row
+
+
+def _ratio(shorter: np.ndarray, longer: np.ndarray) -> np.ndarray:
+    """shorter / longer, or 0 at the middle of the square."""
+    return np.divide(shorter, longer, out=np.zeros_like(longer), where=longer != 0)
 
 
 def _cell(place: np.ndarray, k: int) -> np.ndarray:
@@ -147,7 +151,9 @@ def lobe(exponent: float, k: int) -> Lobe:
     square = np.stack(np.meshgrid(place, place, indexing="ij"), axis=-1)
     cells = square.reshape(k, BIN_POINTS, k, BIN_POINTS, 2).swapaxes(1, 2)
     places = from_square(cells.reshape(bins, BIN_POINTS**2, 2))
-    rows = [_bin_means(of_bin, places, exponent).mean(axis=0) for of_bin in places]
+    rows = []
+    for bin_places in places:
+        rows.append(_bin_means(bin_places, places, exponent).mean(axis=0))
     means = np.stack(rows)
     means = (means + means.T) / 2  # symmetric to the bit
     scale = np.ones(bins)

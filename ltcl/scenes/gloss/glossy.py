@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
-import scipy.sparse.linalg
+from scipy.sparse.linalg import aslinearoperator
 
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
@@ -33,8 +33,16 @@ from ltcl.scenes.camera import SceneCamera
 from ltcl.scenes.gloss import beams, brdf
 from ltcl.scenes.patches import cut
 from ltcl.scenes.rays import Sight, sight
-from ltcl.scenes.scene import Scene
-from ltcl.scenes.walls import Block, Wall, point, spread_albedo, vector
+from ltcl.scenes.scene import Scene, single_or_all
+from ltcl.scenes.walls import (
+    Block,
+    Wall,
+    box_corners,
+    finite_floats,
+    point,
+    spread_albedo,
+    vector,
+)
 from ltcl.transport import frames as picture_frames
 
 # Columns of T that are computed together.
@@ -96,15 +104,15 @@ class GlossyScene(Scene):
             blocks = self.white.data * albedo[:, None, None]
             bsr = (blocks, self.white.indices, self.white.indptr)
             reflections.append(scipy.sparse.bsr_array(bsr))
-        return reflections[0] if self.channels == 1 else tuple(reflections)
+        return single_or_all(tuple(reflections))
 
     @property
     def A(self) -> Any:
         """Bounce of the light field, K G (eq. 4), a LinearOperator; a tuple of three in colour."""
-        G = scipy.sparse.linalg.aslinearoperator(self.G)
-        reflections = self.K if self.channels == 3 else (self.K,)
-        bounces = [scipy.sparse.linalg.aslinearoperator(K) @ G for K in reflections]
-        return bounces[0] if self.channels == 1 else tuple(bounces)
+        G = aslinearoperator(self.G)
+        if self.channels == 1:
+            return aslinearoperator(self.K) @ G
+        return tuple(aslinearoperator(K) @ G for K in self.K)
 
     @property
     def first_bounce(self) -> np.ndarray:
@@ -112,9 +120,9 @@ class GlossyScene(Scene):
 
         It is 0 where camera or projector see nothing.
         """
-        direct = self.P.sum(axis=1) * self.white.data[:, -1, -1] * self.Q.sum(axis=0)
-        F = self.albedo * direct
-        return F[0] if self.channels == 1 else F
+        reflected = self.P.sum(axis=1) * self.white.data[:, -1, -1]
+        direct = reflected * self.Q.sum(axis=0)
+        return single_or_all(self.albedo * direct)
 
     def matrices(self) -> tuple[np.ndarray, ...]:
         """T = P S F Q, one (N, N) float64 array per channel, bounces summed until 1e-8 is left.
@@ -136,8 +144,8 @@ class GlossyScene(Scene):
         for albedo in self.albedo:
             columns = []
             for start in range(0, patches, COLUMNS_AT_ONCE):
-                some = light[:, start : start + COLUMNS_AT_ONCE]
-                columns.append(sum(self._pictures(albedo, some)))
+                patterns = light[:, start : start + COLUMNS_AT_ONCE]
+                columns.append(sum(self._pictures(albedo, patterns)))
             matrices.append(np.concatenate(columns, axis=1))
         return tuple(matrices)
 
@@ -172,7 +180,9 @@ class GlossyScene(Scene):
         channels = []
         for albedo, light in zip(self.albedo, columns, strict=True):
             channels.append(list(self._pictures(albedo, light, count)))
-        pictures = [layout.pack(list(parts), self.grid) for parts in zip(*channels, strict=True)]
+        pictures = []
+        for bounce in zip(*channels, strict=True):
+            pictures.append(layout.pack(list(bounce), self.grid))
         return np.stack(pictures)
 
     def _pictures(
@@ -189,7 +199,8 @@ class GlossyScene(Scene):
             leaving *= albedo[:, None, None]
             leaving = leaving.reshape(arriving.shape)
             yield self.P @ leaving
-            tail = np.abs(leaving).max(initial=0.0) * largest_albedo / (1 - largest_albedo)
+            largest = np.abs(leaving).max(initial=0.0)
+            tail = largest * largest_albedo / (1 - largest_albedo)
             if bounce == count or (count is None and tail <= MAX_TAIL):
                 return
             arriving = self.G @ leaving
@@ -265,7 +276,7 @@ def glossy(
         raise InputTypeError(f"blocks is {blocks!r}; it must be a sequence of ltcl.scenes.Block")
     if isinstance(room, Scene):
         blocks = (*room.blocks, *blocks)
-    boxes = np.array([(block.low, block.high) for block in blocks]).reshape(-1, 2, 3)
+    boxes = box_corners(blocks)
     n = checks.count("n", n)
     k = brdf.side(directions)
     size = n * n * len(walls)
@@ -342,8 +353,7 @@ def _materials(gloss: Any, exponent: Any, walls: int, k: int) -> list[tuple[floa
 
 def _of_walls(name: str, value: Any, walls: int) -> list[float]:
     """A number for each wall, of one for all or one for each."""
-    array = checks.finite(name, checks.real(name, value)).astype(np.float64)
-    checks.shape(name, array, (), (walls,))
+    array = checks.shape(name, finite_floats(name, value), (), (walls,))
     return np.broadcast_to(array, (walls,)).tolist()
 
 
@@ -351,7 +361,8 @@ def _form_factors(exchange: Any, area: np.ndarray) -> np.ndarray:
     """Form factors (N, N) of matte patches, means over the bins: reciprocal, no row above 1."""
     size = len(area)
     bins = exchange.shape[0] // size
-    sums = scipy.sparse.kron(scipy.sparse.eye_array(size), np.ones((1, bins)), format="csr")
+    identity = scipy.sparse.eye_array(size)
+    sums = scipy.sparse.kron(identity, np.ones((1, bins)), format="csr")
     both = area[:, None] * (sums @ exchange @ sums.T).toarray() / bins
     form_factors = (both + both.T) / (2 * area[:, None])
     return form_factors / max(1.0, form_factors.sum(axis=1).max())

@@ -85,7 +85,7 @@ def compensate(
         has.
     weights : like `desired` or one frame of it, optional
         Factor, at least 0, of the residual at each camera pixel, before it is squared. When not
-        given 1, and 0 where T.masked.
+        given 1, and 0 where `T.unlit`: at camera pixels that no projector pixel lights.
     method, rtol, **options
         Arguments of `ltcl.solve`. rtol is 1e-2 when not given, or the error of a compressed T or
         an inverse where that is more, as the result's `rtol` says. Within the bounds the error is
@@ -276,7 +276,7 @@ def _bring_within_bounds(request: CompensationRequest, start: StartingLight) -> 
     """Step 3: the light within the bounds that comes nearest to the target, or the clamped one."""
     problem = request.problem
     limits = problem.limits
-    frames = request.shape.frames or 1
+    frames = request.shape.frame_count
     light: Columns = []
     solves: list[Bounded] = []
     clipped = np.zeros(frames)
@@ -307,9 +307,11 @@ def _judge(
     frames = len(bounded.frame_clipped)
     frame_sizes = _norms_of_frames(target_norms, frames)
     frame_errors = _norms_of_frames(problem.norms(evidence.missing), frames)
+    # Errors of a black target are not relative; norms are in the unit of the weights.
+    black_size = 1.0 / problem.weight_unit
     size = float(np.linalg.norm(frame_sizes))
     if size == 0.0:
-        size = 1.0
+        size = black_size
     error = float(np.linalg.norm(frame_errors))
     solutions = start.solutions
     if not solutions:
@@ -320,7 +322,7 @@ def _judge(
         clipped=bounded.clipped,
         error=error / size,
         gap=max(error - _least_error(problem, bounded), 0.0) / size,
-        frame_errors=frame_errors / np.where(frame_sizes > 0, frame_sizes, 1.0),
+        frame_errors=frame_errors / np.where(frame_sizes > 0, frame_sizes, black_size),
         frame_clipped=bounded.frame_clipped,
         solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=bounded.solves,

@@ -96,9 +96,9 @@ class GainTrials:
             )
         largest_size = max(np.prod(A.shape) for A, _ in problem.systems)
         self.is_on_host = largest_size <= MAX_HOST_ENTRIES
-        self.matrices: list[Any] = []
-        for A, _ in problem.systems:
-            self.matrices.append(A.to_dense() if self.is_on_host else A)
+        self.matrices: list[Any] = [A for A, _ in problem.systems]
+        if self.is_on_host:
+            self.matrices = [A.to_dense() for A in self.matrices]
 
     def upper_bound(self, loss: float) -> tuple[float, Columns]:
         """A gain that no gain within `loss` exceeds, and the light that is most like desired.

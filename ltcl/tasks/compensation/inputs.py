@@ -22,7 +22,7 @@ from ltcl.tasks.compensation.problem import (
     channel_systems,
     stack_channels,
 )
-from ltcl.tasks.requirements import check_inverse, default_rtol, resolve_reference
+from ltcl.tasks.requirements import check_exact, check_inverse, default_rtol
 from ltcl.transport import frames as layout
 from ltcl.transport.transport import Transport, check_transport
 
@@ -69,8 +69,8 @@ class CompensationRequest:
     inverse : Inverse, optional
     method, options : str, dict
         Arguments of `ltcl.solve`.
-    exact : sequence of Operator or None
-        The systems that judge the solves of each channel.
+    exact : sequence of Operator
+        The systems that judge the solves of each channel, if T does not judge them itself.
     clamp : bool
     """
 
@@ -86,7 +86,7 @@ class CompensationRequest:
     inverse: Inverse | None
     method: str
     options: dict[str, Any]
-    exact: Sequence[Operator | None]
+    exact: Sequence[Operator]
     clamp: bool
 
 
@@ -120,13 +120,20 @@ def check_inputs(
         other_method = None if method == "auto" else method
         check_inverse(T, inverse, rtol, exact=exact, method=other_method)
     if rtol is None:
-        rtol = default_rtol(RTOL, T, exact, inverse)
+        rtol = RTOL
+        if T.is_compressed or inverse is not None:
+            rtol = default_rtol(RTOL, T, exact, inverse)
     settings = check_settings(T, method, rtol, options)
     if checks.flag("clamp", clamp) and not T.is_square:
         raise InputError(
             "clamp is True, but this T has no S; its light is found within the bounds only"
         )
-    reference, judging_systems = resolve_reference(T, exact)
+    reference = T
+    judging_systems: Sequence[Operator] = ()
+    if exact is not None:
+        check_exact(T, exact)
+        reference = exact
+        judging_systems = exact.systems
     if channel_weights is not None:
         channel_weights = stack_channels(channel_weights, system_count)
     problem = CompensationProblem(
@@ -195,10 +202,10 @@ def check_weights(
 
     The unit is a power of 2 that keeps their squares inside float64.
     """
-    if weights is None and not T.masked.any():
+    if weights is None and not T.unlit.any():
         return None, 1.0
     if weights is None:
-        is_lit = ~T.masked[:, None]
+        is_lit = ~T.unlit[:, None]
         return [np.broadcast_to(is_lit, d.shape).astype(np.float64) for d in desired], 1.0
     weights = checks.real("weights", weights).astype(np.float64, copy=False)
     channels = _check_frames("weights", weights, T, shape, desired)
@@ -271,6 +278,5 @@ def _check_frames(
 
 def _frames_and_colours(shape: layout.PictureLayout, channels: int) -> tuple[int, int]:
     """Frames, and colours that stand side by side in the columns of one channel."""
-    frames = 1 if shape.frames is None else shape.frames
     colours = 3 if shape.colour and channels == 1 else 1
-    return frames, colours
+    return shape.frame_count, colours

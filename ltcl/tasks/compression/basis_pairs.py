@@ -39,12 +39,12 @@ def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
     is_list = isinstance(names, (list, tuple)) and len(names) > 0
     if not is_list or not all(isinstance(name, str) for name in names):
         raise InputTypeError(
-            f"basis is {names!r}; it must be a name, such as db2, or a list of at least one"
+            f"basis is {names!r}; it must be a name, such as db2, or a list of names"
         )
     for name in names:
         if for_inverse and name.endswith(ROWS):
             raise InputError(
-                f"basis is {name!r}; an inverse needs one basis on both sides, such as 'db2'"
+                f"basis is {name!r}; an inverse needs the same basis on both sides, such as 'db2'"
             )
         if name == PIXELS:
             continue
@@ -86,8 +86,7 @@ class Bases:
             # Large coefficients then lie side by side, in fewer tiles.
             order = multiresolution_order(grid, W.levels)
             W = SubsetBasis(device, grid, order, of=W)
-        pixels = grid[0] * grid[1]
-        weights = np.ones(pixels)
+        weights = np.ones(grid[0] * grid[1])
         if light is not None:
             weights = np.sqrt(1.0 + len(light) * energies(W, light))
         out = None if name.endswith(ROWS) else W
@@ -113,7 +112,8 @@ class Bases:
     ) -> Coefficients:
         """The numbers of R, times the weights, within the `limits` of `coefficients`."""
         out = None if self.out is None else CoefficientAnalysis(self.out)
-        into = CoefficientAnalysis(self.into, self.weights[:, None].astype(np.float32))
+        weights = self.weights[:, None].astype(np.float32)
+        into = CoefficientAnalysis(self.into, weights)
         return coefficients(R, out, into, progress=progress, **limits)
 
     def noise(self, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,11 +122,12 @@ class Bases:
         `variances` (2, N) are of rows and columns of R; pictures of random signs show what the
         bases make of them.
         """
-        generator = np.random.default_rng(0)
-        signs = generator.choice([-1.0, 1.0], (variances.shape[1], SIGN_PICTURES))
-        row_variances, column_variances = variances
-        rows = np.sqrt(energies(self.out, np.sqrt(row_variances)[:, None] * signs))
-        columns = np.sqrt(energies(self.into, np.sqrt(column_variances)[:, None] * signs))
+        random = np.random.default_rng(0)
+        pixels = variances.shape[1]
+        signs = random.choice([-1.0, 1.0], (pixels, SIGN_PICTURES))
+        row_noise, column_noise = np.sqrt(variances)
+        rows = np.sqrt(energies(self.out, row_noise[:, None] * signs))
+        columns = np.sqrt(energies(self.into, column_noise[:, None] * signs))
         return rows, self.weights * columns
 
 
@@ -155,13 +156,14 @@ class CoefficientAnalysis:
             x = self.weights * x
         return x
 
-    def __reduce__(self) -> tuple[Callable[..., CoefficientAnalysis], tuple[Any, ...]]:
-        arrays = None if self.W is None else self.W.to_arrays()
-        return _unpickle_analysis, (arrays, self.weights)
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        if self.W is None:
+            return CoefficientAnalysis, (None, self.weights)
+        return _unpickle_analysis, (self.W.to_arrays(), self.weights)
 
 
 def _unpickle_analysis(arrays: Any, weights: np.ndarray | None) -> CoefficientAnalysis:
-    W = None if arrays is None else basis_of(_device_of_worker(), arrays)
+    W = basis_of(_device_of_worker(), arrays)
     return CoefficientAnalysis(W, weights)
 
 

@@ -49,8 +49,7 @@ def quantize(C: scipy.sparse.csr_array, allowance: float) -> Packed:
     # The 2-norm of rounding is far below its Frobenius norm, which is that of equal rows at most.
     frobenius = allowance * math.sqrt(rows)
     while True:
-        relative = frobenius / size if size else 0.0
-        packed = smallest(C, relative)
+        packed = smallest(C, frobenius / size if size else 0.0)
         frobenius_of_rounding, norm_of_rounding = packed.difference
         if packed.precision == "float32" or norm_of_rounding <= allowance:
             return packed
@@ -86,8 +85,9 @@ def drop_below(X: Any, threshold: float) -> tuple[scipy.sparse.csr_array, float]
 def _drop_below_sparse(X: Any, threshold: float) -> tuple[scipy.sparse.csr_array, float]:
     is_kept = np.abs(X.data) >= threshold
     dropped = X.data[~is_kept].astype(np.float64)
-    kept_before = np.concatenate([[0], np.cumsum(is_kept)]).astype(X.indptr.dtype)
-    csr = (X.data[is_kept], X.indices[is_kept], kept_before[X.indptr])
+    kept_before = np.concatenate([[0], np.cumsum(is_kept)])
+    pointers = kept_before.astype(X.indptr.dtype)[X.indptr]
+    csr = (X.data[is_kept], X.indices[is_kept], pointers)
     return scipy.sparse.csr_array(csr, X.shape), float(dropped @ dropped)
 
 
@@ -107,13 +107,15 @@ def threshold_within(frobenius: float, *arrays: np.ndarray, most: float = math.i
             sizes = np.abs(flat[start:stop])
             keys = sizes.view(np.int32) >> BIN_BITS
             counts += np.bincount(keys, minlength=bins)
-            squares += np.bincount(keys, np.square(sizes, dtype=np.float64), minlength=bins)
+            powers = np.square(sizes, dtype=np.float64)
+            squares += np.bincount(keys, powers, minlength=bins)
     largest_square = frobenius**2 * (1 + SQUARE_TOLERANCE)
-    edge = int(np.searchsorted(np.cumsum(squares), largest_square, side="right"))
-    edge_above_all = int(np.flatnonzero(counts)[-1]) + 1 if counts.any() else 0
-    edge = min(edge, edge_above_all)
+    edge = np.searchsorted(np.cumsum(squares), largest_square, side="right")
+    # No edge is above the bin of the largest number.
+    edge = min(int(edge), int(np.max(np.flatnonzero(counts) + 1, initial=0)))
     numbers_from_bin = np.cumsum(counts[::-1])[::-1]
-    edge = max(edge, int(np.searchsorted(-numbers_from_bin, -most, side="left")))
+    edge_of_most = np.searchsorted(-numbers_from_bin, -most, side="left")
+    edge = max(edge, int(edge_of_most))
     return float(np.int32(edge << BIN_BITS).view(np.float32))
 
 
@@ -199,7 +201,8 @@ def coefficients(
 
     between = _collect(R, into, first, drop / 3.0, room_for_numbers, progress_of_rows)
     columns = scipy.sparse.csr_array(between.core.T)
-    lit = np.flatnonzero(np.diff(columns.indptr))  # few, where light is smooth
+    # Where light is smooth, few columns are lit.
+    lit = np.flatnonzero(np.diff(columns.indptr))
     lit_columns = source("C", columns[lit], R.memory, R.client)
     collected = _collect(lit_columns, out, threshold, drop, most, progress_of_columns)
     core = scipy.sparse.csr_array(collected.core.T)
@@ -223,10 +226,10 @@ def _dense_coefficients(
     m, n = R.shape
     C = np.empty((m, n), np.float32)
 
-    def transform_rows(place: slice, rows: np.ndarray, value: Any) -> tuple[slice, np.ndarray]:
+    def transform(place: slice, rows: np.ndarray, value: Any) -> tuple[slice, Any]:
         return place, _transformed(into, rows.T).T
 
-    for place, rows in R.each(transform_rows):
+    for place, rows in R.map_blocks(transform):
         C[place] = rows
         progress(0.5 * place.stop / m)
     if out is not None:
@@ -261,31 +264,33 @@ def _collect(
     A threshold that is not given rises whenever twice as many numbers as `most` have come together,
     never above what all of them call for.
     """
-    kept = _KeptNumbers(R.shape[1], threshold or 0.0)
+    numbers = _KeptNumbers(R.shape[1])
+    if threshold is not None:
+        numbers.threshold = threshold
 
-    def large_numbers(
+    def drop_small(
         place: slice, rows: np.ndarray, least: float
     ) -> tuple[int, scipy.sparse.csr_array, float]:
         core, squares = drop_below(_transformed(W, rows.T), least)
         return place.stop, scipy.sparse.csr_array(core.T), squares
 
-    for stop, piece, squares in R.each(large_numbers, lambda: kept.threshold):
-        kept.append(piece, squares)
-        if threshold is None and kept.count > 2 * most:
-            kept.raise_threshold(0.0, most)
+    for stop, piece, squares in R.map_blocks(drop_small, lambda: numbers.threshold):
+        numbers.append(piece, squares)
+        if threshold is None and numbers.count > 2 * most:
+            numbers.raise_threshold(0.0, most)
         progress(stop / R.shape[0])
     if threshold is None:
-        room = max(drop**2 - kept.squares, 0.0)
-        kept.raise_threshold(math.sqrt(room), most)
-    core = scipy.sparse.csr_array(scipy.sparse.vstack(kept.pieces, format="csr"))
-    return _Collected(core, math.sqrt(kept.squares), kept.threshold)
+        room = max(drop**2 - numbers.squares, 0.0)
+        numbers.raise_threshold(math.sqrt(room), most)
+    core = scipy.sparse.csr_array(scipy.sparse.vstack(numbers.pieces, format="csr"))
+    return _Collected(core, math.sqrt(numbers.squares), numbers.threshold)
 
 
 class _KeptNumbers:
     """Pieces of a sparse matrix that come together, above a threshold that rises."""
 
-    def __init__(self, columns: int, threshold: float) -> None:
-        self.threshold = threshold
+    def __init__(self, columns: int) -> None:
+        self.threshold = 0.0
         self.squares = 0.0  # of what was dropped
         self.pieces: list[Any] = [scipy.sparse.csr_array((0, columns), dtype=np.float32)]
 
@@ -302,7 +307,8 @@ class _KeptNumbers:
     def raise_threshold(self, frobenius: float, most: float) -> None:
         """Drop numbers of at most this norm, and more, to leave `most`."""
         values = [piece.data for piece in self.pieces]
-        self.threshold = max(self.threshold, threshold_within(frobenius, *values, most=most))
+        threshold = threshold_within(frobenius, *values, most=most)
+        self.threshold = max(self.threshold, threshold)
         pieces = []
         squares = []
         for piece in self.pieces:
@@ -318,6 +324,7 @@ def _transformed(transform: Transform | None, block: np.ndarray) -> np.ndarray:
     if transform is None:
         return np.ascontiguousarray(block)
     rows, columns = block.shape
-    padded = np.zeros((rows, -(-columns // COLUMNS) * COLUMNS), np.float32)
+    padded_columns = -(-columns // COLUMNS) * COLUMNS
+    padded = np.zeros((rows, padded_columns), np.float32)
     padded[:, :columns] = block
     return transform(padded)[:, :columns]

@@ -131,9 +131,8 @@ def compress(
     """
     began = time.perf_counter()
     checks.one_of("norm", norm, ROUNDING_SHARE)
-    by_noise = isinstance(rtol, str) and rtol == "noise"
     goal: Goal
-    if by_noise:
+    if isinstance(rtol, str) and rtol == "noise":
         goal = ByNoise(norm)
     else:
         rtol = check_rtol(rtol, FLOAT32_UNIT)
@@ -142,14 +141,19 @@ def compress(
         budget = checks.count("budget", budget)
     if memory is not None:
         memory = checks.count("memory", memory)
-    names = basis_names(INVERSE_NAMES if basis is None else basis)
+    if basis is None:
+        basis = INVERSE_NAMES
+    names = basis_names(basis)
     note = check_progress(progress)
     if client is not None:
         cluster.require(client)
     with memory_errors("compress", T):
-        noise = check_transport(T).noise if by_noise else None
+        noise = None
+        if isinstance(goal, ByNoise):
+            noise = check_transport(T).noise
         inputs = check_inputs(T, grid, first_bounce, device, noise, memory=memory, client=client)
-        C, channels = compress_inputs(inputs, names, goal, fresh_starts("compress"), note)
+        starts = fresh_starts("compress")
+        C, channels = compress_inputs(inputs, names, goal, starts, note)
     _check_budget(budget, rtol, channels)
     C.compression = Compression(
         rtol=rtol,
@@ -168,7 +172,9 @@ def check_rtol(rtol: Any, least: float) -> float:
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     if rtol <= least:
         rounding = checks.upwards(least)
-        raise ToleranceError(f"rtol is {rtol:g}; it must be above {rounding}, which float32 rounds")
+        raise ToleranceError(
+            f"rtol is {rtol:g}; it must be above {rounding}, the rounding of float32"
+        )
     return rtol
 
 
@@ -178,8 +184,8 @@ def _check_budget(
     needed = sum(channel.nbytes for channel in channels)
     if budget is not None and needed > budget:
         raise InputError(
-            f"budget is {budget} bytes, but rtol {rtol} needs {needed} ({checks.size(needed)}); "
-            f"give a budget of at least {needed} bytes, or a larger rtol"
+            f"budget is {budget} bytes, but rtol {rtol} needs {needed} "
+            f"({checks.size(needed)}); give at least {needed} bytes, or a larger rtol"
         )
 
 
@@ -191,19 +197,22 @@ def compress_inputs(
     progress: Note,
 ) -> tuple[Transport, tuple[ChannelCompression, ...]]:
     """R of every channel in the best of the bases `names`, and the report of each."""
-    confirmation = Confirmation(starts, fresh_starts("pictures", 1.0 - PICTURE_CONFIDENCE))
+    draws = fresh_starts("pictures", 1.0 - PICTURE_CONFIDENCE)
+    confirmation = Confirmation(starts, draws)
     count = len(inputs.problems)
     matrices = []
     reports = []
     for channel, problem in enumerate(inputs.problems):
 
         def note(text: str, share: float, channel: int = channel) -> None:
-            label = f"{COLOURS[channel]}: " if count == 3 else ""
-            progress(label + text, (channel + share) / count)
+            if count == 3:
+                text = f"{COLOURS[channel]}: {text}"
+            progress(text, (channel + share) / count)
 
         best, trials = goal.compare(problem.window(), names, note)
         fit = goal.whole(problem, best, confirmation, note)
         matrices.append(ScaledColumns(fit.system(problem), problem.F))
         reports.append(fit.report(trials))
         note("done", 1.0)
-    return Transport(matrices, dark_threshold=0.0, **inputs.settings), tuple(reports)
+    C = Transport(matrices, dark_threshold=0.0, **inputs.settings)
+    return C, tuple(reports)

@@ -161,11 +161,16 @@ class Fit:
         return len(self.numbers.core.indptr) - 1
 
     @property
-    def error_bound(self) -> float:
-        """Upper bound on ||x~ - x|| / ||x||."""
+    def error(self) -> float:
+        """Upper bound on the 2-norm of R~ - R, infinite where it was not measured."""
         if self.norm is None:
             return math.inf
-        return self.norm.upper * self.inverse
+        return self.norm.upper
+
+    @property
+    def error_bound(self) -> float:
+        """Upper bound on ||x~ - x|| / ||x||."""
+        return self.error * self.inverse
 
     @property
     def solution_error(self) -> float:
@@ -180,9 +185,8 @@ class Fit:
             diagonal = problem.operator.diagonal()
         except InputError:  # an operator of the user may have none
             diagonal = None
-        error = math.inf if self.norm is None else self.norm.upper
         core = Tiles(self.R.device, self.R.core.packed)
-        R = Compressed(core, self.R.out, self.R.into, error, diagonal=diagonal)
+        R = Compressed(core, self.R.out, self.R.into, error=self.error, diagonal=diagonal)
         S = IdentityPlus(R, solution_error=self.solution_error)
         S.error_bound = self.error_bound
         return S
@@ -225,5 +229,5 @@ def error_norm(
 ) -> TwoNorm:
     """||R~ - R||_2, bounded by what is certain of its Frobenius norm."""
     size = float(np.linalg.norm(numbers.core.data.astype(np.float64)))
-    certain = numbers.dropped + TRANSFORM_ROUNDING * size + R.core.quantisation
-    return two_norm(problem.operator, R, factor=factor, frobenius=certain, **start)
+    frobenius = numbers.dropped + TRANSFORM_ROUNDING * size + R.core.quantisation
+    return two_norm(problem.operator, R, factor=factor, frobenius=frobenius, **start)

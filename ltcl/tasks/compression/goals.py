@@ -112,8 +112,8 @@ def bound_all_light(
     start = next(confirmation.starts)
     norm = error_norm(problem, fit.numbers, fit.R, COARSE_NORM_FACTOR, **start)
     start = next(confirmation.starts)
-    inverse = inverse_norm(IdentityPlus(fit.R), factor=COARSE_NORM_FACTOR, **start)
-    return replace(fit, norm=norm, inverse=inverse.upper, pictures=pictures)
+    inverse = inverse_norm(IdentityPlus(fit.R), factor=COARSE_NORM_FACTOR, **start).upper
+    return replace(fit, norm=norm, inverse=inverse, pictures=pictures)
 
 
 @dataclass(frozen=True)
@@ -205,15 +205,16 @@ class _Comparison:
         self.trials: list[Trial] = []
         self.refusals: list[ToleranceError] = []
         self.fewest = math.inf  # numbers of the best basis so far
-        # Norm of S^-1, None until the first basis tells it.
-        self.inverse = DIFFUSE_INVERSE_NORM if goal.is_of_pictures else None
+        # Norm of S^-1: a guess, until the first basis tells it where it matters.
+        self.inverse = DIFFUSE_INVERSE_NORM
+        self.is_inverse_known = goal.is_of_pictures
 
     def try_basis(self, name: str, note: Callable[[str], object]) -> None:
         """Fit in one basis, unless it needs far more numbers than another."""
         note(name)
         pixels = self.window.pixels
         bases = self.goal.bases(self.window, name)
-        allowed = self.goal.frobenius(self.inverse or DIFFUSE_INVERSE_NORM, pixels)
+        allowed = self.goal.frobenius(self.inverse, pixels)
         candidates = bases.gather(
             self.window.R, drop=GATHERED_SHARE * allowed, most=MAX_NUMBERS_PER_ROW * pixels
         )
@@ -223,9 +224,10 @@ class _Comparison:
             self._leave(name, count, f"{ratio:.1f} times as many numbers for the same error")
             return
         self.fewest = min(self.fewest, count)
-        if self.inverse is None:
+        if not self.is_inverse_known:
             note(f"{name}: norm of S^-1")
             self.inverse = self._inverse_norm(bases, candidates)
+            self.is_inverse_known = True
         fitting = ToleranceFitting(
             goal=self.goal, problem=self.window, bases=bases, note=note, confirmation=None
         )
@@ -243,7 +245,8 @@ class _Comparison:
         try:
             R = bases.compressed(candidates.core, 0.0)
             return inverse_norm(IdentityPlus(R)).upper
-        except ConvergenceError:  # the candidates are not good enough for that
+        except ConvergenceError:
+            # The candidates are not good enough for that.
             return inverse_norm(IdentityPlus(self.window.operator)).upper
 
     def _leave(self, name: str, count: int, reason: str) -> None:
@@ -315,8 +318,9 @@ class ToleranceFitting:
                 break
         if best is None:
             least = float(checks.upwards(1.25 * share * rtol))
-            message = f"rtol is {rtol:g}, but float32 reaches about {least:g} for this T"
-            raise ToleranceError(message, least)
+            raise ToleranceError(
+                f"rtol is {rtol:g}, but float32 reaches about {least:g} for this T", least
+            )
         return best
 
     def _measure(
@@ -332,13 +336,12 @@ class ToleranceFitting:
             pictures = self._picture_error(R)
             least_error = pictures.error
         else:
-            start = {} if self.confirmation is None else next(self.confirmation.starts)
-            norm = error_norm(self.problem, numbers, R, NORM_FACTOR, **start)
+            norm = error_norm(self.problem, numbers, R, NORM_FACTOR, **self._next_start())
             least_error = norm.estimate * inverse
             is_promising = norm.upper * inverse <= self.goal.rtol
             if self.confirmation is not None and is_promising:
                 self.note(f"{stage}: norm of S^-1")
-                start = next(self.confirmation.starts)
+                start = self._next_start()
                 inverse = inverse_norm(IdentityPlus(R), factor=NORM_FACTOR, **start).upper
         fit = Fit(
             bases=self.bases,
@@ -351,16 +354,24 @@ class ToleranceFitting:
         )
         return _Measured(fit, least_error)
 
-    def _picture_error(self, R: Any) -> PictureError:
+    def _next_start(self) -> dict[str, Any]:
         if self.confirmation is None:
-            return picture_error(self.problem, R, count=COMPARED_PICTURES)
-        return picture_error(self.problem, R, **next(self.confirmation.draws))
+            return {}
+        return next(self.confirmation.starts)
+
+    def _picture_error(self, R: Any) -> PictureError:
+        draw: dict[str, Any] = {"count": COMPARED_PICTURES}
+        if self.confirmation is not None:
+            draw = next(self.confirmation.draws)
+        return picture_error(self.problem, R, **draw)
 
     def _is_rounding_alone(self, measured: _Measured) -> bool:
         """True if the error is above the tolerance by rounding, which is as fine as it can be."""
         fit = measured.fit
-        of_rounding = measured.least_error - fit.numbers.dropped * fit.inverse
-        return fit.R.core.precision == "float32" and of_rounding > self.goal.rtol
+        if fit.R.core.precision != "float32":
+            return False
+        dropped = fit.numbers.dropped * fit.inverse
+        return measured.least_error - dropped > self.goal.rtol
 
     def _gather_finer(self, candidates: Coefficients, inverse: float, share: float) -> Coefficients:
         """More candidates, where some were dropped."""
@@ -414,7 +425,8 @@ class ByNoise(Goal):
         low = SIGNIFICANT_WHERE_BRIGHT**2
         average = SIGNIFICANT_ON_AVERAGE**2
         limits = np.sqrt(low + 2.0 * (average - low) / squared_weights)
-        least = MIN_NOISE_SCALE * _smallest_lit(rows) * _smallest_lit(limits * columns)
+        smallest_column = _smallest_lit(limits * columns)
+        least = MIN_NOISE_SCALE * _smallest_lit(rows) * smallest_column
         if not math.isfinite(least):
             least = 0.0
         gathered = bases.gather(problem.R, threshold=least)
@@ -422,13 +434,15 @@ class ByNoise(Goal):
 
         # 2. Drop those within the noise. Its scale is corrected first: dropped numbers have all of
         # their noise, and where they are less than T.noise says, that is too much.
-        noise = np.repeat(rows, np.diff(core.indptr)) * columns[core.indices]
+        noise = np.repeat(rows, np.diff(core.indptr))
+        noise *= columns[core.indices]
         is_small = np.abs(core.data) < limits[core.indices] * noise
         dropped_square = gathered.dropped**2 + np.sum(core.data[is_small] ** 2)
         total_noise = float(np.sum(rows**2) * np.sum(columns**2))
         dropped_noise = total_noise - np.sum(noise[~is_small] ** 2)
         if dropped_noise > 0.0:
-            noise *= np.clip(math.sqrt(dropped_square / dropped_noise), MIN_NOISE_SCALE, 1.0)
+            scale = math.sqrt(dropped_square / dropped_noise)
+            noise *= np.clip(scale, MIN_NOISE_SCALE, 1.0)
         is_small = np.abs(core.data) < limits[core.indices] * noise
         kept_columns = core.indices[~is_small]
         kept_noise = noise[~is_small]
@@ -438,7 +452,8 @@ class ByNoise(Goal):
         numbers = replace(gathered, core=core, second=second)
 
         # 3. Estimate the squared error of pictures: squares lost, and twice the variance kept.
-        noise_of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2 / squared_weights))
+        column_noise = np.sum(columns**2 / squared_weights)
+        noise_of_pictures = math.sqrt(np.mean(rows**2) * column_noise)
         R = bases.compressed(core, NOISE_ROUNDING_SHARE * noise_of_pictures)
         light = typical_light(problem, COMPARED_PICTURES)
         lost, _ = lost_light(problem, R, light)

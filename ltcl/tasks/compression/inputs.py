@@ -15,7 +15,7 @@ from ltcl.device import Device, open_device
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.operators import Dense, Host, Operator
 from ltcl.tasks.compression.sources import SourceRows, interreflection_rows, source
-from ltcl.transport import first_bounce as transport_first_bounce
+from ltcl.transport.first_bounce import find_first_bounce, mask_dark
 from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport, check_transport
 
@@ -60,8 +60,10 @@ class CompressionProblem:
         left = (width - w) // 2
         first_of_rows = np.arange(top, top + h) * width + left
         pixels = np.add.outer(first_of_rows, np.arange(w)).ravel()
-        parts = [self.R.rows(first, first + w)[:, pixels] for first in first_of_rows.tolist()]
-        R = np.concatenate(parts)
+        strips = []
+        for first in first_of_rows.tolist():
+            strips.append(self.R.rows(first, first + w)[:, pixels])
+        R = np.concatenate(strips)
         return CompressionProblem(
             R=source("R", R, self.R.memory),
             operator=Dense(self.operator.device, R),
@@ -95,7 +97,8 @@ def check_inputs(
 ) -> CompressionInputs:
     """Check the input of `compress`: a Transport, operators or rows; `reading` as in `source`."""
     if isinstance(T, Transport):
-        for name, value in {"grid": grid, "first_bounce": first_bounce, "device": device}.items():
+        settings = {"grid": grid, "first_bounce": first_bounce, "device": device}
+        for name, value in settings.items():
             if value is not None:
                 raise InputError(
                     f"{name} is given, but T is a Transport, which has its own; leave it out"
@@ -103,23 +106,28 @@ def check_inputs(
         check_transport(T)
         if T.error > 0.0:
             raise InputError(
-                f"T is compressed already, with an error of {T.error:.2g}; compress the original "
-                "transport"
+                f"T is compressed already, with an error of {T.error:.2g}; "
+                "compress the original transport"
             )
         return inputs_of_transport(T, noise, **reading)
 
     matrices = list(T) if isinstance(T, (list, tuple)) else [T]
     if len(matrices) not in (1, 3):
-        raise InputError(f"T has {len(matrices)} channels; it must be one, or three for RGB")
+        raise InputError(f"T has {len(matrices)} channels; it must have 1, or 3 for RGB")
     if grid is None:
         raise InputError(
-            "grid is None, but T is no Transport; it must be (h, w), the projector's pixels"
+            "grid is None, but T is not a Transport; it must be (h, w), the projector's pixels"
         )
-    if all(hasattr(matrix, "matvec") and not hasattr(matrix, "rows") for matrix in matrices):
-        F = "diagonal" if first_bounce is None else first_bounce
-        made = Transport(T, grid, F, device=device)
-        return check_inputs(made, None, None, None, None, **reading)
-    return _inputs_of_rows(matrices, grid, first_bounce, device, **reading)
+    if not all(_is_operator(matrix) for matrix in matrices):
+        return _inputs_of_rows(matrices, grid, first_bounce, device, **reading)
+    if first_bounce is None:
+        first_bounce = "diagonal"
+    transport = Transport(T, grid, first_bounce, device=device)
+    return check_inputs(transport, None, None, None, None, **reading)
+
+
+def _is_operator(matrix: Any) -> bool:
+    return hasattr(matrix, "matvec") and not hasattr(matrix, "rows")
 
 
 def _inputs_of_rows(
@@ -130,9 +138,7 @@ def _inputs_of_rows(
     n = rows[0].shape[0]
     for channel in rows:
         if channel.shape != (n, n):
-            raise InputError(
-                f"T has shape {channel.shape}; it must be square, (N, N), to have an S"
-            )
+            raise InputError(f"T has shape {channel.shape}; it must be square, (N, N)")
         # One row too many is not noticed where rows end with the matrix.
         channel.rows(0, 1)
     grid = checks.grid("grid", grid, n)
@@ -142,17 +148,17 @@ def _inputs_of_rows(
         raise InputError(
             f"first_bounce is {first_bounce!r}, but T is rows; give an array (N,), or None"
         )
-    F = "diagonal" if first_bounce is None else first_bounce
-    F, _ = transport_first_bounce.find_first_bounce(rows, F, lambda: device)
-    F, *_ = transport_first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
+    if first_bounce is None:
+        first_bounce = "diagonal"
+    F, _ = find_first_bounce(rows, first_bounce, lambda: device)
+    F, *_ = mask_dark(F, F <= 0.0, grid, may_mask=False)
     problems = []
     for channel, f in zip(rows, F, strict=True):
         R = interreflection_rows(channel, f)
         problems.append(CompressionProblem(R=R, operator=Host(device, R), grid=grid, F=f))
+    settings = {"grid": grid, "first_bounce": F}
     float32_bytes = 4 * F.size * n
-    return CompressionInputs(
-        problems=problems, settings={"grid": grid, "first_bounce": F}, nbytes=float32_bytes
-    )
+    return CompressionInputs(problems=problems, settings=settings, nbytes=float32_bytes)
 
 
 def inputs_of_transport(
@@ -166,16 +172,19 @@ def inputs_of_transport(
         rows = []
         for matrix, f in zip(T.matrices, F, strict=True):
             rows.append(interreflection_rows(source("T", matrix, **reading), f))
-    nbytes = 4 * T.channels * T.shape[1] ** 2
+    nbytes = 0
     try:
         operators: list[Operator] = [S.R for S in T.systems]
-        nbytes = T.nbytes or nbytes
+        nbytes = T.nbytes
     except MemoryError:  # of the device, or of the host
         operators = [Host(T.device, R) for R in rows]
+    if nbytes == 0:
+        nbytes = 4 * T.channels * T.shape[1] ** 2
 
     problems = []
-    for channel, (R, operator, f) in enumerate(zip(rows, operators, F, strict=True)):
-        problem = CompressionProblem(R=R, operator=operator, grid=T.grid, F=f)
+    for channel, R in enumerate(rows):
+        operator = operators[channel]
+        problem = CompressionProblem(R=R, operator=operator, grid=T.grid, F=F[channel])
         if noise is not None:
             problem = replace(problem, noise=_noise_factors(problem, noise, channel))
         problems.append(problem)
@@ -183,7 +192,7 @@ def inputs_of_transport(
         "grid": T.grid,
         "first_bounce": F,
         "mixing": T.mixing,
-        "noise": noise or T.measured_noise,
+        "noise": T.measured_noise if noise is None else noise,
         "on_dark": "mask" if T.masked.any() else "raise",
     }
     return CompressionInputs(problems=problems, settings=settings, nbytes=nbytes)
@@ -209,5 +218,7 @@ def memory_errors(command: str, T: Any) -> Iterator[None]:
         raise
     except MemoryError as error:
         pixels = getattr(T, "shape", (0, 0))[-1]
-        needed = f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels"
-        raise MemoryLimitError(f"{needed}, more than the host gives: {error}") from error
+        raise MemoryLimitError(
+            f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels, "
+            f"more than the host has: {error}"
+        ) from error

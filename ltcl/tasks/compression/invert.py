@@ -93,20 +93,26 @@ def invert(
     (1, True)
     """
     check_transport(T)
-    rtol = check_rtol(rtol, ROUNDED_TERMS * FLOAT32_UNIT * math.sqrt(T.shape[0]))
+    rounding = FLOAT32_UNIT * math.sqrt(T.shape[0])
+    rtol = check_rtol(rtol, ROUNDED_TERMS * rounding)
     if T.is_compressed and rtol <= T.error:
         raise InputError(
             f"rtol is {rtol:g}, but T is compressed and its solutions may be off by "
-            f"{checks.upwards(T.error)}; ask for more than that, or invert the original transport"
+            f"{checks.upwards(T.error)}; ask for more than that, "
+            "or invert the original transport"
         )
     names = basis_names(basis, for_inverse=True)
     note = check_progress(progress)
     starts = fresh_starts("invert")
     bounces = []
     errors = []
+
+    def note_rewriting(text: str, share: float) -> None:
+        note(text, share / 2)
+
     try:
         with memory_errors("invert", T):
-            rewritten = _in_one_basis(T, rtol, names, lambda text, share: note(text, share / 2))
+            rewritten = _in_one_basis(T, rtol, names, note_rewriting)
             for channel, S in enumerate(rewritten.systems):
                 share = 0.5 + 0.5 * channel / T.channels
 
@@ -119,8 +125,10 @@ def invert(
         note("done", 1.0)
     except ToleranceError as error:
         least = float(checks.upwards(1.1 * error.least - 0.1 * T.error))
-        message = f"rtol is {rtol:g}, but float32 reaches about {least:g} for the inverse of this T"
-        raise ToleranceError(message, least) from None
+        raise ToleranceError(
+            f"rtol is {rtol:g}, but float32 reaches about {least:g} for the inverse of this T",
+            least,
+        ) from None
     confidence = 1.0 - (rewritten.compressions + T.channels + 1) * MISS
     return Inverse(bounces, errors, T.grid, T.first_bounce, T.mixing, confidence=confidence)
 
@@ -134,15 +142,19 @@ class _Rewritten(NamedTuple):
 
 def _in_one_basis(T: Transport, rtol: float, names: list[str], note: Note) -> _Rewritten:
     """S of every channel in one basis: as it is, or compressed."""
-    compressions = 1 if T.error else 0
-    keeps_basis = T.is_compressed or names == ["pixels"]
-    if keeps_basis and all(_has_coefficients(S.R) for S in T.systems):
+    compressions = 0
+    purpose = "compress"
+    if T.error:
+        compressions = 1
+        purpose = "rewrite"
+    may_keep_basis = T.is_compressed or names == ["pixels"]
+    if may_keep_basis and all(_has_coefficients(S.R) for S in T.systems):
         return _Rewritten(T.systems, compressions)
     share = SHARE_OF_R * (rtol - T.error) / (1.0 + T.error)
     goal = ByTolerance("worst", share)
-    starts = fresh_starts("rewrite" if T.error else "compress")
     try:
-        C, _ = compress_inputs(inputs_of_transport(T), names, goal, starts, note)
+        inputs = inputs_of_transport(T)
+        C, _ = compress_inputs(inputs, names, goal, fresh_starts(purpose), note)
     except ToleranceError as error:
         least = T.error + error.least * (1.0 + T.error) / SHARE_OF_R
         raise ToleranceError(str(error), least) from None
@@ -177,15 +189,16 @@ def _invert_channel(
     if isinstance(core, Compressed):
         W = core.out
         core = core.core
-    C: Any = core.matrix() if isinstance(core, (CSR, Tiles)) else core.to_dense()
-    C = scipy.sparse.csr_array(C).astype(np.float32)
+    matrix = core.matrix() if isinstance(core, (CSR, Tiles)) else core.to_dense()
+    C: Any = scipy.sparse.csr_array(matrix).astype(np.float32)
     eye = scipy.sparse.eye_array(C.shape[0])
 
     # 1. Part of the tolerance that rounding and the compression of R leave for A.
     # S is the identity on coefficients that C leaves out.
     norm = max(1.0, bound_norm(eye + C, S.device, starts))
     earlier = S.solution_error
-    rounding = FLOAT32_UNIT * math.sqrt(S.shape[0]) * norm  # of x, for each unit of b and A b
+    # Rounding of x, for each unit of b and A b.
+    rounding = FLOAT32_UNIT * math.sqrt(S.shape[0]) * norm
     least = earlier + ROUNDED_TERMS * rounding
     allowance = (rtol - least) / (1.0 + earlier)
     if allowance <= 0.0:
@@ -208,12 +221,15 @@ def _invert_channel(
     progress("choosing the precision of A")
     rounding_allowance = (1.0 - SHARE_OF_ITERATION) * allowance / norm
     tiles = Tiles(S.device, quantize(inverse.D, rounding_allowance))
-    error = bound_norm(residual_operator(C, tiles.matrix()), S.device, starts, allowance)
+    residual = residual_operator(C, tiles.matrix())
+    error = bound_norm(residual, S.device, starts, allowance)
     if error > allowance:
         tiles = Tiles(S.device, quantize(inverse.D, 0.0))
         error = inverse.error
     error = error * (1.0 + earlier) + least
     # With X = I - A~: A~ - A = (I - X S) S^-1, ||I - X S|| <= error, and so
     # ||S^-1|| <= ||X|| / (1 - error).
-    norm_of_inverse = bound_norm(eye - tiles.matrix(), S.device, starts) / (1.0 - error)
-    return _Bounce(Compressed(tiles, W, W, error=error * norm_of_inverse), error)
+    norm_of_X = bound_norm(eye - tiles.matrix(), S.device, starts)
+    norm_of_inverse = norm_of_X / (1.0 - error)
+    A = Compressed(tiles, W, W, error=error * norm_of_inverse)
+    return _Bounce(A, error)

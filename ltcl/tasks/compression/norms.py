@@ -88,11 +88,15 @@ def inverse_norm(
         rmatmat=multiply_transposed,
         dtype=np.float64,
     )
-    norm = two_norm(Host(core.device, inverse), confidence=confidence, factor=factor, seed=seed)
+    operator = Host(core.device, inverse)
+    norm = two_norm(operator, confidence=confidence, factor=factor, seed=seed)
+    estimate = norm.estimate
     upper = norm.upper / (1.0 - SOLVE_RTOL * math.sqrt(norm.products))
-    # S is the identity on the coefficients that the core leaves out.
-    least = 1.0 if core.shape[0] < S.shape[0] else 0.0
-    return replace(norm, estimate=max(norm.estimate, least), upper=max(upper, least))
+    if core.shape[0] < S.shape[0]:
+        # S is the identity on the coefficients that the core leaves out.
+        estimate = max(estimate, 1.0)
+        upper = max(upper, 1.0)
+    return replace(norm, estimate=estimate, upper=upper)
 
 
 def solve_columns(S: IdentityPlus, X: np.ndarray, rtol: float = SOLVE_RTOL) -> np.ndarray:
@@ -102,8 +106,8 @@ def solve_columns(S: IdentityPlus, X: np.ndarray, rtol: float = SOLVE_RTOL) -> n
     except ConvergenceError as error:
         residual = f"{error.solution.residual:.2g}"
         raise ConvergenceError(
-            f"S is singular, or nearly so: a solve for the norm of its inverse left {residual} "
-            "of a light; check the first bounce",
+            "S is singular, or nearly so: a solve for the norm of its inverse ended with "
+            f"a relative residual of {residual}; check the first bounce",
             error.solution,
         ) from None
     return np.asarray(solution.x, np.float64)
@@ -115,7 +119,8 @@ def estimate_norm(A: Any, start: np.ndarray | None = None) -> tuple[float, np.nd
     norm = 0.0
     v = np.random.default_rng(0).standard_normal(A.shape[1])
     if start is not None:
-        v = start / np.linalg.norm(start) + START_NOISE * v / np.linalg.norm(v)
+        noise = START_NOISE * v / np.linalg.norm(v)
+        v = start / np.linalg.norm(start) + noise
     for _ in range(POWER_STEPS):
         u = A @ (v / np.linalg.norm(v))
         norm = float(np.linalg.norm(u))

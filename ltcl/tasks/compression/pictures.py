@@ -66,10 +66,12 @@ def picture_error(
         x = x[:, is_lit].astype(np.float32)
         lost, exact = lost_light(problem, R, x)
         size = np.linalg.norm(x, axis=0)
-        appearance = np.maximum(np.linalg.norm(x + exact, axis=0), MIN_APPEARANCE * size)
+        appearance = np.linalg.norm(x + exact, axis=0)
+        appearance = np.maximum(appearance, MIN_APPEARANCE * size)
         errors += list(np.linalg.norm(lost, axis=0) / appearance)
-        solved = np.linalg.norm(solve_columns(S, lost, SOLVE_RTOL), axis=0) / size
-        errors += list(solved * (1.0 + SOLVE_RTOL))
+        solved = solve_columns(S, lost, SOLVE_RTOL)
+        relative = np.linalg.norm(solved, axis=0) / size
+        errors += list(relative * (1.0 + SOLVE_RTOL))
     share = (1.0 - confidence) ** (1.0 / count)
     return PictureError(float(np.max(errors)), share, confidence, count)
 
@@ -89,7 +91,8 @@ def _product(A: Operator, x: np.ndarray) -> np.ndarray:
 
 def typical_light(problem: CompressionProblem, count: int) -> np.ndarray:
     """Light F p (N, count) of norm 1, always of the same pictures: to choose by, not to confirm."""
-    x = draw(problem.grid, count, np.random.default_rng(0)) * problem.F[:, None]
+    pictures = draw(problem.grid, count, np.random.default_rng(0))
+    x = pictures * problem.F[:, None]
     return x / np.maximum(np.linalg.norm(x, axis=0), 1e-30)
 
 
@@ -112,7 +115,8 @@ def _spectrum(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
     noise = noise * f ** -random.uniform(0.8, 1.4)
     values = np.fft.irfft2(noise, grid)
     contrast = random.uniform(0.2, 1.0)
-    values = np.exp(contrast * (values - values.mean()) / max(values.std(), 1e-9))
+    deviation = max(values.std(), 1e-9)
+    values = np.exp(contrast * (values - values.mean()) / deviation)
     return values / values.max()
 
 
@@ -124,7 +128,8 @@ def _edges(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
         angle = random.uniform(0, np.pi)
         v, u = random.uniform(0, 1, 2) * grid
         place = (x - u + 1j * (y - v)) * np.exp(1j * angle)
-        height, width = np.exp(random.uniform(math.log(0.02), 0.0, 2)) * max(grid)
+        sides = np.exp(random.uniform(math.log(0.02), 0.0, 2))
+        height, width = sides * max(grid)
         is_inside = (abs(place.imag) <= height) & (abs(place.real) <= width)
         picture[is_inside] = random.random()
     return picture

@@ -28,6 +28,8 @@ MAX_BLOCK_ROWS = 512
 # Items for workers, or up to twice as many: each costs the client some milliseconds.
 MAX_ITEMS = 512
 
+# Reads rows start .. stop - 1 of a matrix.
+Fetch = Callable[[int, int], Any]
 # Of first row, row behind the last, and what was fetched there; returns the rows, checked.
 MakeRows = Callable[[int, int, Any], np.ndarray]
 # Of the place of a block, its rows and a value of the moment.
@@ -55,7 +57,7 @@ class SourceRows(scipy.sparse.linalg.LinearOperator):
     def __init__(
         self,
         shape: Any,
-        fetch: Callable[[int, int], Any],
+        fetch: Fetch,
         make: MakeRows,
         memory: int | None,
         *,
@@ -75,7 +77,7 @@ class SourceRows(scipy.sparse.linalg.LinearOperator):
         """Rows start .. stop - 1, (stop - start, N)."""
         return self.make(start, stop, self.fetch(start, stop))
 
-    def each(
+    def map_blocks(
         self,
         work: BlockWork,
         value: Callable[[], Any] = lambda: None,
@@ -86,26 +88,25 @@ class SourceRows(scipy.sparse.linalg.LinearOperator):
         It runs here or on workers.
         """
         size = rows_at_once(self.shape[1], self.memory)
-        is_fetched_there = self.workers_fetch or self.client is None
-        task = _BlockTask(
-            make=self.make,
-            fetch=self.fetch if is_fetched_there else None,
-            work=work,
-            size=size,
-            dtype=dtype,
-        )
+        task = _BlockTask(make=self.make, work=work, size=size, dtype=dtype)
+        client_fetches = self.client is not None and not self.workers_fetch
+        if not client_fetches:
+            task.fetch = self.fetch
         spans = self._spans(size)
-        spans_per_item = 1 + len(spans) // MAX_ITEMS if self.workers_fetch else 1
+        spans_per_item = 1
+        if self.workers_fetch:
+            spans_per_item += len(spans) // MAX_ITEMS
 
         def items() -> Iterator[tuple[list[Any], Any]]:
             for first in range(0, len(spans), spans_per_item):
-                parts = []
+                blocks = []
                 for start, stop in spans[first : first + spans_per_item]:
-                    fetched = None if is_fetched_there else self.fetch(start, stop)
-                    parts.append((start, stop, fetched))
-                yield parts, value()
+                    fetched = self.fetch(start, stop) if client_fetches else None
+                    blocks.append((start, stop, fetched))
+                yield blocks, value()
 
-        return itertools.chain.from_iterable(stream(self.client, task, items()))
+        results = stream(self.client, task, items())
+        return itertools.chain.from_iterable(results)
 
     def _spans(self, size: int) -> list[tuple[int, int]]:
         """First row and the one behind the last of what is fetched at once."""
@@ -123,44 +124,46 @@ class SourceRows(scipy.sparse.linalg.LinearOperator):
         def work(place: slice, rows: np.ndarray, value: Any) -> np.ndarray:
             return rows.diagonal(place.start).copy()
 
-        return np.concatenate(list(self.each(work, dtype=float)))
+        return np.concatenate(list(self.map_blocks(work, dtype=float)))
 
     def _matmat(self, X: np.ndarray) -> np.ndarray:
         x = X.astype(np.float32)
-        products = self.each(lambda place, rows, value: rows @ x)
+        products = self.map_blocks(lambda place, rows, value: rows @ x)
         return np.concatenate(list(products)).astype(np.float64)
 
     def _rmatmat(self, X: np.ndarray) -> np.ndarray:
         x = X.astype(np.float32)
         product = np.zeros((self.shape[1], X.shape[1]))
-        for part in self.each(lambda place, rows, value: rows.T @ x[place]):
-            product = product + part
+        for term in self.map_blocks(lambda place, rows, value: rows.T @ x[place]):
+            product = product + term
         return product
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class _BlockTask:
     """Make the rows of one item and work on their blocks; workers get it without the matrix."""
 
     make: MakeRows
-    fetch: Callable[[int, int], Any] | None
     work: BlockWork
     size: int
     dtype: Any
+    # None where the client fetches the rows and sends them.
+    fetch: Fetch | None = None
 
     def __call__(self, item: tuple[list[Any], Any]) -> list[Any]:
-        parts, value = item
+        blocks, value = item
         results = []
-        for start, stop, fetched in parts:
+        for start, stop, fetched in blocks:
             if self.fetch is not None:
                 fetched = self.fetch(start, stop)
             count = stop - start
             for first, end in cut(count, self.size):
-                # All that is left, at the end: too many rows are noticed there.
-                some = fetched[first:end] if end < count else fetched[first:]
-                rows = self.make(start + first, start + end, some)
+                # The last block takes all that is left, so that too many rows are noticed.
+                fetched_end = end if end < count else None
                 place = slice(start + first, start + end)
-                results.append(self.work(place, np.asarray(rows, self.dtype), value))
+                rows = self.make(place.start, place.stop, fetched[first:fetched_end])
+                rows = np.asarray(rows, self.dtype)
+                results.append(self.work(place, rows, value))
         return results
 
 
@@ -174,7 +177,9 @@ def source(name: str, matrix: Any, memory: int | None = None, client: Any = None
     if scipy.sparse.issparse(matrix):
         matrix = checks.csr(name, matrix)
     columns = matrix.shape[1]
-    workers_fetch = client is not None and _can_workers_fetch(client, matrix)
+    workers_fetch = False
+    if client is not None:
+        workers_fetch = _can_workers_fetch(client, matrix)
 
     def make(start: int, stop: int, fetched: Any) -> np.ndarray:
         place = f"{name} in rows {start} to {stop - 1}"
@@ -199,16 +204,17 @@ def _check_source(name: str, matrix: Any) -> None:
     shape = getattr(matrix, "shape", None)
     if shape is not None and np.size(shape) != 2:
         raise InputError(f"{name} has shape {shape}; it must be (M, N)")
-    is_readable = any(hasattr(matrix, way) for way in ("__getitem__", "rows", "matvec"))
+    ways = ("__getitem__", "rows", "matvec")
+    is_readable = any(hasattr(matrix, way) for way in ways)
     if shape is None or not is_readable:
         kind = type(matrix).__name__
         raise InputTypeError(
-            f"{name} is a {kind}; it must be an array, sparse, an operator, or have shape and "
-            "rows(start, stop)"
+            f"{name} is a {kind}; it must be an array, sparse, an operator, "
+            "or have shape and rows(start, stop)"
         )
 
 
-def _fetcher(name: str, matrix: Any, client: Any, workers_fetch: bool) -> Callable[[int, int], Any]:
+def _fetcher(name: str, matrix: Any, client: Any, workers_fetch: bool) -> Fetch:
     """Function that reads rows of a matrix of any kind."""
     if hasattr(matrix, "rows"):
         return lambda start, stop: matrix.rows(start, stop)
@@ -224,7 +230,8 @@ def _fetcher(name: str, matrix: Any, client: Any, workers_fetch: bool) -> Callab
         units[np.arange(start, stop), np.arange(stop - start)] = 1.0
         try:
             return np.ascontiguousarray(matrix.rmatmat(units).T)
-        except (NotImplementedError, TypeError) as error:  # SciPy raises either, by its version
+        except (NotImplementedError, TypeError) as error:
+            # Which one SciPy raises depends on its version.
             kind = type(matrix).__name__
             raise InputError(f"{name} is a {kind} without rmatvec or rows") from error
 
@@ -260,7 +267,8 @@ def interreflection_rows(T: SourceRows, F: np.ndarray) -> SourceRows:
 
     def make(start: int, stop: int, fetched: Any) -> np.ndarray:
         rows = make_T(start, stop, fetched)
-        block = checks.finite(f"T in rows {start} to {stop - 1}", rows) / divisor
+        rows = checks.finite(f"T in rows {start} to {stop - 1}", rows)
+        block = rows / divisor
         row = np.arange(stop - start)
         block[row, start + row] -= is_lit[start:stop]
         return block.astype(np.float32)
@@ -282,8 +290,8 @@ def rows_at_once(values: int, memory: int | None = None) -> int:
     if rows == 0:
         least = checks.size(COLUMNS * values * BYTES_PER_VALUE)
         raise MemoryLimitError(
-            f"memory is {checks.size(memory)}; it must be at least {least}, for {COLUMNS} rows of "
-            f"{values} numbers"
+            f"memory is {checks.size(memory)}; it must be at least {least}, "
+            f"for {COLUMNS} rows of {values} numbers"
         )
     return rows
 

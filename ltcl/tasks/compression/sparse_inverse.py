@@ -129,9 +129,10 @@ def invert_coefficients(
         device = open_device()
     inversion = _Inversion(C, rtol, device, progress)
     is_small = rows <= MAX_SMALL_ROWS
-    has_room = is_small or 8 * DENSE_MATRICES * rows * rows < checks.host_memory()
-    multiplications = float(np.diff(C.indptr)[C.indices].sum(dtype=np.int64))
-    is_dense = rows**3 < DENSE_ADVANTAGE * multiplications
+    dense_bytes = 8 * DENSE_MATRICES * rows * rows
+    has_room = is_small or dense_bytes < checks.host_memory()
+    multiplications = _row_products(C).sum(dtype=np.int64)
+    is_dense = rows**3 < DENSE_ADVANTAGE * float(multiplications)
     status = Status.DIVERGED
     if not is_small and not (has_room and is_dense):
         try:
@@ -144,12 +145,17 @@ def invert_coefficients(
     if status is not Status.CONVERGED:
         inversion.measure(always=True)
     result = SparseInverse(
-        inversion.D, inversion.bound, status, inversion.products, inversion.method
+        D=inversion.D,
+        error=inversion.bound,
+        status=status,
+        products=inversion.products,
+        method=inversion.method,
     )
     if status is not Status.CONVERGED:
-        outcome = f"{result.method}: {status.name.lower()} after {result.products} products"
         raise ConvergenceError(
-            f"{outcome}, error {result.error:.2g}; loosen rtol, or check the first bounce", result
+            f"{result.method}: {status.name.lower()} after {result.products} products, "
+            f"error {result.error:.2g}; loosen rtol, or check the first bounce",
+            result,
         )
     return result
 
@@ -198,7 +204,8 @@ class _Inversion:
         self.threshold = 0.0
         self.bound = math.inf
         self._starts = fresh_starts("sparse inverse")
-        self._largest_vector: np.ndarray | None = None  # of the largest residual so far
+        # Vector of the largest residual so far.
+        self._largest_vector: np.ndarray | None = None
 
     @property
     def has_converged(self) -> bool:
@@ -209,7 +216,8 @@ class _Inversion:
         """Estimate the residual of D; bound it where that may be small enough, or `always`."""
         self.progress(f"{self.method}: residual after {self.products} products")
         residual = residual_operator(self.C, self.D)
-        norm, self._largest_vector = estimate_norm(residual, self._largest_vector)
+        norm, vector = estimate_norm(residual, self._largest_vector)
+        self._largest_vector = vector
         self.bound = math.inf
         if always or norm <= self.rtol:
             self.bound = bound_norm(residual, self.device, self._starts, self.rtol)
@@ -280,8 +288,10 @@ class _RowSteps:
         self.C = C
         eye = scipy.sparse.eye_array(C.shape[0], dtype=C.dtype)
         self.S = scipy.sparse.csr_array(eye + C)
-        self.blocks = [slice(*ends) for ends in itertools.pairwise(_row_blocks(C))]
-        self.directions: list[Any] = [None] * len(self.blocks)  # d of each block
+        ends = itertools.pairwise(_row_blocks(C))
+        self.blocks = [slice(start, stop) for start, stop in ends]
+        # d of each block.
+        self.directions: list[Any] = [None] * len(self.blocks)
 
     def advance(
         self, D: Any, keep: float, gain: float, threshold: float, pool: ThreadPoolExecutor
@@ -292,7 +302,8 @@ class _RowSteps:
             rows = self.blocks[number]
             residual = scipy.sparse.csr_array(self.C[rows] - D[rows] @ self.S)
             G, _ = drop_below(residual, CORRECTION_SHARE * threshold)
-            G.sort_indices()  # so that sums have one order, however rows are cut
+            # Sums have one order, however rows are cut.
+            G.sort_indices()
             direction = gain * G
             if keep:
                 direction = direction + keep * self.directions[number]
@@ -311,8 +322,8 @@ def _threshold_of_norm(C: Any, error: float) -> float:
     high = error
     for _ in range(BISECTION_STEPS):
         middle = math.sqrt(max(low, 1e-6 * error) * high)
-        kept, _ = drop_below(C, middle)
-        lost, _ = estimate_norm(scipy.sparse.csr_array(C - kept))
+        large, _ = drop_below(C, middle)
+        lost, _ = estimate_norm(scipy.sparse.csr_array(C - large))
         if lost <= error:
             low = middle
         else:
@@ -330,19 +341,21 @@ def _spectral_interval(C: Any) -> tuple[float, float]:
     if not lower > 0.0:
         raise InputError(
             f"S = I + C has an eigenvalue of real part {lower:.3g}; all must be above 0, "
-            "as of every scene, where memory is too small for elimination: check the first bounce"
+            "as those of every scene are, since memory is too small for elimination: "
+            "check the first bounce"
         )
     margin = SPECTRUM_MARGIN * (upper - lower)
-    widened_lower = max(lower - margin, lower / 2.0, MIN_LOWER_END * upper)
-    return widened_lower, upper + margin
+    least = max(lower / 2.0, MIN_LOWER_END * upper)
+    return max(lower - margin, least), upper + margin
 
 
 def _outermost(C: Any, which: str) -> float:
     """The smallest ("SR") or largest ("LR") real part, or a bound on it where none was found."""
     arpack: Any = scipy.sparse.linalg.eigs
-    start = np.random.default_rng(0).uniform(0.5, 1.5, C.shape[0]).astype(C.dtype)
+    start = np.random.default_rng(0).uniform(0.5, 1.5, C.shape[0])
+    start = start.astype(C.dtype)
     try:
-        (value,) = arpack(C, k=1, which=which, tol=1e-2, v0=start, return_eigenvectors=False)
+        (value,) = arpack(C, 1, which=which, tol=1e-2, v0=start, return_eigenvectors=False)
         return float(value.real)
     except scipy.sparse.linalg.ArpackNoConvergence:
         # All eigenvalues are within a disc of this radius.
@@ -354,10 +367,15 @@ def _outermost(C: Any, which: str) -> float:
 def _row_blocks(C: Any) -> np.ndarray:
     """Ends of blocks of rows whose product C C has about `BLOCK_NUMBERS` numbers each."""
     rows = C.shape[0]
-    products_before = np.cumsum(np.diff(C.indptr)[C.indices], dtype=np.int64)
+    products_before = np.cumsum(_row_products(C), dtype=np.int64)
     products_before = np.concatenate([[0], products_before])
-    numbers_of_rows = np.minimum(np.diff(products_before[C.indptr]), rows)
-    numbers = np.cumsum(numbers_of_rows)
-    wanted = np.arange(BLOCK_NUMBERS, numbers[-1], BLOCK_NUMBERS)
-    ends = np.searchsorted(numbers, wanted, side="right")
+    products = np.diff(products_before[C.indptr])
+    numbers = np.cumsum(np.minimum(products, rows))
+    block_ends = np.arange(BLOCK_NUMBERS, numbers[-1], BLOCK_NUMBERS)
+    ends = np.searchsorted(numbers, block_ends, side="right")
     return np.unique(np.concatenate([[0], ends, [rows]]))
+
+
+def _row_products(C: Any) -> np.ndarray:
+    """Multiplications in C C for each number of C: the numbers in the row that it meets."""
+    return np.diff(C.indptr)[C.indices]

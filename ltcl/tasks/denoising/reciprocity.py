@@ -107,11 +107,12 @@ def _keep_significant(
     log_d: np.ndarray, step: FactorStep, bases: list[SeparableBasis]
 ) -> np.ndarray:
     """Drop the wavelet coefficients of log d that errors of the fit explain."""
-    kept = np.zeros(len(log_d))
+    significant = np.zeros(len(log_d))
     for basis in bases:
         coefficients = basis.forward_picture(log_d)
         variance = np.diag(basis.forward(step.covariance))
         variance = max(1.0, step.noise_ratio) * variance
-        is_significant = coefficients * coefficients > SIGNIFICANCE**2 * variance
-        kept += basis.backward_picture(coefficients * is_significant) / len(bases)
-    return kept
+        is_significant = coefficients**2 > SIGNIFICANCE**2 * variance
+        log_of_basis = basis.backward_picture(coefficients * is_significant)
+        significant += log_of_basis / len(bases)
+    return significant

@@ -75,6 +75,7 @@ class ChannelNoise:
     columns: np.ndarray
     direct: float = 1.0
     neighbours: float = 0.0
+    is_known: bool = True
 
 
 def fit_channel(shape: tuple[int, int], parts: Samples, is_exact: bool) -> ChannelNoise:
@@ -118,7 +119,7 @@ class _Fit:
         scale = 1.0
         for number in range(PASSES):
             model = self.variance_of_light(self.samples.light)
-            expected = self.rows[self.samples.i] * self.columns[self.samples.j] * model
+            expected = self._factors_of(self.samples) * model
             ratios = self._ratios(expected)
             # Sums of exact samples are kept, so that large variances count more.
             weights = expected if self.is_exact else np.ones(len(ratios))
@@ -133,6 +134,9 @@ class _Fit:
         """photons light + floor^2."""
         return self.photons * np.maximum(light, 0.0) + self.floor2
 
+    def _factors_of(self, samples: EntrySamples) -> np.ndarray:
+        return self.rows[samples.i] * self.columns[samples.j]
+
     def _ratios(self, expected: np.ndarray) -> np.ndarray:
         """Squares over their expected values."""
         ratios = self.samples.square / expected
@@ -142,11 +146,14 @@ class _Fit:
 
     def _update_factors(self, ratios: np.ndarray, weights: np.ndarray, scale: float) -> None:
         """Multiply factors of rows and columns by mean ratios; their mean stays 1."""
-        for factor, index in ((self.rows, self.samples.i), (self.columns, self.samples.j)):
+        samples = self.samples
+        for factor, index in ((self.rows, samples.i), (self.columns, samples.j)):
             total = np.bincount(index, weights, len(factor))
             weighted = np.bincount(index, weights * ratios, len(factor))
-            has_samples = total > 0
-            factor *= np.where(has_samples, weighted, scale) / np.where(has_samples, total, 1.0)
+            is_empty = total == 0
+            weighted[is_empty] = scale
+            total[is_empty] = 1.0
+            factor *= weighted / total
             factor /= factor.mean()
 
     def _light_bins(self) -> np.ndarray:
@@ -169,7 +176,8 @@ class _Fit:
         count = counts[is_used].astype(float)
         mean = np.bincount(bins, variances, LIGHT_BINS)[is_used] / count
         light = np.bincount(bins, self.samples.light, LIGHT_BINS)[is_used] / count
-        A = np.stack([np.maximum(light, 0.0) / self.brightest, np.ones(len(count))], axis=1)
+        relative_light = np.maximum(light, 0.0) / self.brightest
+        A = np.stack([relative_light, np.ones(len(count))], axis=1)
         root = np.sqrt(count)
         if self.is_exact:
             # All exact samples together say the same of the first bounce.
@@ -186,8 +194,10 @@ class _Fit:
         """Factor of the variance of the first bounce; 1 with too few samples of it."""
         if len(direct.i) < (1 if self.is_exact else MIN_FIRST_BOUNCES):
             return 1.0
-        expected = self.rows[direct.i] * self.columns[direct.i]
-        expected = expected * self.variance_of_light(direct.light)
+        model = self.variance_of_light(direct.light)
+        expected = self._factors_of(direct) * model
         ratios = direct.square / np.maximum(expected, 1e-300)
         clipped = np.minimum(ratios, MAX_VARIANCES * ratios.mean())
-        return float(np.average(clipped, weights=expected if self.is_exact else None))
+        if not self.is_exact:
+            return float(clipped.mean())
+        return float(np.average(clipped, weights=expected))

@@ -34,7 +34,7 @@ from ltcl.transport.noise.comparison import compare, differences, shows_rows
 from ltcl.transport.noise.fit import ChannelNoise, Samples, fit_channel
 from ltcl.transport.noise.neighbours import filter_pictures, filtered_variance
 
-SOURCES = ("given", "acquired", "measured twice", "estimated")
+SOURCES = ("given", "acquired", "measured twice", "estimated", "unknown")
 # Largest finite number of a noise.
 MAX_NUMBER = 1e36
 # Largest standard deviation, times the brightest light: above, the units must be wrong.
@@ -56,7 +56,8 @@ class Noise:
     white : (channels, M) float64
         Variance of row sums, infinite where rows were not made to add up to a measured white.
     source : str
-        "acquired", "measured twice", "given", or "estimated" from T alone.
+        "acquired", "measured twice", "given", or "estimated" from T alone; "unknown" if T does not
+        show it: then the noise is at least the one stated.
     direct : (channels,) float64
         Factor of the variance of the first bounce: far below 1 for a path-traced T.
     neighbours : (channels,) float64
@@ -93,7 +94,7 @@ class Noise:
 
     @classmethod
     def _array_names(cls) -> list[str]:
-        return [each.name for each in fields(cls) if each.name != "source"]
+        return [field.name for field in fields(cls) if field.name != "source"]
 
     @classmethod
     def uniform(
@@ -150,8 +151,8 @@ class Noise:
         for first, second in pairs:
             if not (shows_rows(first) and shows_rows(second)):
                 raise InputError(
-                    "noise is a second T, but one of both is compressed, or an operator without "
-                    "entries; compare those that they were made from, which keeps the noise"
+                    "noise is a second T, but one of the two is compressed, or an operator "
+                    "without entries; compare the originals, and the noise is kept with T"
                 )
         samples = [differences(first, second) for first, second in pairs]
         noise = cls.fit(matrices[0].shape, samples, "measured twice")
@@ -173,6 +174,11 @@ class Noise:
             )
         return replace(noise, neighbours=neighbours)
 
+    @property
+    def is_measured(self) -> bool:
+        """False if T alone tells the noise, or does not tell it."""
+        return self.source not in ("estimated", "unknown")
+
     def __repr__(self) -> str:
         floor = ", ".join(f"{value:.2g}" for value in self.floor)
         M = self.rows.shape[1]
@@ -181,7 +187,8 @@ class Noise:
 
     def variance(self, entries: Any, channel: int = 0) -> np.ndarray:
         """Variance of the entries (M, N) of a channel, float64."""
-        light = self.photons[channel] * np.maximum(entries, 0.0) + self.floor[channel] ** 2
+        light = self.photons[channel] * np.maximum(entries, 0.0)
+        light = light + self.floor[channel] ** 2
         variance = self.rows[channel][:, None] * self.columns[channel] * light
         if variance.shape[0] == variance.shape[1]:
             np.einsum("ii->i", variance)[:] *= self.direct[channel]
@@ -215,10 +222,11 @@ class Noise:
 
     def check_fits(self, channels: int, shape: tuple[int, int], brightest: Any = 0.0) -> None:
         """Refuse a T of another shape; `brightest` (channels,) are its entries, 0 if unknown."""
-        own_shape = (self.rows.shape[1], self.columns.shape[1])
-        if len(self.floor) != channels or own_shape != shape:
+        noise_shape = (self.rows.shape[1], self.columns.shape[1])
+        if len(self.floor) != channels or noise_shape != shape:
             raise InputError(
-                f"noise is of {len(self.floor)} channel(s) {own_shape}; T has {channels} {shape}"
+                f"noise has {len(self.floor)} channel(s) of {noise_shape}; "
+                f"T has {channels} of {shape}"
             )
         light = np.maximum(brightest, 0.0).astype(np.float64)
         variance = self.photons * light + self.floor**2
@@ -226,20 +234,21 @@ class Noise:
         is_too_large = variance > (MAX_NOISE_RATIO * light) ** 2
         if np.any((light > 0.0) & is_too_large):
             raise InputError(
-                f"noise reaches {variance.max() ** 0.5:.3g}, more than {MAX_NOISE_RATIO:g} times "
-                "the light of T; it must be in the units of T"
+                f"noise reaches {variance.max() ** 0.5:.3g}, more than "
+                f"{MAX_NOISE_RATIO:g} times the light of T; it must be in the units of T"
             )
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Numbers for files, by names that begin with ``noise_``."""
-        arrays = {f"noise_{name}": np.asarray(getattr(self, name)) for name in self._array_names()}
-        arrays["noise_source"] = np.array(SOURCES.index(self.source))
+        arrays = {"noise_source": np.array(SOURCES.index(self.source))}
+        for name in self._array_names():
+            arrays[f"noise_{name}"] = np.asarray(getattr(self, name))
         return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
         """The noise of the arrays of `to_arrays`; None if `arrays` has none of them."""
-        names = [each.name for each in fields(cls)]
+        names = [field.name for field in fields(cls)]
         values: dict[str, Any] = {}
         for name in names:
             if f"noise_{name}" in arrays:
@@ -248,9 +257,7 @@ class Noise:
             return None
         missing = set(names) - values.keys()
         if missing:
-            raise InputError(
-                f"noise_{min(missing)} is missing; noise is the arrays of {', '.join(names)}"
-            )
+            raise InputError(f"noise_{min(missing)} is missing; a noise has {', '.join(names)}")
         number = np.asarray(values.pop("source")).tolist()
         checks.one_of("noise_source", number, range(len(SOURCES)))
         return cls(**values, source=SOURCES[int(number)])

@@ -239,3 +239,18 @@ def test_the_standard_error_at_a_gain_covers_both_parts(device):
         deviations += np.sum((c.solution.x[:, 0] - exact) ** 2)
         variances += np.sum(c.solution.standard_error[:, 0] ** 2)
     assert 0.6 < np.sqrt(deviations / variances) < 1.15
+
+
+@pytest.mark.parametrize("largest", [1.0, 0.99, 0.3, 5.0, 1e-6])
+@pytest.mark.parametrize("frames", [None, 2])
+def test_the_error_of_a_black_target_is_not_relative(device, largest, frames):
+    """No pattern has an error below error - gap, whatever the unit of the weights."""
+    T = ltcl.Transport(0.5 * np.eye(6) + 0.02, (2, 3), device=device)
+    shape = (2, 3) if frames is None else (frames, 2, 3)
+    weights = largest * np.linspace(0.5, 1.0, 6).reshape(2, 3)
+    c = ltcl.compensate(T, np.zeros(shape), background=0.02, weights=weights)
+    errors = weights * (T @ c.pattern + 0.02)
+    assert c.error == pytest.approx(np.linalg.norm(errors), rel=1e-4)
+    expected = np.linalg.norm(errors.reshape(-1, 6), axis=1)
+    np.testing.assert_allclose(c.frame_errors, expected, rtol=1e-4)
+    assert 0 <= c.gap < 1e-3 * c.error

@@ -339,7 +339,7 @@ def test_what_float32_or_the_host_cannot_do_is_refused_at_once(command, corner):
         raise MemoryError("Unable to allocate")
 
     operator = LinearOperator((64, 64), matvec=rows, rmatvec=rows, rmatmat=rows, dtype=float)
-    with pytest.raises(MemoryLimitError, match="needs up to 32 KiB for 64 pixels"):
+    with pytest.raises(MemoryLimitError, match=r"32 KiB .* 64 "):
         command(ltcl.Transport(operator, (8, 8), first_bounce=np.ones(64)))
 
 
