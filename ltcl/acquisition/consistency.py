@@ -24,6 +24,7 @@ import numpy as np
 from ltcl.acquisition import agreement, anchor
 from ltcl.acquisition.agreement import ADVICE, CameraModel
 from ltcl.acquisition.geometry import Correspondence, Resampling, decode
+from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.radiometry import Radiance
 from ltcl.acquisition.radiometry.exposures import NO_LIGHT
 from ltcl.acquisition.rig import Shots
@@ -76,8 +77,8 @@ def check_black(session: CaptureSession, photographs: Sequence[Photograph]) -> N
 
     Compared pixel by pixel with that one, all others would deviate.
     """
-    pictures = map(session.linear, photographs)
-    light = np.stack([picture.ravel() for picture in pictures])
+    response = session.camera.response
+    light = np.stack([response.linear(shot.sampled).ravel() for shot in photographs])
     level = light.mean(axis=1)
     deviation = light - light.mean(axis=0) - level[:, None]
     noise_of_level = float(np.std(deviation)) / math.sqrt(light.shape[1])
@@ -215,7 +216,7 @@ def check_uniform(
     for photograph, picture in zip(photographs, darker_pictures, strict=False):
         name = session.name(photograph)
         share, share_noise = reference.share_of_white(picture)
-        sampled = agreement.sample(photograph.image, reference.pixels)
+        sampled = agreement.sample(photograph.sampled, reference.pixels)
         deviation = agreement.find_deviation(
             [sampled], [photograph.seconds], session.camera, reference.expected(share)
         )
@@ -240,25 +241,21 @@ def check_map(
     session: CaptureSession,
     resampling: Resampling,
     stripes: Sequence[Photograph],
+    light: PhotographFile,
     blocks: np.ndarray,
     white: np.ndarray,
 ) -> None:
     """Refuse Gray code in which a pattern was exchanged with its inverse.
 
     Its map is mirrored in part. The picture of blocks (H, W[, c]) tells: it is more like their
-    pattern in the map that exchanging them back gives. `white` is a picture too; both are without
-    ambient light.
+    pattern in the map that exchanging them back gives. `light` is linear, of the stripes; `white`
+    is a picture too, and both are without ambient light.
     """
-    if not stripes:
-        return
     likeness = _block_correlation(resampling, blocks, white)
     if likeness > MIN_MAP_CORRELATION:
         return
-    light = [session.linear(photograph) for photograph in stripes]
     for k in range(0, len(stripes) - 2, 2):
-        exchanged = light.copy()
-        exchanged[k] = light[k + 1]
-        exchanged[k + 1] = light[k]
+        exchanged = light.exchanged(k, k + 1)
         with contextlib.suppress(InputError):
             mapping = decode(exchanged, resampling.grid, levels=session.shots.levels)
             corrected = Resampling.of(mapping)
