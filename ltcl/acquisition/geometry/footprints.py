@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.geometry.correspondence import Correspondence
+from ltcl.acquisition.radiometry.strips import in_strips
 
 # A difference that is so many times the opposite one crosses the border of an object (perspective:
 # below 1.1).
@@ -27,6 +28,9 @@ POINTS_PER_SIDE = 8
 
 # Corners (u, v) of a camera pixel: if all lie in one projector pixel, so does the footprint.
 CORNERS = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
+
+# Camera pixels of a strip of rows whose differences are taken at once.
+STRIP_PIXELS = 1 << 16
 
 # Camera pixels whose points are placed at once.
 PIXELS_AT_ONCE = 1 << 14
@@ -73,7 +77,7 @@ class Footprints:
     ----------
     mapping : Correspondence
         Places of their middles.
-    J : (H, W, 2, 2) float64
+    J : (H, W, 2, 2) float32
         d(x, y) / d(u, v), whose columns span the parallelogram.
     known : (H, W) bool
         Whether J is known.
@@ -97,34 +101,38 @@ class Footprints:
         camera pixels count as squares. Those that would span six times the median have no
         footprint.
         """
-        places = np.stack([mapping.x, mapping.y], axis=-1).astype(np.float64)  # NaN if not valid
-        du, has_both_u = _differences(places, 1)
-        dv, has_both_v = _differences(places, 0)
-        J = np.stack([du, dv], axis=-1)
-        h, w = mapping.grid
-        if w == 1:
-            J[:, :, 0] = np.nan
-        if h == 1:
-            J[:, :, 1] = np.nan
-        # Missing derivatives of a square, by Cauchy and Riemann's equations.
-        of_square = J[..., ::-1, ::-1] * [[1, -1], [-1, 1]]
-        J = np.nan_to_num(np.where(np.isnan(J), of_square, J))
+        H, W = mapping.camera_grid
+        J = np.empty((H, W, 2, 2), np.float32)
+        has_both = np.empty((H, W), bool)
 
-        is_known = np.linalg.det(J) != 0
+        def measure_rows(rows: slice) -> None:
+            # One row more on each side has the differences along columns.
+            top = max(rows.start - 1, 0)
+            window = slice(top, rows.stop + 1)
+            inside = slice(rows.start - top, rows.stop - top)
+            strip_J, strip_both = _jacobians(mapping, window)
+            J[rows] = strip_J[inside]
+            has_both[rows] = strip_both[inside]
+
+        in_strips(H, STRIP_PIXELS // W, measure_rows)
+        is_known = _determinants(J) != 0
         span = np.abs(J).max(axis=(2, 3))
         if is_known.any():
             is_known &= span <= MAX_SPAN_RATIO * np.median(span[is_known])
-        is_straddling = is_known & ~(has_both_u & has_both_v)
-        return cls(mapping=mapping, J=J, known=is_known, straddling=is_straddling)
+        return cls(mapping=mapping, J=J, known=is_known, straddling=is_known & ~has_both)
 
     @property
     def width(self) -> float:
         """Length of the median footprint, in projector pixels."""
-        return float(np.median(np.linalg.norm(self.J[self.known], 2, axis=(1, 2))))
+        # Squares of the largest singular values of 2 x 2 matrices.
+        J = self.J[self.known]
+        half = np.sum(J**2, axis=(1, 2)) / 2
+        largest = half + np.sqrt(np.maximum(half**2 - _determinants(J) ** 2, 0.0))
+        return float(np.sqrt(np.median(largest)))
 
     def areas(self) -> np.ndarray:
         """Area of each footprint in projector pixels, (M,)."""
-        return np.abs(np.linalg.det(self.J)).ravel()
+        return np.abs(_determinants(self.J)).ravel()
 
     def shares(self, padded: PaddedGrid, *, tent: bool = False) -> scipy.sparse.csr_array:
         """Part of each footprint in each pixel of the padded grid, (M, pixels).
@@ -147,6 +155,27 @@ class Footprints:
             parts = _count_points(padded.numbers(*places), padded.size)
             chunks.append(_insert_whole(parts, is_split, known[chunk], numbers[:, 0]))
         return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
+
+
+def _jacobians(mapping: Correspondence, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    """J of some rows, 0 where it is not known, and whether all four neighbours count."""
+    places = np.stack([mapping.x[rows], mapping.y[rows]], axis=-1)  # NaN if not valid
+    du, has_both_u = _differences(places.astype(np.float64), 1)
+    dv, has_both_v = _differences(places.astype(np.float64), 0)
+    J = np.stack([du, dv], axis=-1)
+    h, w = mapping.grid
+    if w == 1:
+        J[:, :, 0] = np.nan
+    if h == 1:
+        J[:, :, 1] = np.nan
+    # Missing derivatives of a square, by Cauchy and Riemann's equations.
+    of_square = J[..., ::-1, ::-1] * [[1, -1], [-1, 1]]
+    return np.nan_to_num(np.where(np.isnan(J), of_square, J)), has_both_u & has_both_v
+
+
+def _determinants(J: np.ndarray) -> np.ndarray:
+    """Determinants of matrices (..., 2, 2)."""
+    return J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
 
 
 def _places(
