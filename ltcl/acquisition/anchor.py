@@ -32,10 +32,11 @@ from ltcl.acquisition.radiometry import Radiance
 MIN_WHITE_SHARE = 0.1
 # Least s, so that d is finite.
 MIN_SCALE = 0.05
-# Change of the lamp, relative to the calibration, below which it is none, as shutters repeat
-# themselves no better; and the largest one from one pattern of blocks to the next.
+# Change of the lamp since the calibration below which it is none, as shutters repeat themselves no
+# better, in standard deviations of noise as well; and the largest that is corrected.
 MIN_LAMP_CHANGE = 0.01
-MAX_LAMP_STEP = 0.08
+LAMP_SIGMAS = 5.0
+MAX_LAMP_CHANGE = 0.15
 # Difference of the two measures of a change, relative to it, that is allowed.
 MAX_LAMP_DOUBT = 0.25
 # Relative variance of the light of blocks, below which their contrast tells nothing.
@@ -109,16 +110,11 @@ class Anchor:
         return find_deviation([sample(image, self.pixels)], [seconds], camera, known)
 
     def lamp_gain(
-        self,
-        image: np.ndarray,
-        seconds: float,
-        camera: CameraModel,
-        ambient: Radiance,
-        previous: float = 1.0,
+        self, image: np.ndarray, seconds: float, camera: CameraModel, ambient: Radiance
     ) -> float:
         """Gain of the lamp since the calibration, by a photograph (H, W[, c]) of the pattern.
 
-        It is `previous`, the gain at the pattern of blocks before, if the light changed otherwise.
+        It is 1 if there is no change, or another one than that of the lamp.
         """
         codes = sample(image, self.pixels)
         curve = codes if codes.shape[1] > 1 else codes[:, 0]
@@ -128,16 +124,18 @@ class Anchor:
         x = (self.value[is_clear] - room).sum(axis=1, dtype=np.float64)
         y = ((linear - camera.offset)[is_clear] / seconds - room).sum(axis=1, dtype=np.float64)
         if len(x) < 2 or x.sum() <= 0 or x.var() < MIN_CONTRAST * x.mean() ** 2:
-            return previous
+            return 1.0
         by_sum = float(y.sum() / x.sum())
         by_contrast = float(np.cov(x, y)[0, 1] / x.var(ddof=1))
+        noise = self.variance[is_clear].sum()
+        noise += camera.noise.variance(linear[is_clear]).sum() / seconds**2
+        least_change = max(MIN_LAMP_CHANGE, LAMP_SIGMAS * float(np.sqrt(noise) / x.sum()))
         change = abs(by_sum - 1.0)
         doubt = abs(by_sum - by_contrast)
-        if change < MIN_LAMP_CHANGE or doubt > max(MIN_LAMP_CHANGE, MAX_LAMP_DOUBT * change):
-            return previous
-        if abs(by_sum / previous - 1.0) > MAX_LAMP_STEP:
-            return previous
-        return by_sum
+        is_of_lamp = doubt <= max(least_change, MAX_LAMP_DOUBT * change)
+        if is_of_lamp and least_change < change < MAX_LAMP_CHANGE:
+            return by_sum
+        return 1.0
 
 
 def compact(picture: Radiance) -> np.ndarray:

@@ -172,8 +172,6 @@ class ScanCamera(ScanGrid):
         # Photographs are compared at some of the pixels that see the projector.
         seeing = np.unique(calibration.resampling.weights.indices)
         self._pixels = spread(seeing)
-        # Gain of the lamp at the last pattern of blocks; unknown where a scan goes on.
-        self._lamp_gain: float | None = 1.0 if shots.count else None
 
     def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:
         """Announce the patterns that come next to the rig, in batches of `size`."""
@@ -206,25 +204,8 @@ class ScanCamera(ScanGrid):
             progress(1)
         self._check_patterns(patterns, pictures, exposed)
         blocks = self._photograph(anchor.marked(batch), times[:1])
-        gains = self._lamp_gains(blocks, exposed)
-        self._check_anchor(blocks, exposed, gains[-1])
-        return [picture.scaled(1.0 / g) for picture, g in zip(pictures, gains, strict=True)]
-
-    def _lamp_gains(
-        self, blocks: _ExposedPattern, exposed: Sequence[_ExposedPattern]
-    ) -> np.ndarray:
-        """Gain of the lamp at each pattern, between those of the patterns of blocks around them."""
-        known = self.calibration
-        if known.anchor is None:
-            return np.ones(len(exposed))
-        first = 1.0 if self._lamp_gain is None else self._lamp_gain
-        last = known.anchor.lamp_gain(
-            blocks.images[0], blocks.seconds[0], known.camera, known.ambient, first
-        )
-        if self._lamp_gain is None:
-            first = last
-        self._lamp_gain = last
-        return np.linspace(first, last, len(exposed))
+        gain = self._check_anchor(blocks, exposed)
+        return [picture.scaled(1.0 / gain) for picture in pictures]
 
     def _photograph(self, codes: np.ndarray, seconds: Sequence[float]) -> _ExposedPattern:
         images = [self.shots.photograph(codes, t) for t in seconds]
@@ -306,12 +287,10 @@ class ScanCamera(ScanGrid):
     def _names(self, photographs: _ExposedPattern) -> str:
         return " or ".join(self.shots.name(number) for number in photographs.numbers)
 
-    def _check_anchor(
-        self, blocks: _ExposedPattern, exposed: Sequence[_ExposedPattern], gain: float
-    ) -> None:
+    def _check_anchor(self, blocks: _ExposedPattern, exposed: Sequence[_ExposedPattern]) -> float:
         """Raise AcquisitionError if the pattern of blocks deviates from that of the calibration.
 
-        `gain` is that of the lamp since then.
+        Returns the gain of the lamp since then.
 
         It names the photographs of the batch (with `anchor.compact` images) that show it first, or
         just not.
@@ -320,10 +299,11 @@ class ScanCamera(ScanGrid):
         [image] = blocks.images
         [seconds] = blocks.seconds
         if known.anchor is None:
-            return
-        deviation = known.anchor.deviation(image, seconds, known.camera, known.ambient, gain)
-        if deviation is None:
-            return
+            return 1.0
+        shot = image, seconds, known.camera, known.ambient
+        gain = known.anchor.lamp_gain(*shot)
+        if known.anchor.deviation(*shot, gain) is None:
+            return gain
         light = anchor.compact(self._merge(blocks))
         series = [*exposed, replace(blocks, images=[light])]
         setup = known.white, known.ambient, known.resampling
