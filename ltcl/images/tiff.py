@@ -128,10 +128,10 @@ def _bits(directory: Directory) -> int:
 
 
 def is_inverted(directory: Directory, codes: np.ndarray) -> bool:
-    """Whether white is 0 in codes that OpenCV decoded: it inverts those of 8 bits itself."""
+    """True if white is 0 in codes that OpenCV decoded: it inverts those of 8 bits itself."""
     return directory[PHOTOMETRIC] == WHITE_IS_ZERO and codes.dtype == np.uint16
 
 
 def is_grey_with_alpha(directory: Directory) -> bool:
-    """Whether it has two channels, of which OpenCV drops the second."""
+    """True for two channels: OpenCV drops the second."""
     return directory.get(SAMPLES, 1) == 2

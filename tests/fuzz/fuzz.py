@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import io
 import itertools
 import logging
@@ -27,14 +28,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-try:
-    import atheris
-except ImportError:
-    atheris = None
-
 import numpy as np
 import scipy.sparse
 from PIL import Image
+
+atheris: Any = None
+with contextlib.suppress(ImportError):
+    atheris = importlib.import_module("atheris")
 
 # libFuzzer is guided by the lines of these that a file reaches.
 GUIDES = ["ltcl.images", "ltcl.store", "ltcl.files", "ltcl.checks"]

@@ -218,6 +218,7 @@ def cicp(curve: int) -> bytes:
 
 
 SRGB = chunk(b"sRGB", b"\0")
+PROFILE = chunk(b"iCCP", b"x\0\0" + zlib.compress(b"a profile"))
 CODES = np.array([[[0], [60], [128], [255]]])
 
 
@@ -231,6 +232,8 @@ CODES = np.array([[[0], [60], [128], [255]]])
         ([gama(0.454)], None),
         ([gama(1.0)], 1.0),
         ([gama(0.5)], 2.0),
+        ([PROFILE, gama(1.0)], 1.0),
+        ([PROFILE], None),
         ([cicp(13), gama(1.0)], None),
         ([cicp(1)], None),
         ([cicp(8)], 1.0),
