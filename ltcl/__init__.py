@@ -21,6 +21,10 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+# Before all that takes long: Ctrl-C while the program is imported.
+from ltcl.cli import interrupt as _interrupt  # noqa: F401
+
+# isort: split
 from ltcl import errors
 from ltcl.batch import cluster
 from ltcl.device import Device, list_devices, open_device

@@ -21,6 +21,7 @@ from ltcl.cli import (
     doctor,
     film,
     info,
+    interrupt,
     ranks,
     relight,
     separate,
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns the exit code.
     """
+    interrupt.release()
     words = sys.argv[1:] if arguments is None else list(arguments)
     if "--mpi" in words:
         return ranks.run_on_every_rank(run, words)
