@@ -59,7 +59,7 @@ def input_file(path: Any, shown: Path | None = None) -> Path:
     The message names it as `shown`.
     """
     path = as_path(path)
-    shown = shown or path
+    label: Path = shown or path
     try:
         status = path.stat()
         is_regular = stat.S_ISREG(status.st_mode)
@@ -67,9 +67,9 @@ def input_file(path: Any, shown: Path | None = None) -> Path:
         if is_regular:
             path.open("rb").close()
     except FileNotFoundError:
-        raise FileError(f"{shown}: no such file") from None
+        raise FileError(f"{label}: no such file") from None
     except OSError as error:
-        raise _refusal(shown, "cannot be read", error) from error
+        raise _refusal(label, "cannot be read", error) from error
 
     if path.is_dir():
         kind = "a folder"
@@ -79,7 +79,7 @@ def input_file(path: Any, shown: Path | None = None) -> Path:
         kind = "empty"
     else:
         return path
-    raise FileError(f"{shown}: is {kind}; it must be a file with content")
+    raise FileError(f"{label}: is {kind}; it must be a file with content")
 
 
 def as_path(path: Any, name: str = "path") -> Path:

@@ -13,6 +13,7 @@ import typer
 from ltcl import __version__
 from ltcl.cli import (
     acquire,
+    align,
     analyze,
     compensate,
     convert,
@@ -20,6 +21,7 @@ from ltcl.cli import (
     doctor,
     film,
     info,
+    interrupt,
     ranks,
     relight,
     separate,
@@ -54,6 +56,7 @@ PANELS: dict[str, list[Any]] = {
         info.info,
         analyze.analyze,
         convert.convert,
+        align.align,
         transform.compress,
         transform.invert,
         transform.denoise,
@@ -81,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns the exit code.
     """
+    interrupt.release()
     words = sys.argv[1:] if arguments is None else list(arguments)
     if "--mpi" in words:
         return ranks.run_on_every_rank(run, words)

@@ -106,7 +106,7 @@ def _shape(member: Any) -> tuple[int, ...]:
 
 def _sparse(members: Mapping[str, Any], name: str) -> scipy.sparse.csr_array:
     """The matrix of a sparse group, whose arrays may have room to spare."""
-    starts = _numbers(members[f"{name}/jc"])
+    starts: Any = _numbers(members[f"{name}/jc"])
     entries = max(int(starts[-1]), 0)
     # MATLAB leaves out arrays of no entries.
     empty = np.zeros(0, np.int64)
@@ -142,13 +142,13 @@ def write_hdf5(path: Path, record: StoreRecord) -> None:
     with _h5py(path).File(content, "w") as file:
         file.update(arrays)
         if not record.dense:
-            names = ("T",) if len(matrices) == 1 else CHANNELS
+            names = CHANNELS if len(matrices) == 3 else ("T",)
             for name, matrix in zip(names, matrices, strict=True):
                 _write_sparse(file.create_group(name), matrix.tocsc())
     path.write_bytes(content.getbuffer())
 
 
-def _write_sparse(group: Any, columns: scipy.sparse.csc_array) -> None:
+def _write_sparse(group: Any, columns: Any) -> None:
     group.attrs[ROWS] = columns.shape[0]
     group["data"] = columns.data
     group["ir"] = columns.indices

@@ -184,8 +184,9 @@ def write_npz(path: Path, record: StoreRecord | CompressedRecord) -> None:
 def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:
     """Arrays of one sparse matrix as SciPy writes them, or of three channels."""
     is_grey = len(record.matrices) == 1
+    layout = np.array(b"csr") if is_grey else RGB_FORMAT
     arrays: dict[str, Any] = {
-        "format": np.array(b"csr") if is_grey else RGB_FORMAT,
+        "format": layout,
         "_is_array": True,  # SciPy makes a csr_array of it
         "shape": record.shape,
     }
@@ -206,7 +207,9 @@ def read_npy(path: Path) -> StoreRecord:
     has_room = 2 * mapped.nbytes <= checks.host_memory()
 
     def load(name: str) -> np.ndarray:
-        return np.array(mapped) if has_room else mapped
+        if has_room:
+            return np.array(mapped)
+        return mapped
 
     return assemble(FileContents(shapes={"T": mapped.shape}, load=load))
 

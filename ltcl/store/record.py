@@ -259,8 +259,9 @@ def assemble(
 
 def _one_channel(first_bounce: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The first bounce of MATLAB, where one channel is a row or a column of N values, as (N,)."""
-    is_vector = first_bounce.size == shape[-1]
-    return first_bounce.ravel() if is_vector else first_bounce
+    if first_bounce.size == shape[-1]:
+        return first_bounce.ravel()
+    return first_bounce
 
 
 def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequence[str]:
@@ -280,7 +281,8 @@ def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequ
 
 
 def _unreadable(contents: FileContents, name: str) -> FileError:
-    return FileError(f"{name!r} is {contents.unreadable[name]}; T must be an array of real numbers")
+    kind = contents.unreadable[name]
+    return FileError(f"{name!r} is {kind}; T must be an array of real numbers")
 
 
 def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:

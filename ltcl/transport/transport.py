@@ -246,7 +246,7 @@ class Transport:
     def _dark_rule(self, threshold: float) -> DarkRule:
         is_measured = self._noise is not None
         if isinstance(self._noise, Noise):
-            is_measured = self._noise.source != "estimated"
+            is_measured = self._noise.is_measured
         return DarkRule(
             matrices=self.matrices,
             threshold=checks.number("dark_threshold", threshold, least=0.0, below=1.0),

@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -33,6 +34,7 @@ COMMANDS = [
     "info",
     "analyze",
     "convert",
+    "align",
     "compress",
     "denoise",
     "invert",
@@ -165,6 +167,34 @@ def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, nam
         printed[len(options)] = stdout.read()
     assert ".npz" in printed[0]
     assert json.loads(printed[1])[0]["file"] == str(path)
+
+
+@pytest.mark.parametrize("module", ["numpy", "scipy", "typer"])
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
+    """A module that interrupts its own import stands in the place of one that takes long."""
+    text = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)"
+    (tmp_path / f"{module}.py").write_text(text)
+    root = Path(ltcl.__file__).parents[1]
+    paths = os.pathsep.join([str(tmp_path), str(root)])
+    run = subprocess.run(
+        [sys.executable, "-m", "ltcl", "devices", *options],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 130
+    assert run.stderr == "ltcl: error: interrupted\n"
+    if options:
+        assert json.loads(run.stdout)["exit_code"] == 130
+
+
+def test_who_imports_ltcl_keeps_the_handlers_of_signals():
+    code = "import signal, ltcl; print(signal.getsignal(signal.SIGINT).__name__)"
+    words = [sys.executable, "-c", code]
+    run = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert run.stdout == "default_int_handler\n"
 
 
 def test_quiet_and_verbose(program, transport, tmp_path):

@@ -220,7 +220,9 @@ def blocks(order: tuple[int, ...]) -> ltcl.Transport:
         (lambda: blocks((0, 1, 2)), "bounces need one grid", "c"),
         (lambda: blocks((2, 1, 0)), "blue for red, red for blue", ""),
         (
-            lambda: ltcl.Transport(np.eye(288)[:96], (12, 24), camera_grid=(4, 24)),
+            lambda: ltcl.Transport(
+                np.eye(288)[:96], (12, 24), camera_grid=(4, 24), noise=Noise.uniform((96, 288), 0.0)
+            ),
             "bounces need one grid",
             "c",
         ),

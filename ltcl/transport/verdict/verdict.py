@@ -103,7 +103,7 @@ def verdict(T: Transport, **known: float) -> Verdict:
     places: dict[str, str] = {}
     try:
         check_transport(T, square=False)
-        _check_enough_pixels(T)
+        _check_noise_is_known(T)
         for measure in Evidence(T).measures():
             _keep_worst(measure, numbers, places)
     except (InputError, np.linalg.LinAlgError) as error:
@@ -112,11 +112,13 @@ def verdict(T: Transport, **known: float) -> Verdict:
     return _judge(numbers, places)
 
 
-def _check_enough_pixels(T: Transport) -> None:
-    if T.noise.source == "estimated" and min(T.shape) < MIN_PIXELS:
+def _check_noise_is_known(T: Transport) -> None:
+    if not T.noise.is_measured and min(T.shape) < MIN_PIXELS:
         raise InputError(
             f"fewer than {MIN_PIXELS} pixels do not tell their noise: use ltcl analyze --noise"
         )
+    if T.noise.source == "unknown":
+        raise InputError("T does not show its noise: use ltcl analyze --noise")
 
 
 def _keep_worst(measure: Measure, numbers: dict[str, float], places: dict[str, str]) -> None:
