@@ -45,8 +45,15 @@ TEMPORARY_NAME = re.compile(rf"\..*-{HOST}-[0-9a-f]{{16}}(\.[^.]*)?", re.DOTALL)
 # Arguments of renameat2(2) and renamex_np(2) that exchange two names.
 CURRENT_FOLDER = -100
 RENAME_EXCHANGE = 2
-# Errors of file systems that cannot exchange.
-CANNOT_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EXDEV)
+# Errors of file systems that cannot exchange; EPERM is that of sandboxes.
+CANNOT_EXCHANGE = (
+    errno.EINVAL,
+    errno.ENOSYS,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.EXDEV,
+    errno.EPERM,
+)
 # Errors of file systems without locks; EBADF is that of NFS.
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EBADF)
 # Errors of a writer that another one overtakes.

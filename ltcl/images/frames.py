@@ -259,8 +259,10 @@ def _encode_video(path: Path, temporary: Path, pictures: Iterable[np.ndarray], f
             codes = _rgb_codes(picture)
             if count == 1:
                 shape = codes.shape
-                check_video(path, shape[:2])
-                stream.height, stream.width = shape[:2]
+                h, w = shape[:2]
+                check_video(path, (h, w))
+                stream.height = h
+                stream.width = w
                 stream.bit_rate = min(BITS_PER_PIXEL * fps * codes[..., 0].size, MAX_BIT_RATE)
             if codes.shape != shape:
                 raise InputError(f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}")

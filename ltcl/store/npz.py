@@ -134,6 +134,9 @@ def _headers(path: Path) -> Headers:
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
             with archive.open(info) as stream:
+                # Opened all the same: a name in the directory may be damaged.
+                if name == info.filename:
+                    continue
                 shape, dtype = _array_header(stream)
                 stored = info.file_size - stream.tell()
             most = EXPANSION * min(info.compress_size, file_size)
@@ -200,9 +203,10 @@ def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:
 def read_npy(path: Path) -> StoreRecord:
     """Read a dense matrix, or map it where memory has no room for two of it."""
     with path.open("rb") as file:
-        _, dtype = _array_header(file)
-    if dtype.hasobject:
-        raise FileError(f"is {OBJECTS}; it must be an array of real numbers")
+        shape, dtype = _array_header(file)
+    kind = _kind(dtype)
+    if kind:
+        raise FileError(f"holds an array {shape} that is {kind}; it must be of real numbers")
     mapped = np.lib.format.open_memmap(path, "r")  # reads the header and allocates nothing
     has_room = 2 * mapped.nbytes <= checks.host_memory()
 
