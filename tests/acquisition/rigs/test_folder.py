@@ -312,6 +312,12 @@ def test_raw_of_a_monochrome_camera_is_grey(tmp_path: Path, channels: int) -> No
     np.testing.assert_allclose(codes, raw * (65535 / 4095), atol=1.5)
 
 
+def test_raw_in_a_folder_whose_name_is_not_utf_8(tmp_path: Path) -> None:
+    folder = tmp_path / b"caf\xe9".decode("utf-8", "surrogateescape")
+    camera_files.write_dng(place(folder, ".dng"), RAW, 1 / 30)
+    assert photograph(folder).shape == (32, 48, 3)
+
+
 def test_raw_without_rawpy_and_of_a_size_beyond_memory_is_refused(
     tmp_path: Path, monkeypatch: Any
 ) -> None:
