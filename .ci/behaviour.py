@@ -131,8 +131,8 @@ def transport_commands() -> list[str]:
     return lines
 
 
-def task_commands() -> list[str]:
-    """Compensate, separate and relight."""
+def compensate_commands() -> list[str]:
+    """Compensate."""
     lines = []
     for method in ("jacobi", "richardson", "chebyshev", "gauss_seidel", "sor", "southwell", "cg"):
         lines.append(f"compensate corner.npz grey.png --method {method} --out m-{method} --json")
@@ -173,6 +173,13 @@ def task_commands() -> list[str]:
         "compensate small.npz grey.png --rtol 1e-6 --out c23",
         "compensate dark.npz grey.png --out c24 --json",
         "compensate dark.npz grey.png --on-dark raise --out c25",
+    ]
+    return lines
+
+
+def light_commands() -> list[str]:
+    """Separate, relight, and other programs than those for transports."""
+    return [
         "separate corner.npz picture.exr --out s1",
         "separate corner.npz picture.exr --out s2 --bounces 2 --json",
         "separate corner.npz picture.exr --out s3 --bounces 0 --json",
@@ -215,7 +222,6 @@ def task_commands() -> list[str]:
         "nothing",
         "--version",
     ]
-    return lines
 
 
 def help_commands() -> list[str]:
@@ -415,7 +421,8 @@ def record(folder: Path) -> None:
     os.environ["NO_COLOR"] = "1"
     make_inputs()
     runs = {}
-    lines = [*scene_commands(), *transport_commands(), *task_commands(), *help_commands()]
+    lines = [*scene_commands(), *transport_commands(), *compensate_commands()]
+    lines += [*light_commands(), *help_commands()]
     for number, line in enumerate(lines):
         sys.stderr.write(f"\r{number + 1} of {len(lines)}: {line:60.60}")
         runs[f"{number}: {line}"] = run(line)

@@ -97,7 +97,7 @@ def separate_light(T: Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]
     """Direct light and bounces, (BOUNCES + 1, h, w), and whether section 8.4 was warned of."""
     separation = ltcl.separate(T, picture, BOUNCES, method="direct")
     light = np.concatenate([separation.direct[None], separation.bounces])
-    return light, bool(separation.warning)
+    return light, "section 8.4" in separation.warning
 
 
 def series_iterations(R: np.ndarray, l_out: np.ndarray, l_d: np.ndarray) -> int | None:

@@ -26,7 +26,7 @@
 // every second d.
 #define STRAIGHT 0.25f
 
-static inline real bounded_free(real x, real g, real lower, real upper)
+INLINE real bounded_free(real x, real g, real lower, real upper)
 {
     return (g > 0 ? x <= lower : x >= upper) ? 0 : -g;
 }
@@ -61,7 +61,10 @@ kernel void bounded_direction(
     real gd = 0, dd = 0, most = 0;
     EACH_VALUE(i, row) {
         const real z = bounded_free(x[i], g[i], lower[row], upper[row]);
-        const real p = z == 0 ? 0 : z + beta * d[i];
+        // Two statements: LLVM 18 of PoCL 6 fails on the conditional expression.
+        real p = z + beta * d[i];
+        if (z == 0)
+            p = 0;
         const real step = alpha == 0 ? 0 : clamp(x[i] + alpha * p, lower[row], upper[row]) - x[i];
         d[i] = step;
         gd += g[i] * step;

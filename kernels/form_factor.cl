@@ -213,7 +213,7 @@ kernel void form_factor_weigh(
             z[c * pitch + j] = j < count ? right[j] * x[j * stride + offset + c] : 0;
 }
 
-static inline void patch_sum(
+INLINE void patch_sum(
     real *sum, int i, real left, int pitch, global const real *geometry, global const real *blocks,
     global const real *z)
 {

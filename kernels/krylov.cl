@@ -46,7 +46,7 @@
     (STATE_ROWS + iteration % RESIDUAL_SLOTS * (int)get_num_groups(0) + (int)get_group_id(0))
 
 // A denominator beyond float32 gives NaN, which the residual tells, not a step of 0.
-static inline real divided(real a, real b)
+INLINE real divided(real a, real b)
 {
     return a / (isfinite(b) ? b : NAN);
 }

@@ -82,7 +82,7 @@ kernel void southwell_step(
         places[me] = place;
         // A tree; of equal ones the first row.
         for (int left = items; left > 1; left = (left + 1) / 2) {
-            barrier(CLK_LOCAL_MEM_FENCE);
+            barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
             if (me < left / 2) {
                 const int rival = places[me + (left + 1) / 2];
                 const real gain = fabs(r[rival * k + c]) - fabs(r[places[me] * k + c]);

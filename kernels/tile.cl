@@ -69,7 +69,7 @@ typedef char narrow;
 #endif
 
 // Add every `step`-th number from number `n` of the tiles on.
-static inline void tile_add(
+INLINE void tile_add(
     real *sum, global const PLACE *columns, global const narrow *values, global const uchar *scales,
     global const real *x, int stride, int n, int end, int step)
 {
@@ -81,7 +81,7 @@ static inline void tile_add(
     }
 }
 
-static inline lanes tile_sum(
+INLINE lanes tile_sum(
     global const PLACE *columns, global const narrow *values, global const uchar *scales,
     global const real *x, int stride, int j, int end)
 {

@@ -52,7 +52,9 @@
 #define SLOT_BITS 42  // the rest of 64
 
 // Loads asked for ahead: a third less time a step. The prefetch() of OpenCL does nothing in PoCL.
-#if WALKS > 1 && defined(__clang__)
+// Only where clang compiles for the CPU itself: SPIR-V, through which others pass, has no such
+// instruction.
+#if WALKS > 1 && defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
 #define FETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #else
 #define FETCH(p)
@@ -73,7 +75,7 @@ typedef struct {
 
 // Half a block of Philox4x32-10 (Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, SC
 // 2011) at (x, y, z, w).
-static inline void philox(walks *walk, uint stream, ulong seed)
+INLINE void philox(walks *walk, uint stream, ulong seed)
 {
     ulong x[WALKS], y[WALKS], z[WALKS], w[WALKS];
     for (int i = 0; i < WALKS; ++i) {
@@ -97,12 +99,12 @@ static inline void philox(walks *walk, uint stream, ulong seed)
 #define FIRST_ENTRY(record) ((ulong)(record).y << 32 | (record).x)
 
 // A uniform choice of the entries of a row, by the upper bits of a word.
-static inline ulong slot(uint4 record, ulong word)
+INLINE ulong slot(uint4 record, ulong word)
 {
     return FIRST_ENTRY(record) + ((word >> GO_ON_BITS) * record.z >> SLOT_BITS);
 }
 
-static inline void
+INLINE void
 set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
 {
     for (int w = 0; w < WALKS; ++w) {
@@ -118,7 +120,7 @@ set_out(walks *walk, int units, int chunks, uint first, uint end, global const u
 // Prepare one step of all walks: start the next samples where walks have ended, and draw. Returns
 // whether any walk is under way; the others take a step that does not count. `links` are read where
 // LINKED only; `b` may be 0.
-static inline int draw_steps(
+INLINE int draw_steps(
     walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries,
     global const uint4 *links, global const real *b, int stride)
 {
@@ -168,7 +170,7 @@ static inline int draw_steps(
 
 // Move walk w. Returns whether it goes on after its score, which counts `worth` times: unchanged by
 // an empty row.
-static inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
+INLINE int move(walks *walk, int w, global const uint2 *steps, real *worth)
 {
     int seen = 0;
     for (int c = 0; c < CHANNELS; ++c)
@@ -265,7 +267,7 @@ kernel void walk_columns(
 #define BIT_LENGTH(x) (64 - (int)clz((ulong)(x)))
 
 // |value| 2^(150 + shift) of the bits of a real, rounded to the nearest integer.
-static inline ulong scaled(uint value, int shift)
+INLINE ulong scaled(uint value, int shift)
 {
     const uint bits = value & 0x7fffffffu, exponent = bits >> 23;
     const ulong significand = exponent ? (bits & 0x7fffffu) | 0x800000u : bits;
@@ -275,7 +277,7 @@ static inline ulong scaled(uint value, int shift)
     return left < -25 ? 0 : ((significand >> (-left - 1)) + 1) >> 1;
 }
 
-static inline ulong scaled_sum(global const uint *values, uint n, int shift)
+INLINE ulong scaled_sum(global const uint *values, uint n, int shift)
 {
     ulong sum = 0;
     for (uint t = 0; t < n; ++t)
@@ -290,7 +292,7 @@ static inline ulong scaled_sum(global const uint *values, uint n, int shift)
         ++t; \
     while (t < n && !(MASS(t) test capacity))
 
-static inline void fill_bins(
+INLINE void fill_bins(
     global const uint *values, global const int *columns, uint n, int shift, ulong capacity,
     global ulong *out)
 {

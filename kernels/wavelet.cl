@@ -75,7 +75,7 @@ typedef struct {
     real c, s;    // cosine and sine for the last two samples, where they are not a regular pair
 } side;
 
-static inline side side_at(int pixels, int level)
+INLINE side side_at(int pixels, int level)
 {
     const int size = 1 << level, whole = pixels >> level, rest = pixels & (size - 1);
     const int n = whole + (rest > 0);
@@ -128,7 +128,7 @@ INLINE term join_term(side a, int m, int t, bool inside, constant real *taps)
 }
 
 // Where sample 0 or 1 of pair m stands; a.n: there is none.
-static inline int place(side a, int m, int which)
+INLINE int place(side a, int m, int which)
 {
     const int i = 2 * m + which;
     return m < a.regular ? (i + FIRST) % (2 * a.regular) : i;

@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Output that is there whole or not at all, and input files that are files.
 
-A hidden temporary file on the same disk is written, flushed and renamed, which is atomic. Its name
-tells host and process: the next writer in a folder removes the temporaries of processes that were
-killed (not on Windows).
+A hidden temporary file on the same disk is written, flushed and renamed, which is atomic. A new
+folder is exchanged with the one that it replaces, which is atomic, too, where the file system is
+able to (on Linux and macOS; not NFS).
+
+A writer holds a lock on its temporary, a reader of a folder on a file in it. What nobody has locked
+any more is removed by the next writer in the same place. Windows has no such locks: nothing is
+removed there.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
 import importlib
 import os
 import platform
@@ -16,6 +22,7 @@ import re
 import secrets
 import shutil
 import stat
+import weakref
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -32,13 +39,34 @@ IS_WINDOWS = os.name == "nt"
 # Windows has no fcntl: nothing is locked there.
 fcntl: Any = None if IS_WINDOWS else importlib.import_module("fcntl")
 
+# Some network file systems have locks that only their own host sees.
 HOST = f"{zlib.crc32(platform.node().encode()):08x}"
-TEMPORARY_NAME = re.compile(rf"\..*-{HOST}-(\d{{1,9}})-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
+TEMPORARY_NAME = re.compile(rf"\..*-{HOST}-[0-9a-f]{{16}}(\.[^.]*)?", re.DOTALL)
+# Arguments of renameat2(2) and renamex_np(2) that exchange two names.
+CURRENT_FOLDER = -100
+RENAME_EXCHANGE = 2
+# Errors of file systems that cannot exchange; EPERM is that of sandboxes.
+CANNOT_EXCHANGE = (
+    errno.EINVAL,
+    errno.ENOSYS,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.EXDEV,
+    errno.EPERM,
+)
+# Errors of file systems without locks; EBADF is that of NFS.
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EBADF)
+# Errors of a writer that another one overtakes.
+OVERTAKEN = (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST)
 
 
-def input_file(path: Any) -> Path:
-    """Return `path` as a Path if it is a regular file with content, else raise FileError."""
+def input_file(path: Any, shown: Path | None = None) -> Path:
+    """Return `path` as a Path if it is a regular file with content, else raise FileError.
+
+    The message names it as `shown`.
+    """
     path = as_path(path)
+    label: Path = shown or path
     try:
         status = path.stat()
         is_regular = stat.S_ISREG(status.st_mode)
@@ -46,9 +74,9 @@ def input_file(path: Any) -> Path:
         if is_regular:
             path.open("rb").close()
     except FileNotFoundError:
-        raise FileError(f"{path}: no such file") from None
+        raise FileError(f"{label}: no such file") from None
     except OSError as error:
-        raise _refusal(path, "cannot be read", error) from error
+        raise _refusal(label, "cannot be read", error) from error
 
     if path.is_dir():
         kind = "a folder"
@@ -58,7 +86,7 @@ def input_file(path: Any) -> Path:
         kind = "empty"
     else:
         return path
-    raise FileError(f"{path}: is {kind}; it must be a file with content")
+    raise FileError(f"{label}: is {kind}; it must be a file with content")
 
 
 def as_path(path: Any, name: str = "path") -> Path:
@@ -93,17 +121,14 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise FileError(
                 f"{path}: is a folder, or no regular file; a file cannot be written there"
             )
-        temporary = _temporary(target.parent, target.stem, target.suffix.lower())
-        try:
-            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        suffix = target.suffix.lower()
+        with _temporary(_make_file, target.parent, target.stem, suffix) as temporary:
             yield temporary
-            _flush(temporary)
+            flush(temporary)
             if target.exists():
                 shutil.copymode(target, temporary)
             os.replace(temporary, target)
-            _flush(target.parent)
-        finally:
-            temporary.unlink(missing_ok=True)
+            flush(target.parent)
 
 
 @contextlib.contextmanager
@@ -111,42 +136,146 @@ def fill_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Itera
     """Fill a temporary folder; put it at `path` only when the block ends well.
 
     Into an existing folder files are moved one by one, and its other files stay; with `replace` the
-    new folder takes its place (see `restore`). Parents, links and errors are as in `replace_file`.
+    new folder takes its place. Parents, links and errors are as in `replace_file`.
     """
     with _place_to_write(path) as target:
         if target.exists() and not target.is_dir():
             raise FileError(f"{path}: is a file; a folder cannot be written there")
         is_joining = target.exists() and not replace
-        if is_joining:
-            temporary = _temporary(target, "ltcl")
-        else:
-            temporary = _temporary(target.parent, target.name)
-        try:
-            temporary.mkdir()
+        folder = target if is_joining else target.parent
+        stem = "ltcl" if is_joining else target.name
+        with _temporary(Path.mkdir, folder, stem) as temporary:
             yield temporary
             files = flush_tree(temporary)
             if is_joining:
                 _move_into(target, temporary, files)
             else:
-                if target.exists():
-                    os.replace(target, _earlier(target))
+                _put_folder(temporary, target)
+            flush(target.parent)
+            if not is_joining:
+                _discard(_earlier(target))
+
+
+def _put_folder(temporary: Path, target: Path) -> None:
+    """Put a folder in its place; the one that was there is called `temporary` then."""
+    while True:
+        try:
+            if not target.exists():
                 os.replace(temporary, target)
-            _flush(target.parent)
-        finally:
-            if replace:
-                restore(target)
-            shutil.rmtree(temporary, ignore_errors=True)
+            elif not exchange(temporary, target):
+                _put_folder_in_two_steps(temporary, target)
+            return
+        except OSError as error:
+            if error.errno not in OVERTAKEN or not temporary.exists():
+                raise
+
+
+def exchange(one: Path, two: Path) -> bool:
+    """Exchange the names of two folders at once; False where that cannot be done."""
+    if IS_WINDOWS:
+        return False
+    system = ctypes.CDLL(None, use_errno=True)
+    names = os.fsencode(one), os.fsencode(two)
+    if hasattr(system, "renameat2"):
+        from_name = (CURRENT_FOLDER, names[0])
+        failed = system.renameat2(*from_name, CURRENT_FOLDER, names[1], RENAME_EXCHANGE)
+    elif hasattr(system, "renamex_np"):
+        failed = system.renamex_np(*names, RENAME_EXCHANGE)
+    else:
+        return False
+    code = ctypes.get_errno()
+    if failed and code not in CANNOT_EXCHANGE:
+        raise OSError(code, os.strerror(code), str(two))
+    return not failed
+
+
+def _put_folder_in_two_steps(temporary: Path, target: Path) -> None:
+    """Replace a folder where two cannot be exchanged; `restore` repairs what a kill leaves."""
+    earlier = _earlier(target)
+    _discard(earlier)
+    os.replace(target, earlier)
+    os.replace(temporary, target)
 
 
 def restore(target: Path) -> None:
-    """Repair a folder whose writer was killed between the two renames of `fill_folder`.
-
-    The earlier folder comes back where the new one is missing; else it is removed.
-    """
+    """Bring the earlier folder back if its writer was killed before the new one had its place."""
     earlier = _earlier(target)
-    if not os.path.lexists(target) and earlier.exists():
+    if os.path.lexists(target) or not earlier.exists():
+        return
+    with contextlib.suppress(FileNotFoundError):
         os.replace(earlier, target)
-    shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _earlier(target: Path) -> Path:
+    return target.with_name(f".{target.name[:80]}.ltcl-earlier")
+
+
+def _discard(folder: Path) -> None:
+    """Make a folder a temporary, which goes when its last reader has gone."""
+    temporary = _temporary_path(folder.parent, folder.stem)
+    # Another writer may have done so, or there is none.
+    with contextlib.suppress(FileNotFoundError):
+        os.replace(folder, temporary)
+        _remove(temporary)
+
+
+class PinnedFolder:
+    """A folder that is read: it stays whole while this object lives, though others replace it.
+
+    Attributes
+    ----------
+    root : Path
+        Where its files are read, even if its name belongs to another folder by now.
+    """
+
+    def __init__(self, path: Path, file: str) -> None:
+        """Pin the folder by a lock on one of its files."""
+        self.root = path
+        if IS_WINDOWS:
+            return
+        place = Path(os.path.realpath(path))
+        locks = None
+        while locks is None:
+            locks = _pin(place, file)
+        folder, opened = locks
+        weakref.finalize(self, _unpin, folder, opened, place)
+        # Other systems than Linux read whatever has the name, and checksums tell.
+        if Path(f"/proc/self/fd/{folder}").is_dir():
+            self.root = Path(f"/proc/self/fd/{folder}")
+
+
+def _pin(path: Path, file: str) -> tuple[int, contextlib.ExitStack] | None:
+    """Open a folder and lock a file in it; None if another process removes the folder just now."""
+    with contextlib.ExitStack() as opened:
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        opened.callback(os.close, folder)
+        try:
+            handle = os.open(file, os.O_RDONLY | os.O_NONBLOCK, dir_fd=folder)
+        except FileNotFoundError:
+            if _is_at(path, folder):
+                raise
+            return None
+        opened.callback(os.close, handle)
+        # In file systems without locks, a folder may be removed while it is read.
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_SH)
+        is_removed = os.fstat(handle).st_nlink == 0
+        return None if is_removed else (folder, opened.pop_all())
+
+
+def _unpin(folder: int, opened: contextlib.ExitStack, path: Path) -> None:
+    """Close a folder, and remove it if it was replaced and nobody else reads it."""
+    with opened:
+        is_replaced = not _is_at(path, folder)
+    if is_replaced and path.parent.exists():
+        sweep(path.parent)
+
+
+def _is_at(path: Path, folder: int) -> bool:
+    """True if an open folder is still the one at `path`."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(folder), path.stat())
+    return False
 
 
 @contextlib.contextmanager
@@ -155,7 +284,7 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
 
     Without `wait` the second process is refused with a FileError.
     """
-    created = [place for place in (folder, *folder.parents) if not place.exists()]
+    created = _missing_folders(folder)
     handle = -1
     with _place_to_write(folder / "*"):
         if fcntl is not None:
@@ -175,40 +304,91 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove the temporaries of processes of this host that no longer run."""
+    """Remove the temporaries in a folder whose writers, and readers, no longer run."""
     if IS_WINDOWS or not os.access(folder, os.R_OK):
         return
     for name in os.listdir(folder):
-        match = TEMPORARY_NAME.fullmatch(name)
-        if match is None or _is_running(int(match[1])):
-            continue
-        place = folder / name
-        if place.is_dir():
-            shutil.rmtree(place, ignore_errors=True)
+        if TEMPORARY_NAME.fullmatch(name):
+            _remove(folder / name, needs_lock=True)
+
+
+def _remove(temporary: Path, *, needs_lock: bool = False) -> None:
+    """Remove a temporary, unless somebody holds a lock on it or on a file in it.
+
+    With `needs_lock` it stays, too, if the file system has no locks.
+    """
+    places = [temporary]
+    if temporary.is_dir():
+        places += filter(Path.is_file, temporary.iterdir())
+    with contextlib.ExitStack() as locks:
+        try:
+            if not IS_WINDOWS:
+                for place in places:
+                    locks.enter_context(_exclusive(place))
+        except OSError as error:
+            if needs_lock or isinstance(error, (BlockingIOError, FileNotFoundError)):
+                return
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
         else:
             with contextlib.suppress(PermissionError):
-                place.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
 
 
-def _is_running(process: int) -> bool:
-    """True if a process of this host runs, be it somebody else's."""
+@contextlib.contextmanager
+def _exclusive(path: Path) -> Iterator[None]:
+    """Lock a file or folder; BlockingIOError if somebody else has, OSError if it cannot be."""
+    # A named pipe would wait for its other end.
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW
+    handle = os.open(path, flags)
     try:
-        os.kill(process, 0)  # asks, and does nothing
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
 
 
-def _temporary(folder: Path, stem: str, suffix: str = "") -> Path:
+@contextlib.contextmanager
+def _temporary(
+    make: Callable[[Path], object], folder: Path, stem: str, suffix: str = ""
+) -> Iterator[Path]:
+    """Make a temporary, locked during the block; what has its name at the end is removed."""
     sweep(folder)
-    unique = f"{HOST}-{os.getpid()}-{secrets.token_hex(4)}"
-    return folder / f".{stem[:40]}-{unique}{suffix}"
+    lock = contextlib.ExitStack()
+    path = _temporary_path(folder, stem, suffix)
+    try:
+        make(path)
+        # Another writer may take it for one of a killed process until it is locked.
+        while not _has_locked(path, lock):
+            path = _temporary_path(folder, stem, suffix)
+            make(path)
+        yield path
+    finally:
+        lock.close()
+        _remove(path)
 
 
-def _earlier(target: Path) -> Path:
-    return target.with_name(f".{target.name[:80]}.ltcl-earlier")
+def _has_locked(path: Path, lock: contextlib.ExitStack) -> bool:
+    """Lock a new temporary; False if another writer has removed it, or is about to."""
+    if IS_WINDOWS:
+        return True
+    try:
+        lock.enter_context(_exclusive(path))
+    except (BlockingIOError, FileNotFoundError):
+        return False
+    except OSError as error:
+        # File systems without locks, where nobody sweeps.
+        if error.errno not in NO_LOCKS:
+            raise
+    return path.exists()
+
+
+def _temporary_path(folder: Path, stem: str, suffix: str = "") -> Path:
+    return folder / f".{stem[:40]}-{HOST}-{secrets.token_hex(8)}{suffix}"
+
+
+def _make_file(path: Path) -> None:
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
 
 
 def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
@@ -220,11 +400,13 @@ def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
         if is_used:
             name = destination.relative_to(target)
             raise FileError(f"{target}: {name} cannot be placed there, a name in its path is used")
+    folders = set()
     for file, destination in zip(files, destinations, strict=True):
-        destination.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(destination.parent)
         os.replace(file, destination)
-    for folder in {destination.parent for destination in destinations}:
-        _flush(folder)
+        folders.add(destination.parent)
+    for folder in folders:
+        flush(folder)
 
 
 def _is_no_folder(path: Path) -> bool:
@@ -235,9 +417,9 @@ def _is_no_folder(path: Path) -> bool:
 def _place_to_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Resolve `path` and make its parents; an OSError of the block becomes one line about it."""
     target = Path(os.path.realpath(as_path(path)))
-    created = [folder for folder in target.parents if not os.path.exists(folder)]
+    created = _missing_folders(target.parent)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(target.parent)
         yield target
     except BaseException as error:
         _remove_empty(created)
@@ -256,6 +438,19 @@ def _is_about(error: OSError, target: Path) -> bool:
     return place.is_relative_to(target.parent) or target.is_relative_to(place)
 
 
+def _missing_folders(folder: Path) -> list[Path]:
+    """Return `folder` and its parents as far as they do not exist, the innermost first."""
+    return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
+
+
+def make_folders(folder: Path) -> None:
+    """Make a folder and its missing parents, each flushed into the one that holds it."""
+    missing = _missing_folders(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in missing:
+        flush(place.parent)
+
+
 def _remove_empty(folders: Iterable[Path]) -> None:
     """Remove folders, the innermost first, unless something is in them by now."""
     for folder in folders:
@@ -272,11 +467,11 @@ def flush_tree(folder: Path) -> list[Path]:
     """Flush all in a folder to the disk, and return its files."""
     places = sorted(folder.rglob("*"))
     for place in (*places, folder):
-        _flush(place)
+        flush(place)
     return [place for place in places if place.is_file()]
 
 
-def _flush(path: Path) -> None:
+def flush(path: Path) -> None:
     """Flush a file to the disk; or a folder, so that a rename in it survives a power cut."""
     if not path.is_dir():
         _flush_handle(os.open(path, os.O_RDWR))

@@ -118,5 +118,5 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def disk_without_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Flushing matters to power cuts, which no test can cause; `test_flushing.py` counts calls."""
+    """Flushing matters to power cuts, which `tests/store/test_power_cuts.py` simulates."""
     monkeypatch.setattr(os, "fsync", lambda handle: None)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import pytest
 
 from ltcl.errors import FileError, InputTypeError
-from ltcl.files import fill_folder, input_file, replace_file
+from ltcl.files import PinnedFolder, fill_folder, input_file, replace_file, sweep
 
 MANAGERS = [replace_file, fill_folder]
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -137,3 +139,57 @@ def test_what_cannot_be_read_is_refused(tmp_path):
         refused(tmp_path / name, lambda name=name: input_file(tmp_path / name))
     with pytest.raises(InputTypeError, match=r"path .*3"):
         input_file(3)
+
+
+def in_child(work: Callable[[], object]) -> None:
+    """Do `work` in another process."""
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        return
+    work()
+    os._exit(0)
+
+
+@pytest.mark.parametrize("manager", MANAGERS)
+def test_the_temporary_of_a_writer_stays_while_it_lives(tmp_path, manager):
+    def write_and_die() -> None:
+        with manager(tmp_path / "b"):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    with manager(tmp_path / "a") as temporary:
+        place = temporary if manager is replace_file else temporary / "one.txt"
+        place.write_text("an hour of work")
+        # Another writer sweeps, whatever it thinks of the number of this process.
+        in_child(lambda: write(manager, tmp_path / "b", {"one.txt": "1"}))
+        sweep(tmp_path)
+        in_child(write_and_die)
+        assert len(list(tmp_path.rglob(".*"))) == 2
+    # The next writers in these places remove what the killed one has left.
+    write(manager, tmp_path / "b", {"one.txt": "2"})
+    assert not list(tmp_path.rglob(".*"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+    assert "an hour of work" in {path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_a_folder_that_is_read_stays_until_its_last_reader_has_gone(
+    tmp_path, monkeypatch, can_exchange
+):
+    if not can_exchange:
+        monkeypatch.setattr("ltcl.files.exchange", lambda one, two: False)
+    path = tmp_path / "folder"
+    with fill_folder(path, replace=True) as temporary:
+        (temporary / "file").write_text("old")
+    readers = [PinnedFolder(path, "file"), PinnedFolder(path, "file")]
+    for text in ("new", "newer"):
+        with fill_folder(path, replace=True) as temporary:
+            (temporary / "file").write_text(text)
+    readers.append(PinnedFolder(path, "file"))
+    sweep(tmp_path)
+    assert [(reader.root / "file").read_text() for reader in readers] == ["old", "old", "newer"]
+    del readers[0]
+    sweep(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    readers.clear()
+    assert everything(tmp_path) == {"folder": None, "folder/file": b"newer"}

@@ -97,6 +97,7 @@ def test_prompts_show_every_figure(device, monkeypatch, caplog) -> None:
     monkeypatch.setattr(ImageShow, "show", view)
     figures = draw_figures(device)
     for figure in figures:
+        assert "show()" in repr(figure)
         figure.show()
     assert sizes == [figure.canvas.get_width_height() for figure in figures]
     # The first one had no program that shows it.

@@ -29,7 +29,7 @@ typedef struct {
 #define EACH_COLUMN(j) for (int j = get_local_id(0); j < s.width; j += get_local_size(0))
 #define EACH_VALUE(i, row) for (int i = s.first, row = s.row; i < s.end; i += s.step, row += s.rows)
 
-static inline share columns_share(int rows, int k)
+INLINE share columns_share(int rows, int k)
 {
     const int me = get_local_id(0), items = get_local_size(0);
     share s;
@@ -47,14 +47,14 @@ static inline share columns_share(int rows, int k)
     return s;
 }
 
-static inline real4 four(global const real *x, int i, int step)
+INLINE real4 four(global const real *x, int i, int step)
 {
     return step == 1 ? LOAD4(x + i) : (real4)(x[i], x[i + step], x[i + 2 * step], x[i + 3 * step]);
 }
 
 // The item's sum of x * y * weights, without weights where that is 0: four sums at a time, none of
 // which waits for another.
-static inline real
+INLINE real
 dot_share(global const real *x, global const real *y, global const real *weights, share s)
 {
     real4 sums = 0;
@@ -68,7 +68,7 @@ dot_share(global const real *x, global const real *y, global const real *weights
 
 // Leave the sum of the items' values, or the largest, at out[column]. `scratch` holds a real an
 // item.
-static inline void
+INLINE void
 columns_sum(real value, global real *out, int largest, share s, local real *scratch)
 {
     scratch[get_local_id(0)] = value;
@@ -87,7 +87,7 @@ columns_sum(real value, global real *out, int largest, share s, local real *scra
 //   scratch    a real an item; behind it (first + count, width) totals
 //   first      totals that are kept before these
 // Returns where these totals begin: that of sum n of column j is at [n * width + j].
-static inline local real *columns_totals(
+INLINE local real *columns_totals(
     global const real *partials, int slices, int count, int largest, int k, share s,
     local real *scratch, int first)
 {

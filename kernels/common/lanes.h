@@ -46,7 +46,7 @@ typedef struct {
 } piece;
 
 // Piece number p of k right-hand sides, at least K.
-static inline piece piece_of(int p, int k)
+INLINE piece piece_of(int p, int k)
 {
     const int at = min(K * p, k - K);
     return (piece){at, K * p - at};

@@ -22,7 +22,7 @@
 #include "lanes.h"
 
 // The sum of each of K values over a work-group, in every item.
-static inline void group_sums(real *value, local real *scratch)
+INLINE void group_sums(real *value, local real *scratch)
 {
     for (int k = 0; k < K; ++k)
         scratch[get_local_id(0) * K + k] = value[k];

@@ -22,7 +22,7 @@
 #define SUM_SQUARES
 #define KEEP_SQUARES
 
-static inline void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
+INLINE void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
 {
     for (int k = 0; k < K; ++k)
         finish((first + row) * stride + offset + k, sum[k], a, b, c, x, y, out);

@@ -36,7 +36,7 @@
     partials[(first_group + (int)get_group_id(0)) * stride + offset + k] = sum.item[k]
 
 // The step of one row; `sum` becomes the squares of its residual.
-static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
+INLINE void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
 {
     const int i = (first + row) * stride + offset;
     for (int k = 0; k < K; ++k) {

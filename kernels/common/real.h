@@ -18,7 +18,8 @@ typedef float8 real8;
 #define OF(name, n) PASTE(name, n)
 
 // Loads and stores of n neighbouring values at any address of a real.
-// INLINE is for functions of several values at once, which a call would pass through memory.
+// INLINE is for all functions: a call would pass several values through memory, and llvmpipe crashes
+// where that memory lives across a barrier.
 #ifdef __clang__
 typedef real2 real2_packed __attribute__((aligned(4)));
 typedef real4 real4_packed __attribute__((aligned(4)));
@@ -41,14 +42,14 @@ typedef real8 real8_packed __attribute__((aligned(4)));
 #define STORE8(v, p) STORE_WIDE(8, v, p)
 
 // out = a sum + b y + c x, one value; y is not read where b is 0, nor x where c is.
-static inline void finish(
+INLINE void finish(
     int i, real sum, real a, real b, real c, global const real *x, global const real *y,
     global real *out)
 {
     out[i] = a * sum + (b == 0 ? 0 : b * y[i]) + (c == 0 ? 0 : c * x[i]);
 }
 
-static inline real sum8(real8 v)
+INLINE real sum8(real8 v)
 {
     const real4 h = v.lo + v.hi;
     return (h.s0 + h.s1) + (h.s2 + h.s3);
@@ -60,7 +61,7 @@ static inline real sum8(real8 v)
 //   count    number of values
 //   period   number of results
 //   largest  from this result on, the largest value in place of the sum
-static inline void fold(local real *values, int count, int period, int largest)
+INLINE void fold(local real *values, int count, int period, int largest)
 {
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int rows = (count + period - 1) / period; rows > 1; rows = (rows + 1) / 2) {

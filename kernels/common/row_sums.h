@@ -18,7 +18,7 @@
 #define RUN(j) ((j) + 16 <= end && COLUMN((j) + 15) == COLUMN(j) + 15)
 
 // Add every `step`-th entry from j on.
-static inline void row_add(
+INLINE void row_add(
     bool sparse, real *sum, global const int *columns, global const real *values,
     global const real *x, int stride, int j, int end, int step)
 {
@@ -56,7 +56,7 @@ INLINE void add_run(run_sums *sum, real8 v, global const real *x)
 
 // The K values of a pixel lie side by side: one wide load an entry.
 #define ENTRY_PRODUCT(j) ((lanes)(values[j]) * LOAD(x + COLUMN(j) * stride))
-static inline lanes row_sum(
+INLINE lanes row_sum(
     bool sparse, global const int *columns, global const real *values, global const real *x,
     int stride, int j, int end)
 {

@@ -169,8 +169,8 @@ def connect(
     InputError
         `cluster` is no address, or has workers of its own.
     ClusterError
-        Nothing answers at the address; or local workers are started outside of the main guard, by
-        a file that each of them imports.
+        Nothing answers at the address; local workers do not start, or are started outside of the
+        main guard, by a file that each of them imports.
     """
     distributed = _distributed()
     from dask import config
@@ -222,7 +222,13 @@ def _processes(workers: int | None, device: str | None) -> Any:
             "options": {**options, "env": environment},
         }
     scheduler = {"cls": distributed.Scheduler, "options": loopback}
-    return distributed.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
+    try:
+        return distributed.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
+    except (OSError, RuntimeError, TimeoutError) as error:
+        reason = " ".join(str(error).split())
+        raise ClusterError(
+            f"cluster is 'local', but its {count} worker(s) did not start: {reason}"
+        ) from None
 
 
 def _worker_devices(requested: str | None) -> list[str]:

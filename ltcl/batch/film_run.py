@@ -6,6 +6,8 @@ A batch is read ahead, solved here or on workers, written, and then recorded, in
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
@@ -68,6 +70,7 @@ class BatchSolver:
         numbers, pictures = batch
         try:
             self._survey()
+            pictures = _unambiguous(pictures, self.T)
             solved = compensate(self.T, pictures, gain=self.gain, **self.options)
         except LtclError as error:
             error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
@@ -168,11 +171,19 @@ class FilmRun:
         light = [solved.pattern]
         if solved.appearance is not None:
             light.append(solved.appearance)
-        list(writers.map(self._write, numbers, *light))
-        for read, error, clipped in zip(batch, solved.errors, solved.clipped, strict=True):
-            number = read.frame.number
-            self.records[number] = FrameRecord(number, read.frame.name, read.digest, error, clipped)
-            self.done.add(number)
+        digests = writers.map(self._write, numbers, *light)
+        results = zip(batch, digests, solved.errors, solved.clipped, strict=True)
+        for read, output_digest, error, clipped in results:
+            record = FrameRecord(
+                number=read.frame.number,
+                name=read.frame.name,
+                digest=read.digest,
+                output_digest=output_digest,
+                error=error,
+                clipped=clipped,
+            )
+            self.records[record.number] = record
+            self.done.add(record.number)
         manifest.write(self.folder, self.head, self.records)
         self.solved_count += len(batch)
 
@@ -200,9 +211,9 @@ class FilmRun:
         for frame in islice(self.source, max(numbers)):
             if frame.number in numbers:
                 sample += self._read(frame)
-        pictures = stack(sample or first)
-        options = self.solver.options
-        return compensate(self.solver.T, pictures, gain=gain, loss=loss, **options).gain
+        T = self.solver.T
+        pictures = _unambiguous(stack(sample or first), T)
+        return compensate(T, pictures, gain=gain, loss=loss, **self.solver.options).gain
 
     def _batches(self) -> Iterator[list[ReadFrame]]:
         """The frames that no earlier run has done, without broken ones."""
@@ -243,14 +254,16 @@ class FilmRun:
         return [ReadFrame(frame, digest, picture)]
 
     def _is_done(self, frame: Frame, digest: str, place: str) -> bool:
-        """True if a frame has its files; OtherRun if it has changed since they were made."""
+        """True if a frame has its files as written; OtherRun if it has changed since then."""
         record = self.records.get(frame.number)
         if record is None:
             return False
         if record.digest != digest:
             advice = f"give the same frames to go on, or another folder than {self.folder}"
             raise OtherRun(f"{place} has changed since its pattern was made; {advice}")
-        return all(file.is_file() for file in self._files(frame.number))
+        with contextlib.suppress(OSError):
+            return files_digest(self._files(frame.number)) == record.output_digest
+        return False
 
     def _check_size(self, picture: np.ndarray, place: str) -> None:
         h, w = self.solver.T.camera_grid
@@ -278,11 +291,10 @@ class FilmRun:
             files.append(self.folder / f"appearance/appearance_{number:06}.{self.format}")
         return files
 
-    def _write(
-        self, number: int, pattern: np.ndarray, appearance: np.ndarray | None = None
-    ) -> None:
-        """Write the files of a frame."""
-        pattern_file, *appearance_file = self._files(number)
+    def _write(self, number: int, pattern: np.ndarray, appearance: np.ndarray | None = None) -> str:
+        """Write the files of a frame; return their digest."""
+        files = self._files(number)
+        pattern_file, *appearance_file = files
         if self.codes is not None and self.format == "png":
             images.write(pattern_file, self.codes(pattern), bits=16, encoding="linear")
         else:
@@ -290,6 +302,7 @@ class FilmRun:
         if appearance is not None:
             # Divided by the gain it is as bright as the picture that was asked for.
             self._write_light(appearance_file[0], appearance, self.head["gain"])
+        return files_digest(files)
 
     def _write_light(self, file: Path, light: np.ndarray, white: float) -> None:
         """Write light as it is in .exr, in .png with white at `white`."""
@@ -297,6 +310,14 @@ class FilmRun:
             images.write(file, light)
         else:
             images.write(file, light / np.float32(white), bits=16)
+
+
+def files_digest(files: Sequence[Path]) -> str:
+    """SHA-256 of the bytes of files, one behind the other."""
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def _task(batch: Sequence[ReadFrame]) -> tuple[list[int], np.ndarray]:
@@ -309,3 +330,10 @@ def stack(batch: Sequence[ReadFrame]) -> np.ndarray:
     pictures = [np.atleast_3d(read.picture) for read in batch]
     stacked = np.stack(np.broadcast_arrays(*pictures))
     return stacked if stacked.shape[-1] == 3 else stacked[..., 0]
+
+
+def _unambiguous(pictures: np.ndarray, T: Transport) -> np.ndarray:
+    """Pictures of frames; three grey ones in colour, as (3, h, w) may be the colours of one."""
+    if T.channels == 3 and pictures.ndim == 3 and len(pictures) == 3:
+        return np.repeat(pictures[..., None], 3, axis=-1)
+    return pictures

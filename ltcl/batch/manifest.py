@@ -34,7 +34,7 @@ class OtherRun(InputError):
     """The run that is to be resumed is not the one that was begun."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrameRecord:
     """Entry of a frame of a film.
 
@@ -43,12 +43,14 @@ class FrameRecord:
     number : int, from 1
     name : str
     digest : str, SHA-256 of what was read
+    output_digest : str, SHA-256 of the files that were written
     error, clipped : float, as in a `Compensation`
     """
 
     number: int
     name: str
     digest: str
+    output_digest: str
     error: float
     clipped: float
 

@@ -13,6 +13,7 @@ from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import check_writable_file, file_option, option
 from ltcl.cli.reports.transports import AnalyzedFile
 from ltcl.cli.tables import COLOURS, interval_text, percent, table, verdict_lines
+from ltcl.errors import InputError
 from ltcl.tasks import analysis
 
 PLOT_FORMATS = (".png", ".svg", ".pdf")
@@ -47,7 +48,8 @@ def analyze(
     verdicts = {}
     for file in context.progress.each(files):
         T = loading.load(context, file)
-        first_bounces[file.name] = (T.first_bounce, T.grid)
+        if T.is_square:
+            first_bounces[file.name] = (T.first_bounce, T.grid)
         context.progress("analyzing")
         facts = analysis.analyze(T, rtol=rtol)
         analyses[file.name] = facts
@@ -55,24 +57,30 @@ def analyze(
         entry = AnalyzedFile(file=file, device=T.device.name, **facts.to_dict())
         entries.append(entry)
         colours = COLOURS[T.channels]
-        for colour, channel in zip(colours, facts.channels, strict=True):
+        # A T without S has no channels to analyze.
+        for colour, channel in zip(colours, facts.channels, strict=False):
             label = {"file": str(file), "channel": colour}
             spectra.append({**label, **_spectrum(channel)})
             forecasts.append({**label, **channel.products})
     if plot is not None:
+        if not spectra:
+            raise InputError("--plot is given, but no FILE has an S whose spectrum could be drawn")
         from ltcl import plots
 
         plots.save(plots.analysis(analyses), plot)
     panels.write_first_bounces(show_dark, first_bounces)
-    lines = [
-        "Spectrum of R, bounds on that of S, and checks of the measurement",
-        _table(spectra),
-        "  negative light: in one bounce between parts of the picture; should be 0",
-        "  light passed on: share of each pixel's light, by one bounce; "
-        "must be at least 0 and below 1",
-        f"\nProducts with S to a relative residual of {rtol:g}, two more by sweeps; -: no forecast",
-        _table(forecasts),
-    ]
+    lines = []
+    if spectra:
+        lines = [
+            "Spectrum of R, bounds on that of S, and checks of the measurement",
+            _table(spectra),
+            "  negative light: in one bounce between parts of the picture; should be 0",
+            "  light passed on: share of each pixel's light, by one bounce; "
+            "must be at least 0 and below 1",
+            f"\nProducts with S to a relative residual of {rtol:g}, two more by sweeps; "
+            "-: no forecast",
+            _table(forecasts),
+        ]
     return Answer(entries, [*lines, *verdict_lines(verdicts)])
 
 

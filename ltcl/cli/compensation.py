@@ -112,8 +112,9 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
     resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
     caveat = loading.compression_caveat("errors are", T, asked["exact"])
     notes = [caveat]
-    if settings["weights"] is None and T.masked.any():
-        notes.append("masked pixels do not count in errors")
+    if settings["weights"] is None and T.unlit.any():
+        unlit = f"{T.unlit.sum()} camera pixels that the projector does not light"
+        notes.append(f"{unlit} do not count in errors")
     if setup is not None:
         notes.append(
             "pattern .png holds the codes of the measured projector; 'ltcl show' shows it there"

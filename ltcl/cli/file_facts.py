@@ -166,13 +166,10 @@ def judge(record: StoreRecord | CompressedRecord, facts: FileFacts) -> Verdict:
     reason = ""
     if missing:
         reason = "the file does not contain the grid"
-    elif is_square and facts.nbytes > MAX_JUDGED_BYTES:
+    elif facts.nbytes > MAX_JUDGED_BYTES:
         reason = "T takes more than 256 MiB"
     if reason:
-        tool = f"analyze {facts.file}"
-        if not is_square:
-            tool = f"convert {facts.file} OUT.npz"
-        return Verdict(f"Unknown: {reason}: run 'ltcl {tool}{missing}'.")
+        return Verdict(f"Unknown: {reason}: run 'ltcl analyze {facts.file}{missing}'.")
     arguments = vars(record).items()
     arguments = {name: value for name, value in arguments if value is not None}
     matrices = arguments.pop("matrices")

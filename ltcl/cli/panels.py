@@ -107,7 +107,7 @@ def write_std(
     folder: Path, name: str, std: np.ndarray, factor: float
 ) -> tuple[PictureFiles, Image.Image]:
     """Write files of standard deviations; return their names, and their amplified panel."""
-    label = f"{name.split('/')[-1]}_std"
+    label = f"{name.split('/')[-1]}, std by noise alone"
     _, shown = amplified_panel(std, label, factor)
     return write(folder, f"{name}_std", std, shown), shown
 

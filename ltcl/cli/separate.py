@@ -66,6 +66,7 @@ def separate(
         table(COLUMNS, _table_rows(report)),
         f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}",
         _inverse_error_line(report),
+        *dict.fromkeys(picture.warning for picture in report.pictures),
         loading.compression_caveat("all of this is", T, context.options["exact"]),
     ]
     return Answer(report, lines)
@@ -115,7 +116,12 @@ class PartsWriter:
             parts.append(entry)
         rows = [shown[:3], shown[3:], self._amplified_panels(light), shown_std]
         self.sheet += filter(None, rows)
-        return SeparatedPicture(file=path, transport_error=result.transport_error, parts=parts)
+        return SeparatedPicture(
+            file=path,
+            transport_error=result.transport_error,
+            warning=result.warning,
+            parts=parts,
+        )
 
     def _amplified_panels(self, light: dict[str, np.ndarray]) -> list[Image.Image]:
         """Draw dim parts once more, amplified."""

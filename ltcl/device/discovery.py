@@ -35,7 +35,14 @@ INSTALL_COMMANDS = {
 }
 APT_COMMAND = "sudo apt install pocl-opencl-icd"
 # Variables of the environment that may hide every driver.
-HIDING_VARIABLES = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")
+HIDING_VARIABLES = (
+    "OCL_ICD_VENDORS",
+    "OCL_ICD_FILENAMES",
+    "OPENCL_VENDOR_PATH",
+    "POCL_DEVICES",
+    "POCL_CACHE_DIR",
+    "CUDA_VISIBLE_DEVICES",
+)
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
 _opening = threading.Lock()
@@ -217,13 +224,19 @@ def _install_advice() -> str:
     )
 
 
+def hiding_variables() -> list[str]:
+    """Variables of the environment that are set and may hide every driver, as NAME=value."""
+    variables = []
+    for name in HIDING_VARIABLES:
+        # An empty list of devices hides them, too.
+        if name in os.environ:
+            variables.append(f"{name}={os.environ[name]}")
+    return variables
+
+
 def _unset_advice() -> str:
     """Advice to unset variables that may hide every driver; empty if none is set."""
-    set_by_user = []
-    for name in HIDING_VARIABLES:
-        value = os.environ.get(name)
-        if value:
-            set_by_user.append(f"{name}={value}")
-    if not set_by_user:
+    variables = hiding_variables()
+    if not variables:
         return ""
-    return f"unset {' and '.join(set_by_user)}, or "
+    return f"unset {' and '.join(variables)}, or "

@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ltcl.device import pocl_cache
 from ltcl.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -63,8 +64,16 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
     Raises
     ------
     DeviceError
-        The source does not compile; the message has the compiler's own words.
+        The source does not compile; the message has the compiler's own words. Or the driver is
+        PoCL, and cannot use its folder of compiled kernels.
     """
+    if pocl_cache.DRIVER in device.driver:
+        with pocl_cache.checked():
+            return _build(device, file, defines)
+    return _build(device, file, defines)
+
+
+def _build(device: Device, file: str, defines: dict[str, Any]) -> Any:
     options = list(OPTIONS)
     for name, value in sorted(defines.items()):
         options.append(f"-D{name}={value}")

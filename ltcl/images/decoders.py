@@ -3,7 +3,7 @@
 
 Pillow decodes 8 bits, up to 179 million pixels; OpenCV decodes 16-bit PNG and TIFF; OpenEXR decodes
 its own format. Known limits: some damage gives a wrong picture where a format has no checksum
-(JPEG, BMP, TIFF); OpenEXR also writes to stderr about some damage.
+(JPEG, BMP, TIFF).
 """
 
 from __future__ import annotations
@@ -14,34 +14,47 @@ import re
 import threading
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenEXR
-from PIL import Image, TiffImagePlugin
+from PIL import Image
 
 from ltcl import checks
 from ltcl.errors import FileError, LtclError, MemoryLimitError
 from ltcl.files import input_file
-
-# Tags of TIFF 6.0 and EXIF 2.32.
-WIDTH_TAG = 256
-HEIGHT_TAG = 257
-ORIENTATION_TAG = 274
+from ltcl.images import png, tiff
+from ltcl.images.exr import read_exr
 
 UPRIGHT = 1
 
 # A pixel takes three codes and three floats of 4 bytes each in memory.
 BYTES_PER_PIXEL = 24
 
-# The last chunk of a PNG file, with its length and checksum.
-PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-
 # Modes of Pillow that hold grey or RGB of 8 bits, and the mode each is converted to.
 PILLOW_MODES = {"1": "L", "L": "L", "LA": "LA", "P": "RGBA", "RGB": "RGB", "RGBA": "RGBA"}
 
 _log_lock = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A decoded picture file.
+
+    Attributes
+    ----------
+    codes : ndarray
+        (h, w) or (h, w, 3) RGB, on the pixels of the file.
+    orientation : int
+        Orientation of EXIF.
+    png_header : Header or None
+        Header of a PNG file, which may name a curve.
+    """
+
+    codes: np.ndarray
+    orientation: int = UPRIGHT
+    png_header: png.Header | None = None
 
 
 @contextlib.contextmanager
@@ -78,15 +91,15 @@ def _one_line(error: Exception) -> str:
     return message
 
 
-def decode_file(path: Path, memory: int) -> tuple[np.ndarray, int]:
-    """Codes (h, w) or (h, w, 3) RGB, on the pixels of the file, and its EXIF orientation.
+def decode_file(path: Path, memory: int) -> Decoded:
+    """Decode a picture file.
 
     MemoryLimitError for a picture that needs more than `memory` bytes; FileError for a damaged or
     transparent one.
     """
     with decoding(input_file(path)):
         if path.suffix.lower() == ".exr":
-            return _decode_exr(path, memory), UPRIGHT
+            return Decoded(_without_alpha(read_exr(path, BYTES_PER_PIXEL, memory)))
         checks.fits_host("the file", path.stat().st_size)
         data = path.read_bytes()
         if data.startswith((b"II", b"MM")):
@@ -105,32 +118,38 @@ def turn_upright(codes: np.ndarray, orientation: int) -> np.ndarray:
     return codes
 
 
-def _decode_plain(data: bytes, memory: int) -> tuple[np.ndarray, int]:
-    """Codes and orientation of a PNG, JPEG or BMP file."""
+def _decode_plain(data: bytes, memory: int) -> Decoded:
+    """Decode a PNG, JPEG or BMP file."""
     picture = Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "BMP"))
-    checks.fits_host("the picture", BYTES_PER_PIXEL * picture.width * picture.height, memory)
-    is_deep = False
+    _check_memory(picture.width, picture.height, memory)
     if picture.format == "PNG":
-        _check_png(data)
-        is_deep = "16" in str(picture.tile[0][3])
-    codes = _decode_with_opencv(data) if is_deep else _decode_with_pillow(picture)
-    # After decoding: the header may stand behind the pixels.
+        header = png.read_header(data)
+        if header.depth == 16:
+            codes = _decode_with_opencv(png.without_extras(header))
+            if header.colour_type == png.GREY_WITH_ALPHA:
+                # OpenCV repeats the grey in each colour.
+                codes = codes[..., 0]
+        else:
+            codes = _decode_with_pillow(picture)
+        _check_opaque(png.transparent_pixels(header, codes))
+    else:
+        header = None
+        codes = _decode_with_pillow(picture)
+    # After decoding: the EXIF header may stand behind the pixels.
     exif = Image.Image.getexif(picture)
-    return codes, exif.get(ORIENTATION_TAG, UPRIGHT)
+    return Decoded(codes, exif.get(tiff.ORIENTATION, UPRIGHT), header)
 
 
-def _check_png(data: bytes) -> None:
-    """Refuse a PNG file with a wrong checksum or without its end."""
-    Image.open(io.BytesIO(data)).verify()  # decoding does not look at checksums
-    if PNG_END not in data:  # libpng would write to stderr
-        raise FileError("is truncated: its last chunk, IEND, is not whole")
+def _check_memory(width: int, height: int, memory: int) -> None:
+    checks.fits_host("the picture", BYTES_PER_PIXEL * width * height, memory)
 
 
 def _decode_with_pillow(picture: Image.Image) -> np.ndarray:
     if picture.mode not in PILLOW_MODES:
         raise FileError(f"holds {picture.mode} pixels; it must be grey or RGB")
-    mode = "RGBA" if picture.has_transparency_data else PILLOW_MODES[picture.mode]
-    return _without_alpha(np.array(picture.convert(mode)))
+    # A transparent colour of grey and RGB is not Pillow's to apply: it takes codes of 2 and 4 bits
+    # for those of 8.
+    return _without_alpha(np.array(picture.convert(PILLOW_MODES[picture.mode])))
 
 
 def _decode_with_opencv(data: bytes) -> np.ndarray:
@@ -145,67 +164,22 @@ def _decode_with_opencv(data: bytes) -> np.ndarray:
     return codes
 
 
-def _decode_tiff(data: bytes, memory: int) -> tuple[np.ndarray, int]:
-    """Codes and orientation of a TIFF file.
-
-    Only its directory is read with Pillow, which would refuse float RGB and write to stderr.
-    """
-    file = io.BytesIO(data)
-    is_big_tiff = data[2:3] == b"+"
-    header_size = 16 if is_big_tiff else 8
-    directory = TiffImagePlugin.ImageFileDirectory_v2(file.read(header_size))
-    file.seek(directory.next)
-    directory.load(file)
-    if directory.next:
-        raise FileError("holds several pages; it must hold one picture, so save each to a file")
-    pixels = int(directory[WIDTH_TAG]) * int(directory[HEIGHT_TAG])
-    checks.fits_host("the picture", BYTES_PER_PIXEL * pixels, memory)
-    orientation = directory.get(ORIENTATION_TAG)
-    if not orientation:
-        orientation = UPRIGHT
-    # OpenCV turns a TIFF upright whatever its flags. The inverse turn gives the pixels of the file;
-    # only quarter turns, 6 and 8, are not their own inverse.
-    inverse = {6: 8, 8: 6}.get(orientation, orientation)
-    return turn_upright(_decode_with_opencv(data), inverse), orientation
-
-
-def _decode_exr(path: Path, memory: int) -> np.ndarray:
-    """Codes, float16 or float32, of an EXR file of one part with R, G, B or a single channel."""
-    names, h, w = _exr_channels(path)
-    checks.fits_host("the picture", BYTES_PER_PIXEL * h * w, memory)
-    # `OpenEXR.File` prints on sys.stdout what is wrong with pixels; `InputFile` crashes on headers
-    # that `_exr_channels` refuses.
-    file = OpenEXR.InputFile(str(path))
-    channels = file.header()["channels"]
-    types = {str(channels[name].type) for name in names}
-    if types == {"HALF"}:
-        dtype = np.float16
-    elif types == {"FLOAT"}:
-        dtype = np.float32
+def _decode_tiff(data: bytes, memory: int) -> Decoded:
+    """Decode a TIFF file."""
+    directory = tiff.read_directory(data)
+    tiff.check_layout(directory)
+    _check_memory(int(directory[tiff.WIDTH]), int(directory[tiff.HEIGHT]), memory)
+    orientation = directory.get(tiff.ORIENTATION) or UPRIGHT
+    if tiff.is_grey_with_alpha(directory):
+        codes = _decode_with_pillow(Image.open(io.BytesIO(data), formats=("TIFF",)))
     else:
-        raise FileError(
-            f"holds {', '.join(sorted(types))} channels; they must be all HALF or all FLOAT"
-        )
-    planes = [np.frombuffer(pixels, dtype).reshape(h, w) for pixels in file.channels(names)]
-    return _without_alpha(np.stack(planes, axis=-1))
-
-
-def _exr_channels(path: Path) -> tuple[list[str], int, int]:
-    """Names of the channels of an EXR file, R, G and B first, and its height and width."""
-    file = OpenEXR.File(str(path), header_only=True)
-    header = file.header()
-    is_plain = header["type"] in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
-    if len(file.parts) > 1 or not is_plain:
-        raise FileError("is a deep or multi-part EXR; it must hold one plain picture")
-    window = np.array(header["dataWindow"], int)
-    display = np.array(header["displayWindow"], int)
-    if not np.array_equal(window, display):
-        raise FileError(f"has the data window {window.tolist()}; it must be the display window")
-    w, h = (window[1] - window[0] + 1).tolist()
-    names = sorted((channel.name for channel in header["channels"]), key="RGBA".find)
-    if len(names) != 1 and names not in ([*"RGB"], [*"RGBA"]):
-        raise FileError(f"holds the channels {names}; they must be R, G, B, or one")
-    return names, h, w
+        codes = _decode_with_opencv(data)
+    if tiff.is_inverted(directory, codes):
+        codes = np.iinfo(codes.dtype).max - codes
+    # Both turn a TIFF upright. The inverse turn gives the pixels of the file; only quarter turns,
+    # 6 and 8, are not their own inverse.
+    inverse = {6: 8, 8: 6}.get(orientation, orientation)
+    return Decoded(turn_upright(codes, inverse), orientation)
 
 
 def _without_alpha(codes: np.ndarray) -> np.ndarray:
@@ -221,12 +195,15 @@ def _without_alpha(codes: np.ndarray) -> np.ndarray:
     checks.finite("the picture", codes)
     if channels in (2, 4):
         opaque = np.iinfo(dtype).max if dtype.kind == "u" else 1
-        transparent = np.count_nonzero(codes[..., -1] != opaque)
-        if transparent:
-            raise FileError(
-                f"has {transparent} transparent pixel(s), whose light is not known; "
-                "make them opaque"
-            )
+        _check_opaque(int(np.count_nonzero(codes[..., -1] != opaque)))
     if channels < 3:
         return codes[..., 0]
     return codes[..., :3]
+
+
+def _check_opaque(transparent: int) -> None:
+    """Refuse a picture of so many transparent pixels."""
+    if transparent:
+        raise FileError(
+            f"has {transparent} transparent pixel(s), whose light is not known; make them opaque"
+        )

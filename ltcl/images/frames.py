@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Frames of a folder of pictures or of a video, as linear light; videos written.
 
-OpenCV's FFmpeg decodes videos to 8 bits a channel. It leaves damaged frames out, so they are
-counted: the formats of `COUNTED_EXTENSIONS` store their number, and a missing frame is an error;
-others, as Matroska, store a duration, which sound may stretch, and a missing frame is a warning.
-Known limits: a decoder may replace damaged pixels by others, and FFmpeg itself also writes to
-stderr about damage.
+Videos have 8 bits a channel. Frames that cannot be decoded are missing, so frames are counted: the
+formats of `COUNTED_EXTENSIONS` store their number, and a missing frame is an error; others, as
+Matroska, store a duration, which sound may stretch, and a missing frame is a warning.
 """
 
 from __future__ import annotations
@@ -17,7 +15,9 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,9 +25,9 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.images.decoders import decoding
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
 from ltcl.images.pictures import BITS, as_picture, read
+from ltcl.images.video import Video
 
 # Videos that store the number of their frames.
 COUNTED_EXTENSIONS = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
@@ -36,8 +36,26 @@ COUNTED_EXTENSIONS = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
 OTHER_EXTENSIONS = (".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv", ".flv", ".ogv")
 EXTENSIONS = COUNTED_EXTENSIONS + OTHER_EXTENSIONS
 
+
+class Codec(NamedTuple):
+    """Names that FFmpeg gives to a container, its codec, and the layout of its pixels."""
+
+    container: str
+    name: str
+    pixel_format: str
+
+
 # Videos that can be written, and the codec of each; FFV1 is lossless.
-CODECS = {".mkv": "FFV1", ".avi": "FFV1", ".mp4": "mp4v"}
+CODECS = {
+    ".mkv": Codec("matroska", "ffv1", "bgr0"),
+    ".avi": Codec("avi", "ffv1", "bgr0"),
+    ".mp4": Codec("mp4", "mpeg4", "yuv420p"),
+}
+# MPEG-4 gets as many bits as it can use.
+BITS_PER_PIXEL = 64
+MAX_BIT_RATE = 1 << 30
+# MPEG-4 stores the frames per second as a fraction of two 16-bit numbers.
+MAX_DENOMINATOR = 1001
 
 _logger = logging.getLogger(__name__)
 
@@ -99,34 +117,28 @@ class Source:
         self.count: int | None = None
         self.fps: float | None = None
         self._files: list[Path] = []
+        self._video: Video | None = None
         if path.is_dir():
             self._files = _list_pictures(path)
             self.count = len(self._files)
             return
-        capture = _open_video(path)
-        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if count > 0:
-            self.count = count
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        if fps > 0.0:
-            self.fps = fps
+        self._video = Video(path)
+        self.count = self._video.count
+        self.fps = self._video.fps
+        if encoding == "auto":
+            self.encoding = self._video.encoding
 
     def __iter__(self) -> Iterator[Frame]:
         """All frames, from the first one on; FileError where one is missing."""
-        if self._files:
-            for number, file in enumerate(self._files, start=1):
-                yield Frame(number, file.name, file, self.encoding)
-        else:
-            yield from self._video_frames()
+        for number, file in enumerate(self._files, start=1):
+            yield Frame(number, file.name, file, self.encoding)
+        if self._video is not None:
+            yield from self._video_frames(self._video)
 
-    def _video_frames(self) -> Iterator[Frame]:
-        capture = _open_video(self.path)
+    def _video_frames(self, video: Video) -> Iterator[Frame]:
         number = 0
-        is_decoded, codes = capture.read()
-        while is_decoded:
-            number += 1
+        for number, codes in enumerate(video, start=1):
             yield Frame(number, f"{self.path.name}:{number}", codes, self.encoding)
-            is_decoded, codes = capture.read()
         self._check_count(number)
 
     def _check_count(self, decoded: int) -> None:
@@ -180,7 +192,7 @@ def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") ->
 
 
 def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
-    """Refuse a video by its extension, or by an odd height or width, which OpenCV would cut."""
+    """Refuse a video by its extension, or by an odd height or width, which MPEG-4 cannot hold."""
     path = as_path(path)
     if path.suffix.lower() not in CODECS:
         raise FileError(f"{path}: {unknown_extension(path)}; a video must be {', '.join(CODECS)}")
@@ -215,60 +227,57 @@ def write_video(
     FileError
         The extension is unknown, or the file cannot be written.
     """
+    # The import takes a while.
+    from av.error import FFmpegError
+
     path = as_path(path)
     fps = checks.number("fps", fps, above=0.0)
     check_video(path, (0, 0))
-    codec = CODECS[path.suffix.lower()]
     with replace_file(path) as temporary:
-        count = _encode_video(path, temporary, pictures, fps)
+        try:
+            count = _encode_video(path, temporary, pictures, fps)
+        except FFmpegError as error:
+            raise FileError(f"{path}: cannot be encoded; perhaps the disk is full") from error
         if count == 0:
             raise InputError(f"{path}: there are no frames to write")
-        # OpenCV does not say that a disk is full.
-        capture = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
-        written = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if written != count:
-            raise FileError(
-                f"{path}: holds {written} of {count} frames in {codec}; is the disk full?"
-            )
     return count
 
 
 def _encode_video(path: Path, temporary: Path, pictures: Iterable[np.ndarray], fps: float) -> int:
     """Encode pictures into the file `temporary`, which is for `path`; their number."""
-    writer = cv2.VideoWriter()
+    import av
+
+    codec = CODECS[path.suffix.lower()]
     count = 0
     shape: tuple[int, ...] = ()
-    try:
+    # FFmpeg does not tell that a disk is full, but Python does.
+    with temporary.open("wb") as file, av.open(file, "w", format=codec.container) as video:
+        stream: Any = video.add_stream(codec.name, Fraction(fps).limit_denominator(MAX_DENOMINATOR))
+        stream.thread_type = "AUTO"
+        stream.pix_fmt = codec.pixel_format
         for count, picture in enumerate(pictures, start=1):
-            codes = _bgr_codes(picture)
+            codes = _rgb_codes(picture)
             if count == 1:
                 shape = codes.shape
                 h, w = shape[:2]
                 check_video(path, (h, w))
-                fourcc = writer.fourcc(*CODECS[path.suffix.lower()])
-                writer.open(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (w, h))
+                stream.height = h
+                stream.width = w
+                stream.bit_rate = min(BITS_PER_PIXEL * fps * codes[..., 0].size, MAX_BIT_RATE)
             if codes.shape != shape:
                 raise InputError(f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}")
-            writer.write(codes)
-    finally:
-        writer.release()
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(codes, format="rgb24")))
+        if count:
+            video.mux(stream.encode(None))
     return count
 
 
-def _bgr_codes(picture: np.ndarray) -> np.ndarray:
-    """Codes of a linear picture in sRGB, uint8, (h, w, 3) in the order of OpenCV."""
+def _rgb_codes(picture: np.ndarray) -> np.ndarray:
+    """Codes of a linear picture in sRGB, uint8, (h, w, 3)."""
     codes = from_linear(as_picture("a frame", picture), "srgb", 8, is_float=False)
     if codes.ndim == 2:
-        return cv2.cvtColor(codes, cv2.COLOR_GRAY2BGR)
-    return cv2.cvtColor(codes, cv2.COLOR_RGB2BGR)
-
-
-def _open_video(path: Path) -> cv2.VideoCapture:
-    with decoding(input_file(path)):
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not capture.isOpened():
-            raise FileError("is no video that can be decoded, or a damaged or truncated one")
-        return capture
+        return np.repeat(codes[..., None], 3, axis=2)
+    return np.ascontiguousarray(codes)
 
 
 def _list_pictures(folder: Path) -> list[Path]:

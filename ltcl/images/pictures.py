@@ -8,14 +8,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenEXR
 from numpy.typing import ArrayLike
 
 from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, replace_file, unknown_extension
-from ltcl.images.decoders import decode_file, turn_upright
+from ltcl.images import png
+from ltcl.images.decoders import Decoded, decode_file, decoding, turn_upright
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
+from ltcl.images.exr import write_exr
 
 # Bits that a format can be written with, by its extension; the default first.
 BITS: dict[str, tuple[int, ...]] = {
@@ -55,7 +56,8 @@ def read(
     path : path
         A .png, .jpg, .jpeg, .bmp, .tif, .tiff (8, 16 or 32 bits) or .exr file, opaque everywhere.
     encoding : "auto", "srgb" or "linear"
-        Encoding of the codes in the file; "auto" takes integers as sRGB and floats as linear.
+        Encoding of the codes in the file; "auto" takes integers as sRGB and floats as linear, or
+        as a PNG says (gAMA, cICP).
     upright : bool
         Apply the orientation in the header (EXIF, TIFF). False keeps the pixels of the file, as a
         photograph of a scan needs.
@@ -70,7 +72,7 @@ def read(
     Raises
     ------
     FileError
-        The file is missing, damaged or transparent, or holds NaN.
+        The file is missing, damaged or transparent, holds NaN, or is HDR by its own word.
     MemoryLimitError
         The picture needs more than `memory`, or more than the host has.
 
@@ -83,10 +85,18 @@ def read(
     array([[0.5, 0.5, 0.5]], dtype=float32)
     """
     checks.one_of("encoding", encoding, ENCODINGS)
-    codes, orientation = _decode(as_path(path), memory)
+    path = as_path(path)
+    picture = _decode(path, memory)
+    codes = picture.codes
     if upright:
-        codes = turn_upright(codes, orientation)
-    return to_linear(np.ascontiguousarray(codes), encoding)
+        codes = turn_upright(codes, picture.orientation)
+    codes = np.ascontiguousarray(codes)
+    if encoding == "auto" and picture.png_header is not None:
+        with decoding(path):
+            power = png.power(picture.png_header)
+        if power is not None:
+            return to_linear(codes, "linear") ** np.float32(power)
+    return to_linear(codes, encoding)
 
 
 def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
@@ -107,8 +117,7 @@ def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
     FileError
         The file is missing, damaged or transparent, or holds NaN.
     """
-    codes, _ = _decode(as_path(path), NO_LIMIT)
-    return np.ascontiguousarray(codes)
+    return np.ascontiguousarray(_decode(as_path(path), NO_LIMIT).codes)
 
 
 def write(
@@ -153,7 +162,7 @@ def write(
     with replace_file(path) as temporary:
         try:
             if suffix == ".exr":
-                _write_exr(temporary, codes)
+                write_exr(temporary, codes)
                 return
             if codes.ndim == 3:
                 codes = np.ascontiguousarray(codes[..., ::-1])  # OpenCV keeps BGR
@@ -217,8 +226,8 @@ def as_picture(name: str, image: ArrayLike) -> np.ndarray:
     return checks.finite(name, array)
 
 
-def _decode(path: Path, memory: int) -> tuple[np.ndarray, int]:
-    """Codes on the pixels of the file, and its orientation; an unknown extension is refused."""
+def _decode(path: Path, memory: int) -> Decoded:
+    """Decode a file; an unknown extension is refused."""
     _possible_bits(path)
     return decode_file(path, memory)
 
@@ -228,8 +237,3 @@ def _possible_bits(path: Path) -> tuple[int, ...]:
     if suffix not in BITS:
         raise FileError(f"{path}: {unknown_extension(path)}; pictures are {', '.join(BITS)}")
     return BITS[suffix]
-
-
-def _write_exr(path: Path, codes: np.ndarray) -> None:
-    name = "Y" if codes.ndim == 2 else "RGB"
-    OpenEXR.File({}, {name: codes}).write(str(path))

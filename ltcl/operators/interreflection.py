@@ -109,8 +109,8 @@ def common_device(rows: Sequence[Sequence[Any]], requested: Device | str | None)
     return device
 
 
-def nbytes(systems: Sequence[IdentityPlus]) -> int:
-    """Bytes of all S on the device; a pattern or a basis that they share counts once."""
+def nbytes(systems: Sequence[Operator]) -> int:
+    """Bytes of all operators on the device; a pattern or a basis that they share counts once."""
     arrays: set[Array] = set()
     for S in systems:
         arrays |= S.arrays()

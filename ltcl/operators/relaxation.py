@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 
 from ltcl.device import Array, Device
@@ -21,7 +22,7 @@ from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR
-from ltcl.operators.dense import Dense
+from ltcl.operators.dense import GPU_STRIPS, Dense
 from ltcl.operators.epilogue import widths
 from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.rows import Slab
@@ -73,7 +74,7 @@ class RelaxationRows:
         for start in range(0, n, size):
             rows = slice(start, start + size)
             P = self._block(matrix, rows, omega)
-            inverse = _inverse(P)
+            inverse = _inverse(P) if omega is None else _inverse_triangle(P)
             if inverse is None:
                 raise InputError(
                     f"method={method!r} inverts blocks of S; that of rows {start} to "
@@ -103,6 +104,16 @@ def _inverse(P: np.ndarray) -> np.ndarray | None:
     condition = np.linalg.norm(P, 1) * np.linalg.norm(inverse, 1)
     # NaN is not below it.
     return inverse if condition < 1.0 / np.finfo(np.float64).eps else None
+
+
+def _inverse_triangle(P: np.ndarray) -> np.ndarray:
+    """P^-1 of a lower triangle whose diagonal has no zeros.
+
+    It is not judged by its condition: like substitution on a CPU, a sweep with it may overflow,
+    which the solve reports as divergence.
+    """
+    with np.errstate(all="ignore"):
+        return scipy.linalg.solve_triangular(P, np.eye(len(P)), lower=True, check_finite=False)
 
 
 def readable(S: Operator, method: str) -> RelaxationRows:
@@ -352,7 +363,7 @@ class Sweeps:
         """Queue one block on a GPU: s_B, then x_B += P_BB^-1 s_B."""
         relaxation = self.relaxation
         sums = relaxation.kernel("relax_rows", **defines)
-        correct = sums.device.kernel("dense", "dense_matvec_group", STRIP=1, **defines)
+        correct = sums.device.kernel("dense", "dense_matvec_group", **GPU_STRIPS, **defines)
         group = min(sums.group(self.group), correct.group(self.group))
         local = self.x.device.local(2 * defines["K"] * group)
         for number, begin, end in self._panel_slabs(start):

@@ -22,6 +22,10 @@ class ShownFigure(Figure):
         super().__init__(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor=paper)
         FigureCanvasAgg(self)
 
+    def __repr__(self) -> str:
+        width, height = self.canvas.get_width_height()
+        return f"<ltcl figure {width} x {height}: show() opens it, ltcl.plots.save writes it>"
+
     def _repr_png_(self) -> bytes:
         """Return the picture that notebooks show."""
         buffer = io.BytesIO()

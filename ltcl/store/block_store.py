@@ -24,7 +24,15 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import FileError
-from ltcl.files import as_path, fill_folder, input_file, locked, restore, sweep
+from ltcl.files import (
+    PinnedFolder,
+    as_path,
+    fill_folder,
+    input_file,
+    locked,
+    restore,
+    sweep,
+)
 from ltcl.store.array_log import ArrayLog
 from ltcl.store.document import StoreLayout, is_store, read_document, write_document
 from ltcl.store.final_store import (
@@ -75,10 +83,15 @@ class BlockStore:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._log = ArrayLog(path / "log")
-        self._refresh()
+        # What a final store is read from: it stays, though another one takes its place.
+        self._folder: PinnedFolder | None = None
+        self._open()
 
     def __repr__(self) -> str:
         return f"BlockStore({str(self.path)!r}, shape={self.layout.shape}, final={self.final})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopen, (self.path, self._files)
 
     @classmethod
     def create(
@@ -171,7 +184,7 @@ class BlockStore:
         # An array of no entries has no file.
         with contextlib.suppress(OSError, ValueError, IndexError):
             for name, dtype in types.items():
-                stored = np.fromfile(self.path / places[name] / "c/0", np.uint8)
+                stored = np.fromfile(self._root / places[name] / "c/0", np.uint8)
                 arrays[name] = stored[:-CRC32C_BYTES].view(dtype)
             entries = len(arrays["data"])
             pointers = arrays["indptr"]
@@ -206,7 +219,7 @@ class BlockStore:
         with self._writing():
             changed = self.attributes | attributes
             write_document(self.path, self.layout, self.provenance, changed)
-            self._refresh()
+            self._read_document()
 
     def finalize(
         self,
@@ -226,8 +239,8 @@ class BlockStore:
         with self._writing(finished=True):
             if not self.final:
                 self._finish(sigmas, change, compressed, memory)
-                self._refresh()
-            shutil.rmtree(self._log.path, ignore_errors=True)
+        self._open()
+        shutil.rmtree(self._root / "log", ignore_errors=True)
 
     def _finish(
         self,
@@ -259,7 +272,7 @@ class BlockStore:
 
     def verify(self) -> None:
         """Read everything and compare all checksums; FileError names the first that differs."""
-        self._refresh()
+        self._open()
         with about(self.path):
             for file in self._files:
                 self._check(file)
@@ -286,7 +299,7 @@ class BlockStore:
 
         with about(place, reading=True):
             self._check(f"{place}/zarr.json")
-            array = zarr.open_array(self.path / place, mode="r")
+            array = zarr.open_array(self._root / place, mode="r")
             stored = 0
             if array.size:
                 stored = self._check(f"{place}/c{'/0' * array.ndim}")
@@ -295,7 +308,7 @@ class BlockStore:
 
     def _check(self, file: str) -> int:
         """Compare the checksum of a file of a final store; its bytes."""
-        raw = input_file(self.path / file).read_bytes()
+        raw = input_file(self._root / file, shown=Path(file)).read_bytes()
         if hashlib.sha256(raw).hexdigest() != self._files[file]:
             raise FileError(f"{file} is damaged: its checksum is not that of its bytes")
         return len(raw)
@@ -304,15 +317,32 @@ class BlockStore:
     def _writing(self, *, finished: bool = False) -> Iterator[None]:
         with about(self.path), locked(self.path):
             sweep(self.path.parent)
-            self._refresh()
+            self._read_document()
             if self.final and not finished:
                 raise FileError("is final; nothing is written to it any more")
             yield
 
-    def _refresh(self) -> None:
-        """Read the document again: other processes may have changed it."""
+    @property
+    def _root(self) -> Path:
+        """Folder where the files are read."""
+        if self._folder is None:
+            return self.path
+        return self._folder.root
+
+    def _open(self) -> None:
+        """Read the document again, and pin the folder of a final store."""
+        self._folder = None
+        self._read_document()
+        if self.final:
+            with about(self.path, reading=True):
+                self._folder = PinnedFolder(self.path, "zarr.json")
+            # It may be another store by now.
+            self._read_document()
+
+    def _read_document(self) -> None:
+        """Read the document, which other processes may have changed."""
         with about(self.path, reading=True):
-            content = read_document(self.path / "zarr.json")
+            content = read_document(self._root / "zarr.json")
             self.layout = StoreLayout(**content["ltcl"])
             self.provenance = content["provenance"]
             self.attributes: dict[str, Any] = content["state"]
@@ -358,6 +388,14 @@ class BlockStore:
         T = scipy.sparse.vstack(values, "csr").T.tocsr()
         V = scipy.sparse.vstack(variances, "csr").T.tocsr()
         return scipy.sparse.csr_array(T), scipy.sparse.csr_array(V)
+
+
+def _reopen(path: Path, files: dict[str, str]) -> BlockStore:
+    """Open a store in another process; FileError if it is not the same any more."""
+    store = BlockStore.open(path)
+    if store._files != files:
+        raise FileError(f"{path}: was replaced since it was opened; load it again")
+    return store
 
 
 def places_of_arrays(files: Any) -> dict[str, dict[str, str]]:

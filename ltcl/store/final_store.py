@@ -20,7 +20,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.files import flush_tree
+from ltcl.files import flush, flush_tree
 from ltcl.store.document import StoreLayout, write_document
 from ltcl.transport import first_bounce
 
@@ -101,6 +101,7 @@ def write_final(root: Path, layout: StoreLayout, provenance: Any, content: Final
         for file in flush_tree(root / group):
             checksum = hashlib.sha256(file.read_bytes()).hexdigest()
             checksums[file.relative_to(root).as_posix()] = checksum
+    flush(root)
     write_document(root, layout, provenance, content.state, files=checksums)
 
 

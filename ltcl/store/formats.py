@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 def load(
     path: str | os.PathLike[str],
     *,
-    variable: str | None = None,
+    variable: str | Sequence[str] | None = None,
     grid: tuple[int, int] | None = None,
     camera_grid: tuple[int, int] | None = None,
     first_bounce: str | np.ndarray | None = None,
@@ -48,7 +48,8 @@ def load(
         `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or
         .mat file (versions 5 and 7.3, `LTM` (M, N) or (M, N, 3)), or the folder of a store.
     variable
-        Name of the matrix in a .npz, .h5 or .mat file; else T (in .mat LTM), or the only matrix.
+        Name of the matrix in a .npz, .h5 or .mat file, with its groups in .h5 ("entry/data/T"), or
+        three names of colours ("red,green,blue"); else T (in .mat LTM), or the only matrix.
     grid, camera_grid
         (h, w) of projector and camera; needed where they are not in the file, and preferred to its
         own.
@@ -203,7 +204,7 @@ def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse
 
 
 def read(
-    path: str | os.PathLike[str], *, variable: str | None = None
+    path: str | os.PathLike[str], *, variable: str | Sequence[str] | None = None
 ) -> StoreRecord | CompressedRecord:
     """Read a transport file; errors are those of `load`."""
     path = as_path(path)

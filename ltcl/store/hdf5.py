@@ -3,11 +3,14 @@
 
 A file holds `EXTRAS` and `T` (M, N) or (3, M, N); or `T`, or `T_0` to `T_2`, as MATLAB's sparse
 groups: `data`, `ir` (rows), `jc` (starts of columns), and the attribute MATLAB_sparse (number of
-rows).
+rows). Matrices in other groups have their path as a name, `entry/data/T`.
+
+A file is written in memory first: HDF5 that finds a disk full ends the process.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +22,20 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import FileError
 from ltcl.store.guards import EXPANSION, check_declared, sparse_floats
-from ltcl.store.record import CHANNELS, FileNames, StoreRecord, assemble
+from ltcl.store.record import (
+    CHANNELS,
+    FileContents,
+    FileNames,
+    StoreRecord,
+    Variable,
+    assemble,
+)
+
+ROWS = "MATLAB_sparse"
+# Numbers by the kinds of NumPy; complex ones are refused by name.
+NUMBERS = "fiubc"
+# MATLAB keeps the contents of cells in this group.
+MATLAB_CELLS = "#refs#"
 
 
 @dataclass(frozen=True)
@@ -29,26 +45,32 @@ class SparseGroup:
     rows: int
 
 
-def read_hdf5(
-    path: Path, variable: str | None = None, names: FileNames | None = None
-) -> StoreRecord:
+def read_hdf5(path: Path, variable: Variable = None, names: FileNames | None = None) -> StoreRecord:
     """Read T, or T_0 to T_2."""
     members: dict[str, Any] = {}
-    with _open(path, "r") as file:
+    with _h5py(path).File(path, "r") as file:
         file.visititems(members.__setitem__)  # follows no links
         for name, member in members.items():
-            if not hasattr(member, "dtype") and f"{name}/data" in members:
-                members[name] = SparseGroup(member.attrs["MATLAB_sparse"])
+            if ROWS in member.attrs and f"{name}/jc" in members:
+                members[name] = SparseGroup(member.attrs[ROWS])
         return assemble_members(members, variable, names)
 
 
 def assemble_members(
-    members: Mapping[str, Any], variable: str | None, names: FileNames | None
+    members: Mapping[str, Any], variable: Variable, names: FileNames | None
 ) -> StoreRecord:
-    """Make a record of datasets (or arrays) and of sparse groups, by name."""
+    """Make a record of datasets (or arrays), sparse groups, and kinds of all else, by name."""
     shapes = {}
+    unreadable = {}
     for name, member in members.items():
-        if "/" not in name:
+        group, _, _ = name.rpartition("/")
+        is_inner = isinstance(members.get(group), SparseGroup)
+        if is_inner or name.startswith(MATLAB_CELLS):
+            continue
+        kind = _kind(member)
+        if kind:
+            unreadable[name] = kind
+        elif isinstance(member, SparseGroup) or hasattr(member, "dtype"):
             shapes[name] = _shape(member)
     is_reversed = names is not None and names.is_reversed
 
@@ -56,14 +78,27 @@ def assemble_members(
         if not hasattr(members[name], "dtype"):
             return _sparse(members, name)
         array = _numbers(members[name])
-        if not is_reversed:
+        if not is_reversed or name == "first_bounce" or array.ndim < 2:
             return array
-        if name == "first_bounce":
-            has_one_channel = 1 in array.shape
-            return array.ravel() if has_one_channel else array
-        return array.swapaxes(-1, -2) if array.ndim > 1 else array
+        return array.swapaxes(-1, -2)
 
-    return assemble(shapes, load, variable, names)
+    contents = FileContents(shapes=shapes, load=load, unreadable=unreadable)
+    return assemble(contents, variable, names)
+
+
+def _kind(member: Any) -> str:
+    """Why a member cannot be T; empty if it can, or is a group."""
+    if isinstance(member, str):
+        return member
+    try:
+        dtype = getattr(member, "dtype", None)
+    except TypeError:
+        return "of a type that NumPy lacks"
+    if dtype is None or dtype.kind in NUMBERS:
+        return ""
+    if dtype.names == ("real", "imag"):
+        return "complex"
+    return "a table" if dtype.names else "text"
 
 
 def _shape(member: Any) -> tuple[int, ...]:
@@ -74,13 +109,18 @@ def _shape(member: Any) -> tuple[int, ...]:
 
 
 def _sparse(members: Mapping[str, Any], name: str) -> scipy.sparse.csr_array:
-    """The matrix of a sparse group."""
-    data = _numbers(members[f"{name}/data"])
-    rows = _numbers(members[f"{name}/ir"])
-    starts = _numbers(members[f"{name}/jc"])
+    """The matrix of a sparse group, whose arrays may have room to spare."""
+    starts: Any = _numbers(members[f"{name}/jc"])
+    entries = max(int(starts[-1]), 0)
+    # MATLAB leaves out arrays of no entries.
+    empty = np.zeros(0, np.int64)
+    data = _numbers(members.get(f"{name}/data", empty))[:entries]
+    rows = _numbers(members.get(f"{name}/ir", empty))[:entries]
     shape = checks.grid(f"shape of {name!r}", (members[name].rows, len(starts) - 1))
     return sparse_floats(
-        lambda: scipy.sparse.csc_array((data, rows, starts), shape=shape), shape, data.size
+        lambda: scipy.sparse.csc_array((data, rows, starts), shape=shape),
+        shape,
+        data.size,
     )
 
 
@@ -99,23 +139,31 @@ def _numbers(data: Any) -> np.ndarray:
 def write_hdf5(path: Path, record: StoreRecord) -> None:
     """Write everything in `record`."""
     matrices: Any = record.matrices
-    names = ("T",) if len(matrices) == 1 else CHANNELS
-    with _open(path, "w") as file:
-        file.update(record.arrays())
-        if record.dense:
-            return
-        for name, matrix in zip(names, matrices, strict=True):
-            columns = matrix.tocsc()
-            group = file.create_group(name)
-            group.attrs["MATLAB_sparse"] = columns.shape[0]
-            group["data"] = columns.data
-            group["ir"] = columns.indices
-            group["jc"] = columns.indptr
+    arrays = record.arrays()
+    nbytes = sum(array.nbytes for array in arrays.values())
+    if not record.dense:
+        nbytes += sum(12 * matrix.nnz for matrix in matrices)
+    checks.fits_host("the file, which is written in memory first,", nbytes)
+    content = io.BytesIO()
+    with _h5py(path).File(content, "w") as file:
+        file.update(arrays)
+        if not record.dense:
+            names = CHANNELS if len(matrices) == 3 else ("T",)
+            for name, matrix in zip(names, matrices, strict=True):
+                _write_sparse(file.create_group(name), matrix.tocsc())
+    path.write_bytes(content.getbuffer())
 
 
-def _open(path: Path, mode: str) -> Any:
+def _write_sparse(group: Any, columns: Any) -> None:
+    group.attrs[ROWS] = columns.shape[0]
+    group["data"] = columns.data
+    group["ir"] = columns.indices
+    group["jc"] = columns.indptr
+
+
+def _h5py(path: Path) -> Any:
     try:
         import h5py
     except ImportError:
         raise FileError(f"{path.suffix} files need h5py; pip install 'ltcl[hdf5]'") from None
-    return h5py.File(path, mode)
+    return h5py

@@ -22,7 +22,7 @@ import scipy.io
 from ltcl import checks
 from ltcl.errors import FileError
 from ltcl.store.hdf5 import SparseGroup, assemble_members, read_hdf5
-from ltcl.store.record import EXTRAS, FileNames, StoreRecord
+from ltcl.store.record import EXTRAS, FileNames, StoreRecord, Variable
 
 NAMES = FileNames(matrix="LTM", channels=("LTM_r", "LTM_g", "LTM_b"), is_reversed=True)
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -49,6 +49,8 @@ NUMBER_TYPES = {
 # along.
 SPARSE_CLASS = 5
 NUMBER_CLASSES = range(5, 16)
+OTHER_CLASSES = {1: "a cell array", 2: "a struct", 3: "an object", 4: "text"}
+COMPLEX = 0x800
 CLASS_AND_COMPLEX = 0x8FF
 
 
@@ -79,7 +81,7 @@ def _variable_bytes(variable: Any) -> int:
     return variable.nbytes
 
 
-def read_mat(path: Path, variable: str | None = None) -> StoreRecord:
+def read_mat(path: Path, variable: Variable = None) -> StoreRecord:
     """Read a .mat of version 7.3, or of 5, whose strings, cells and structures are left out."""
     with path.open("rb") as file:
         head = file.read(USER_BLOCK + len(HDF5_SIGNATURE))
@@ -120,18 +122,28 @@ def _inflate(content: memoryview) -> tuple[int, memoryview]:
     kind, size = struct.unpack("<II", inflate.decompress(content, 8))
     checks.fits_host("a variable", 3 * size)
     element = memoryview(inflate.decompress(inflate.unconsumed_tail, size + 1))
-    return (kind if inflate.eof else -1), element
+    if not inflate.eof:
+        kind = -1
+    return kind, element
+
+
+def _other_kind(number_class: int) -> str:
+    """What a variable is that holds no real numbers."""
+    if number_class & COMPLEX:
+        return "complex"
+    return OTHER_CLASSES.get(number_class, "of a type of MATLAB's own")
 
 
 def _variable(kind: int, content: memoryview) -> dict[str, Any]:
-    """The members of one variable of real numbers, as HDF5 has them; none of other variables."""
+    """The members of one variable of real numbers, as HDF5 has them; of others their kind."""
     if kind != MATRIX:
         content = content[:0]
     (_, flags), (_, dimensions), (_, label), *elements = _elements(content)
     number_class = int.from_bytes(flags[:2], "little") & CLASS_AND_COMPLEX
+    name = str(label, "ascii", "replace")
     if number_class not in NUMBER_CLASSES:
-        return {}
-    name = str(label, "ascii")
+        # MATLAB keeps data of its own under an empty name.
+        return {name: _other_kind(number_class)} if name else {}
     shape = np.frombuffer(dimensions, "<i4").tolist()
     arrays = []
     for element_kind, values in elements:

@@ -22,6 +22,13 @@ from ltcl.errors import FileError, InputError
 from ltcl.store.guards import floats, sparse_floats
 from ltcl.store.record import StoreRecord
 
+# What the words of the first line may be, behind %%MatrixMarket.
+KINDS = {
+    "object": ("matrix",),
+    "format": ("coordinate", "array"),
+    "field": ("real", "double", "integer", "unsigned-integer"),
+    "symmetry": ("general", "symmetric"),
+}
 # The first line, comments, and the line of sizes.
 HEAD = rb"([^\n]*+\n(?:\s*+%[^\n]*+\n)*+\s*+[^\n]*+\n\s*+)"
 GRID = re.compile(rb"^%+\s*ltcl grid (\d+) x (\d+)(?:, camera grid (\d+) x (\d+))?\s*$", re.M)
@@ -69,9 +76,12 @@ class Header:
 
 def read_mtx(path: Path) -> StoreRecord:
     """Read a Matrix Market file; its values come back as float64."""
+    with path.open("rb") as file:
+        _check_kinds(file.readline(1000))
     # An entry takes 6 bytes of text or more.
     checks.fits_host("the matrix", 8 * path.stat().st_size)
-    rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(path)
+    data = path.read_bytes() + b"\n"
+    rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(io.BytesIO(data))
     header = Header(
         rows=rows,
         columns=columns,
@@ -80,7 +90,6 @@ def read_mtx(path: Path) -> StoreRecord:
         field=field,
         symmetry=symmetry,
     )
-    data = path.read_bytes() + b"\n"
     head = _check_lines(header, data)
 
     def read() -> Any:
@@ -92,6 +101,18 @@ def read_mtx(path: Path) -> StoreRecord:
         matrix = sparse_floats(read, (rows, columns), header.lines)
     grid, camera_grid = _grids(head)
     return StoreRecord((matrix,), grid, camera_grid)
+
+
+def _check_kinds(line: bytes) -> None:
+    """Refuse a first line with other words than those of real matrices."""
+    words = line.decode("ascii", "replace").lower().split()
+    if len(words) != 1 + len(KINDS) or words[0].lstrip("%") != "matrixmarket":
+        raise FileError(
+            f"the first line is {line[:60]!r}; it must be %%MatrixMarket and {', '.join(KINDS)}"
+        )
+    for (name, allowed), word in zip(KINDS.items(), words[1:], strict=True):
+        if word not in allowed:
+            raise FileError(f"the {name} is {word:.40}; it must be {' or '.join(allowed)}")
 
 
 def _check_lines(header: Header, data: bytes) -> bytes:
@@ -131,4 +152,6 @@ def write_mtx(path: Path, record: StoreRecord) -> None:
         comment += f"ltcl grid {record.grid[0]} x {record.grid[1]}"
     if record.camera_grid:
         comment += f", camera grid {record.camera_grid[0]} x {record.camera_grid[1]}"
-    scipy.io.mmwrite(path, record.matrices[0], comment=comment, symmetry="general")
+    # SciPy does not notice that a disk is full, and takes names in UTF-8 alone.
+    with path.open("wb") as file:
+        scipy.io.mmwrite(file, record.matrices[0], comment=comment, symmetry="general")

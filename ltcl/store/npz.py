@@ -8,10 +8,11 @@ matrix; or, by its `format`, a compressed transport, an inverse, or three sparse
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import scipy.sparse
@@ -25,7 +26,9 @@ from ltcl.store.record import (
     CSR,
     INVERSE_FORMAT,
     CompressedRecord,
+    FileContents,
     StoreRecord,
+    Variable,
     assemble,
 )
 
@@ -34,11 +37,17 @@ RGB_FORMAT = "ltcl-rgb-csr-1"
 INDEX_ARRAYS = ("indices", "indptr", "row", "col", "coords", "offsets")
 # About the bytes of a stored entry: enough to bound the rows of a sparse matrix by the file's size.
 ENTRY_BYTES = 8
+OBJECTS = "made of Python objects (pickled), which are never loaded"
+# Local headers of a zip archive: bytes, and the place of the lengths of name and extra field.
+LOCAL_HEADER = 30
+LOCAL_LENGTHS = struct.Struct("<26xHH")
+# What may stand behind the bytes of an entry.
+MAX_DATA_DESCRIPTOR = 24
 
 Headers = dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
-def read_npz(path: Path, variable: str | None = None) -> StoreRecord | CompressedRecord:
+def read_npz(path: Path, variable: Variable = None) -> StoreRecord | CompressedRecord:
     """Read an .npz; MemoryLimitError or FileError before any array that does not fit is made."""
     headers = _headers(path)
     with np.load(path, allow_pickle=False) as archive:
@@ -52,13 +61,20 @@ def read_npz(path: Path, variable: str | None = None) -> StoreRecord | Compresse
 
         layout = str(load("format")) if "format" in headers else None
         if layout in (COMPRESSED_FORMAT, INVERSE_FORMAT):
-            arrays = {name: load(name) for name in headers if name != "format"}
+            arrays = {}
+            for name, (_, dtype) in headers.items():
+                if name != "format" and not dtype.hasobject:
+                    arrays[name] = load(name)
             return CompressedRecord(arrays, layout)
 
         shapes = {}
+        unreadable = {}
         for name, (shape, dtype) in headers.items():
-            if dtype.kind in "fiubc" or name.startswith("noise_"):
+            kind = _kind(dtype)
+            if not kind or name.startswith("noise_"):
                 shapes[name] = shape
+            else:
+                unreadable[name] = kind
         matrices: dict[str, Any] = {}
         if layout is not None and variable is None:
             matrices = _sparse_matrices(path, layout, headers, load)
@@ -69,7 +85,17 @@ def read_npz(path: Path, variable: str | None = None) -> StoreRecord | Compresse
                 return matrices[name]
             return load(name)
 
-        return assemble(shapes, load_member, variable)
+        contents = FileContents(shapes=shapes, load=load_member, unreadable=unreadable)
+        return assemble(contents, variable)
+
+
+def _kind(dtype: np.dtype) -> str:
+    """Why an array of this type cannot be T; empty if it can."""
+    if dtype.hasobject:
+        return OBJECTS
+    if dtype.kind in "fiubc":
+        return ""
+    return "text" if dtype.kind in "SU" else f"of type {dtype}"
 
 
 def _sparse_matrices(
@@ -102,20 +128,47 @@ def _headers(path: Path) -> Headers:
     """Shape and type of each array by name, after comparison with the sizes that are stored."""
     headers: Headers = {}
     file_size = path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+        _check_directory(archive, file)
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
             with archive.open(info) as stream:
-                is_version_1 = np.lib.format.read_magic(stream) == (1, 0)
-                if is_version_1:
-                    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-                else:
-                    shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+                # Opened all the same: a name in the directory may be damaged.
+                if name == info.filename:
+                    continue
+                shape, dtype = _array_header(stream)
                 stored = info.file_size - stream.tell()
             most = EXPANSION * min(info.compress_size, file_size)
-            check_declared(f"array {name!r}", dtype, shape, min(stored, most), stored)
+            if not dtype.hasobject:
+                check_declared(f"array {name!r}", dtype, shape, min(stored, most), stored)
             headers[name] = (shape, dtype)
     return headers
+
+
+def _check_directory(archive: zipfile.ZipFile, file: IO[bytes]) -> None:
+    """Refuse an archive with more in it than its directory lists, as a flipped bit leaves it."""
+    end = 0
+    for info in sorted(archive.infolist(), key=lambda info: info.header_offset):
+        _check_gap(end, info.header_offset)
+        file.seek(info.header_offset)
+        lengths = LOCAL_LENGTHS.unpack(file.read(LOCAL_HEADER))
+        end = info.header_offset + LOCAL_HEADER + sum(lengths) + info.compress_size
+    _check_gap(end, archive.start_dir)
+
+
+def _check_gap(end: int, start: int) -> None:
+    if start - end > MAX_DATA_DESCRIPTOR:
+        raise FileError(f"is damaged: bytes {end} to {start} are in no array that it lists")
+
+
+def _array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type at the beginning of NumPy's format."""
+    is_version_1 = np.lib.format.read_magic(stream) == (1, 0)
+    if is_version_1:
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    return shape, dtype
 
 
 def write_npz(path: Path, record: StoreRecord | CompressedRecord) -> None:
@@ -133,8 +186,9 @@ def write_npz(path: Path, record: StoreRecord | CompressedRecord) -> None:
 def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:
     """Arrays of one sparse matrix as SciPy writes them, or of three channels."""
     is_grey = len(record.matrices) == 1
+    layout = np.array(b"csr") if is_grey else RGB_FORMAT
     arrays: dict[str, Any] = {
-        "format": np.array(b"csr") if is_grey else RGB_FORMAT,
+        "format": layout,
         "_is_array": True,  # SciPy makes a csr_array of it
         "shape": record.shape,
     }
@@ -147,17 +201,29 @@ def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:
 
 def read_npy(path: Path) -> StoreRecord:
     """Read a dense matrix, or map it where memory has no room for two of it."""
+    with path.open("rb") as file:
+        shape, dtype = _array_header(file)
+    kind = _kind(dtype)
+    if kind:
+        raise FileError(f"holds an array {shape} that is {kind}; it must be of real numbers")
     mapped = np.lib.format.open_memmap(path, "r")  # reads the header and allocates nothing
     has_room = 2 * mapped.nbytes <= checks.host_memory()
 
     def load(name: str) -> np.ndarray:
-        return np.array(mapped) if has_room else mapped
+        if has_room:
+            return np.array(mapped)
+        return mapped
 
-    return assemble({"T": mapped.shape}, load)
+    return assemble(FileContents(shapes={"T": mapped.shape}, load=load))
 
 
 def write_npy(path: Path, record: StoreRecord) -> None:
     """Write the dense matrices of `record`, (M, N) or (3, M, N)."""
     if not record.dense:
         raise InputError("T is sparse, and .npy holds dense arrays only; save it as .npz")
-    np.save(path, record.arrays()["T"], allow_pickle=False)
+    array = np.ascontiguousarray(record.arrays()["T"])
+    header = np.lib.format.header_data_from_array_1_0(array)
+    # NumPy does not notice that a disk is full, but Python does.
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(array.data)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -108,6 +108,8 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
 
 
 Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
+# Name of an array, or names of three, "red,green,blue"; None takes the default.
+Variable = str | Sequence[str] | None
 
 
 @dataclass(frozen=True)
@@ -208,19 +210,35 @@ class FileNames:
     is_reversed: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class FileContents:
+    """Arrays that a file holds by name, and how to read one of them.
+
+    `unreadable` tells of all else in the file why it cannot be T, such as "complex".
+    """
+
+    shapes: Mapping[str, tuple[int, ...]]
+    load: Callable[[str], Any]
+    unreadable: Mapping[str, str] = field(default_factory=dict)
+
+
 def assemble(
-    shapes: Mapping[str, tuple[int, ...]],
-    load: Callable[[str], Any],
-    variable: str | None = None,
+    contents: FileContents,
+    variable: Variable = None,
     names: FileNames | None = None,
 ) -> StoreRecord:
     """Make a record of the arrays that a file holds by name.
 
-    T is the array `variable`, else that of `names`, its three channels, or the only matrix in the
-    file. `shapes` are those of all arrays; `load` reads one of them.
+    T is the array `variable`, or three of them; else that of `names`, its three channels, or the
+    only matrix in the file.
     """
     names = names or FileNames()
-    matrix_names = _matrix_names(shapes, variable, names)
+    shapes = contents.shapes
+    load = contents.load
+    if variable is None:
+        matrix_names = _matrix_names(contents, names)
+    else:
+        matrix_names = _chosen_names(contents, variable)
     matrices = [load(name) for name in matrix_names]
     extras: dict[str, Any] = {}
     for name in ("first_bounce", "mixing"):
@@ -236,37 +254,68 @@ def assemble(
         matrices = [floats("T", matrix) for matrix in matrices]
         if matrices[0].ndim == 3:
             matrices = list(matrices[0])
+    if names.is_reversed and "first_bounce" in extras:
+        extras["first_bounce"] = _one_channel(extras["first_bounce"], matrices[0].shape)
     return StoreRecord(tuple(matrices), **extras)
 
 
-def _matrix_names(
-    shapes: Mapping[str, tuple[int, ...]], variable: str | None, names: FileNames
-) -> Sequence[str]:
+def _one_channel(first_bounce: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The first bounce of MATLAB, where one channel is a row or a column of N values, as (N,)."""
+    if first_bounce.size == shape[-1]:
+        return first_bounce.ravel()
+    return first_bounce
+
+
+def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequence[str]:
+    """Names of the arrays that the user chose as T: one, or three of them, "red,green,blue"."""
+    chosen = [variable] if isinstance(variable, str) else list(variable)
+    if isinstance(variable, str) and variable not in contents.shapes:
+        chosen = [name.strip().lstrip("/") for name in variable.split(",")]
+    if len(chosen) not in (1, 3):
+        raise InputError(f"variable is {variable!r:.100}; it must be one name, or three of colours")
+    for name in chosen:
+        if name in contents.unreadable:
+            raise _unreadable(contents, name)
+        if name not in contents.shapes:
+            present = [*contents.shapes, *contents.unreadable] or ["none"]
+            listed = ", ".join(present)
+            raise FileError(f"variable {name!r} is missing; it holds {listed:.200}")
+    return chosen
+
+
+def _unreadable(contents: FileContents, name: str) -> FileError:
+    kind = contents.unreadable[name]
+    return FileError(f"{name!r} is {kind}; T must be an array of real numbers")
+
+
+def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:
     """Names of the arrays that are T, one or three."""
-    if variable is not None:
-        if variable not in shapes:
-            content = ", ".join(shapes) or "none"
-            raise FileError(f"variable {variable!r} is missing; it holds {content:.200}")
-        return [variable]
+    shapes = contents.shapes
     if names.matrix in shapes:
         return [names.matrix]
+    if names.matrix in contents.unreadable:
+        raise _unreadable(contents, names.matrix)
     if set(names.channels) <= set(shapes):
         return names.channels
     matrices = []
-    content = []
+    listed = []
     step = -1 if names.is_reversed else 1  # axes as the user knows them
     for name, shape in shapes.items():
         if name in EXTRAS or name.startswith("noise_"):
             continue
-        content.append(f"{name!r} {shape[::step]}")
+        listed.append(f"{name!r} {shape[::step]}")
         if _is_matrix(shape):
             matrices.append(name)
     if len(matrices) == 1:
         return matrices
-    listed = ", ".join(content)
+    for name, kind in contents.unreadable.items():
+        listed.append(f"{name!r} ({kind})")
+    if not shapes:
+        listed.insert(0, "no numbers")
     raise FileError(
-        f"holds {listed or 'no numbers':.300}; it must hold {names.matrix} of (M, N) or of three "
-        "channels, or one matrix by another name; variable= names one of several"
+        f"holds {', '.join(listed):.300}; it must hold {names.matrix} of (M, N) or of three "
+        "channels, or one matrix by another name; variable= names one of several, or three of them "
+        "(red,green,blue)"
     )
 
 
@@ -277,7 +326,7 @@ def _check_dense(
     names: FileNames,
 ) -> None:
     for matrix in matrices:
-        if _is_matrix(matrix.shape):
+        if _is_matrix(matrix.shape) and (len(matrices) == 1 or matrix.ndim == 2):
             continue
         shape = matrix.shape
         order = "(3, M, N)"

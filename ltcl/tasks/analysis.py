@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -73,7 +74,10 @@ class ChannelAnalysis:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Analysis:
-    """Result of `ltcl.analyze`: an analysis of each colour channel, and the verdict on T."""
+    """Result of `ltcl.analyze`: an analysis of each colour channel, and the verdict on T.
+
+    A T without S, of other camera pixels or of blocks between colours, has no `channels`.
+    """
 
     shape: tuple[int, int]
     grid: tuple[int, int]
@@ -86,22 +90,17 @@ class Analysis:
     def __repr__(self) -> str:
         height, width = self.grid
         radii = ", ".join(f"{channel.spectral_radius:.3g}" for channel in self.channels)
-        return f"<ltcl Analysis grid {height} x {width}, rho(R) {radii}>"
+        return f"<ltcl Analysis grid {height} x {width}, rho(R) {radii or 'unknown'}>"
 
     def _repr_html_(self) -> str:
-        # Imports OpenCV.
-        from ltcl.images.thumbnails import thumbnails
-
-        bars = {}
+        text = ""
+        for line in (str(self), self.verdict.text, f"Products with S to rtol {self.rtol:g}:"):
+            text += f"<div>{html.escape(line)}</div>"
+        rows = ""
         for channel in self.channels:
-            names = []
-            products = []
-            for name, count in channel.products.items():
-                if math.isfinite(count):
-                    names.append(f"{name} {count:.0f}")
-                    products.append(count)
-            bars["products: " + ", ".join(names)] = _bar_chart(products)
-        return thumbnails(self, bars)
+            for name, products in channel.products.items():
+                rows += f"<tr><td>{name}</td><td>{_count_text(products)}</td></tr>"
+        return f"{text}<table>{rows}</table>"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; infinite or unknown numbers are None."""
@@ -114,7 +113,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     Parameters
     ----------
     T : Transport
-        A square transport.
+        Any transport; one without S gets the verdict alone.
     rtol : float
         Tolerance of the forecast, from 1.2e-7 to 1.
 
@@ -125,7 +124,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     Raises
     ------
     InputError
-        A T that is not square, or a tolerance out of range.
+        A T that is no Transport, or a tolerance out of range.
 
     Examples
     --------
@@ -134,19 +133,14 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     >>> 0.5 < a.channels[0].spectral_radius < 0.7  # m / (1 - m) = 2/3, less what diag(T) took along
     True
     """
-    check_transport(T)
+    check_transport(T, square=False)
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     channels = []
-    for matrix, F, S, negative in zip(
-        T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True
-    ):
-        channels.append(_analyze_channel(matrix, F, S, negative, rtol))
-    highest_bounces = [channel.energy.bounce_highest for channel in channels]
-    judged = verdict(
-        T,
-        negative_bounce=np.fmax.reduce(T.negative_bounces),
-        bounce_highest=np.fmax.reduce(highest_bounces),
-    )
+    if T.is_square:
+        for matrix, F, S, negative in zip(
+            T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True
+        ):
+            channels.append(_analyze_channel(matrix, F, S, negative, rtol))
     return Analysis(
         shape=T.shape,
         grid=T.grid,
@@ -154,7 +148,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
         nbytes=T.nbytes,
         masked=int(T.masked.sum()),
         channels=tuple(channels),
-        verdict=judged,
+        verdict=verdict(T),
     )
 
 
@@ -205,8 +199,8 @@ def _known_norms(R: Operator) -> Norms | None:
         return None
 
 
-def _bar_chart(lengths: list[float]) -> np.ndarray:
-    """A picture (4 * bars, 64) of horizontal bars."""
-    bars = np.array(lengths)[:, None]
-    columns = np.linspace(0, bars.max(), 64)
-    return np.repeat(columns <= bars, 4, axis=0)
+def _count_text(products: float) -> str:
+    """A number of products, infinite where a method diverges, NaN where it is unknown."""
+    if math.isfinite(products):
+        return f"{products:.0f}"
+    return "diverges" if products > 0 else "-"

@@ -94,8 +94,23 @@ def _worst_pixels(T: Transport, picture: np.ndarray, direct: np.ndarray) -> str:
     return ", ".join(pixels)
 
 
+def bounce_limits(T: Transport) -> str:
+    """What T leaves unknown of its bounces, and what their standard deviations are."""
+    text = (
+        "bounces hold as far as light between matt surfaces that the projector lights explains T, "
+        "which does not show unlit surfaces, gloss, or light that returns to its own pixel"
+    )
+    if not np.isnan(T.bounce_spread).any():
+        first, second, third = (f"{100 * spread:.2g}" for spread in T.bounce_spread)
+        text += (
+            f"; the first bounces diag(T) and 1 / diag(T^-1) differ by {first}, {second} and "
+            f"{third} % in bounces 1, 2 and 3 under white"
+        )
+    return f"{text}; std is the effect of noise in T alone"
+
+
 def bounce_warning(T: Transport) -> str:
-    """The reasons why bounces by T are only approximate; empty if none is known."""
+    """The reasons why bounces by T are only approximate; empty if T shows none."""
     warnings = []
     if T.ambient_share > LARGEST_AMBIENT:
         warnings.append(

@@ -9,6 +9,7 @@ import json
 import math
 import os
 import platform
+import re
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ import numpy as np
 from ltcl.device import Device
 from ltcl.files import replace_file
 from ltcl.solvers import Solution
+
+SURROGATE = re.compile(r"[\ud800-\udfff]")
 
 
 def plain(value: Any) -> Any:
@@ -36,8 +39,10 @@ def plain(value: Any) -> Any:
 
 
 def dumps(value: Any) -> str:
-    """`value` as a JSON document that any parser takes: no NaN, no Infinity."""
-    return json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+    """`value` as a JSON document that any parser takes: no NaN, no Infinity, valid UTF-8."""
+    text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+    # Bytes of file names that are no UTF-8 stand in Python's text as single surrogates.
+    return SURROGATE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def write(path: str | os.PathLike[str], value: Any) -> None:

@@ -13,6 +13,7 @@ whatever the tolerance. With one camera they are exact of Lambertian scenes only
 
 from __future__ import annotations
 
+import html
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from ltcl.errors import InputTypeError
 from ltcl.operators import Operator
 from ltcl.solvers import Inverse, Solution, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
-from ltcl.tasks.plausibility import bounce_warning, check_direct_light
+from ltcl.tasks.plausibility import bounce_limits, bounce_warning, check_direct_light
 from ltcl.tasks.requirements import check_exact, check_inverse, default_rtol, error_note
 from ltcl.transport import frames as layout
 from ltcl.transport.transport import Transport, check_transport
@@ -60,9 +61,10 @@ class Separation:
         Lambertian scene measured without noise; NaN where unknown. The relative error of the first
         bounce of a glossy scene is a few times the latter, of others more.
     warning : str
-        The reasons why the bounces are only approximate, also logged. Empty where these are
-        unknown, or the defect is at most 0.1, the negative light at most 0.005, of a compressed T
-        more by its error, and T shows no ambient light.
+        What T leaves unknown of its bounces, and by how much the choice of the first bounce changes
+        them. Before it the reasons why they are only approximate, which are also logged, if T shows
+        some: a defect above 0.1, negative light above 0.005, of a compressed T more by its error,
+        or ambient light.
     transport_error : float
         ``.error`` of T, or of `exact` where that was given, beyond the tolerance of each solve.
     """
@@ -82,9 +84,9 @@ class Separation:
 
     @cached_property
     def std(self) -> SeparationStd:
-        """Standard deviations by the noise of T, computed at the first call.
+        """Standard deviations by the noise of T alone, computed at the first call.
 
-        See `ltcl.transport.uncertainty`.
+        They do not hold what `warning` says is unknown. See `ltcl.transport.uncertainty`.
         """
         pictures = [self.direct, *self.bounces]
         return separation_std(self._solving, self._reference.noise, pictures, self._inverse)
@@ -102,7 +104,7 @@ class Separation:
         for number, bounce in enumerate(self.bounces, 1):
             pictures[f"bounce {number}"] = bounce
         pictures["rest"] = self.rest
-        return thumbnails(self, pictures)
+        return f"{thumbnails(self, pictures)}<div>{html.escape(self.warning)}</div>"
 
 
 def separate(
@@ -196,9 +198,11 @@ def separate(
         pictures.append(_picture(bounce, shape, T))
         solutions.append(solved[0] if T.channels == 1 else solved)
 
-    warning = bounce_warning(reference)
-    if warning:
-        logger.warning(warning)
+    warning = bounce_limits(reference)
+    reasons = bounce_warning(reference)
+    if reasons:
+        logger.warning(reasons)
+        warning = f"{reasons}; {warning}"
     return Separation(
         direct=pictures[0],
         indirect=_picture(indirect, shape, T),

@@ -111,7 +111,7 @@ class EntryErrors:
         products = filtered[..., i] * filtered[..., j]
         sums = self.variance(channel, products.reshape(len(products), -1))
         sums = sums.reshape(-1, *products.shape[1:])
-        if self.noise.neighbours[channel]:
+        if self.noise.neighbours[channel] and self.T.is_square:
             # The first bounce has no part in its neighbours.
             direct = self.diagonal_variance(channel)[:, None, None]
             sums += direct * (patterns[..., i] * patterns[..., j] - products)

@@ -3,7 +3,7 @@
 
 picture                       right-hand sides of a system of N = h * w pixels
 (h, w) or flat (N,)           (N, 1)
-(k, h, w), k frames           (N, k)
+(k, h, w), k frames           (N, k); (3, h, w) is refused for a T in colour, as ambiguous
 (h, w, 3)                     three of (N, 1); of a T with one channel, one (N, 3)
 (k, h, w, 3)                  three of (N, k); of a T with one channel, one (N, 3 k)
 """
@@ -133,8 +133,11 @@ def _find_layout(
         if array.shape == size:
             return PictureLayout(False, None, is_colour_result)
         if array.shape[1:] == size and len(array):
+            _check_unambiguous(name, array, grid, channels)
             return PictureLayout(False, len(array), is_colour_result)
     allowed = f"{grid}, {(*grid, 3)} or frames of these"
+    if array.shape[-3:] == (3, *grid):
+        allowed += f"; if it is in colour, colours come last: numpy.moveaxis({name}, -3, -1)"
     raise InputError(f"{name} has shape {array.shape}; it must be {allowed}")
 
 
@@ -152,3 +155,13 @@ def to_light(
     if mixing is None:
         return light
     return list(np.einsum("ij,jnk->ink", np.linalg.inv(mixing), light))
+
+
+def _check_unambiguous(name: str, array: np.ndarray, grid: tuple[int, int], channels: int) -> None:
+    """Refuse (3, h, w) for a T in colour: three grey frames, or the colours of one picture."""
+    if channels == 3 and array.shape == (3, *grid):
+        raise InputError(
+            f"{name} has shape {array.shape}: three grey frames, or the colours of one picture? "
+            f"It must be {(*grid, 3)} for colours, numpy.moveaxis({name}, 0, -1), "
+            f"or {(3, *grid, 3)} for frames, numpy.stack([{name}] * 3, -1)"
+        )

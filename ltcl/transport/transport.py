@@ -33,7 +33,7 @@ from ltcl.operators import (
 )
 from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
-from ltcl.transport import diagnostics, stored
+from ltcl.transport import coverage, diagnostics, stored
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import (
     DARK_THRESHOLD,
@@ -246,7 +246,7 @@ class Transport:
     def _dark_rule(self, threshold: float) -> DarkRule:
         is_measured = self._noise is not None
         if isinstance(self._noise, Noise):
-            is_measured = self._noise.source != "estimated"
+            is_measured = self._noise.is_measured
         return DarkRule(
             matrices=self.matrices,
             threshold=checks.number("dark_threshold", threshold, least=0.0, below=1.0),
@@ -423,6 +423,17 @@ class Transport:
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
 
     @cached_property
+    def bounce_spread(self) -> tuple[float, ...]:
+        """Relative difference of bounces 1 to 3 under white with diag(T) and 1 / diag(T^-1) as F.
+
+        Values of the worst channel, NaN if no method solves with S; computed once.
+        """
+        spreads = []
+        for T, F, S in zip(self.matrices, self._require_first_bounce(), self.systems, strict=True):
+            spreads.append(diagnostics.bounce_spread_of_system(T, F, S))
+        return tuple(np.max(spreads, axis=0).tolist())
+
+    @cached_property
     def ambient_share(self) -> float:
         """Ambient light left in T, as a share of a bounce; 0 if T shows no entries, or few."""
         has_entries = all(isinstance(T, ENTRIES) for T in self.matrices)
@@ -449,7 +460,9 @@ class Transport:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all S on the device; a pattern or a basis that channels share counts once."""
+        """Bytes of all S on the device, or of T if it has no S; shared patterns count once."""
+        if not self.is_square:
+            return nbytes(self.operators)
         return nbytes(self.systems)
 
     @property
@@ -468,6 +481,18 @@ class Transport:
         if not self.is_compressed:
             return 0.0
         return max(S.error_bound for S in self.systems)
+
+    @cached_property
+    def column_norms(self) -> np.ndarray:
+        """Norms of the columns of `operators`, (systems, N), or (1, 3 N) if they are coupled."""
+        return coverage.column_norms(self)
+
+    @cached_property
+    def unlit(self) -> np.ndarray:
+        """Camera pixels (M,) that no projector pixel lights; `masked` ones of a square T."""
+        if self.is_square:
+            return self.masked
+        return coverage.unlit_pixels(self)
 
     @cached_property
     def operators(self) -> tuple[Operator, ...]:

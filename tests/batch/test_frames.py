@@ -84,6 +84,17 @@ def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batc
     assert (done.solved, done.worst.error < 1e-4, done.most_clipped.clipped) == (COUNT, True, 0)
 
 
+@pytest.mark.parametrize("gain", [1.0, "auto"])
+def test_three_grey_frames_in_a_batch_are_no_colours(device, source, tmp_path, gain):
+    T = ltcl.Transport([SCENE.T] * 3, GRID, device=device)
+    common: dict[str, Any] = {"format": "exr", "rtol": 1e-4, "frames": 3, "gain": gain}
+    together = compensate_frames(T, source, tmp_path / "three", batch=3, **common)
+    apart = compensate_frames(T, source, tmp_path / "two", batch=2, **common)
+    if gain == 1.0:
+        np.testing.assert_allclose(patterns(together), patterns(apart), rtol=1e-3)
+    assert np.shape(patterns(together)) == (3, *GRID, 3)
+
+
 def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, tmp_path):
     common: dict[str, Any] = {"bounds": (0.0, 2.0), "appearance": True, "gain": 0.5, "frames": 5}
     png = compensate_frames(T, source, tmp_path / "png", **common)
@@ -186,6 +197,35 @@ def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, 
     assert compensate_frames(**common, resume=True).solved == 1
     # 5 to 8 were not one batch.
     np.testing.assert_allclose(patterns(done), patterns(whole), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["pattern_000003.png", "appearance/appearance_000002.png"])
+@pytest.mark.parametrize("damage", ["empty", "other", "cut", "flipped", "removed"])
+def test_a_damaged_pattern_is_made_again(T, source, tmp_path, name, damage):
+    common: dict[str, Any] = {"batch": 4, "frames": 5, "appearance": True}
+    done = compensate_frames(T, source, tmp_path, **common)
+    file = tmp_path / name
+    before = everything(tmp_path)
+    good = file.read_bytes()
+    if damage == "removed":
+        file.unlink()
+    else:
+        middle = len(good) // 2
+        flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+        file.write_bytes(
+            {"empty": b"", "other": b"damaged", "cut": good[:-20], "flipped": flipped}[damage]
+        )
+    again = compensate_frames(T, source, tmp_path, resume=True, **common)
+    assert (again.solved, len(again.records)) == (1, len(done.records))
+    np.testing.assert_allclose(images.read(file), _read(good, file.suffix, tmp_path), atol=1e-3)
+    assert everything(tmp_path).keys() == before.keys()
+
+
+def _read(data: bytes, suffix: str, folder: Path) -> np.ndarray:
+    """The picture in these bytes."""
+    file = folder.with_suffix(suffix)
+    file.write_bytes(data)
+    return images.read(file)
 
 
 class Projector:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -50,6 +51,20 @@ def test_without_the_guard_no_worker_is_started(tmp_path, monkeypatch, text):
     with pytest.raises(ClusterError, match=f"film.py, line {line}.*__main__") as error:
         run(tmp_path, text)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_workers_that_do_not_start_are_one_error(tmp_path):
+    """The file ends each worker as that imports it."""
+    script = tmp_path / "film.py"
+    text = "import os\nif __name__ != '__main__':\n    os._exit(3)\n"
+    text += "from ltcl.cluster import connect\n"
+    text += "if __name__ == '__main__':\n    with connect('local', workers=1):\n        pass\n"
+    script.write_text(text)
+    words = [sys.executable, str(script)]
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
+    last = run.stderr.splitlines()[-1]
+    assert last.startswith("ltcl.errors.ClusterError: cluster is 'local'")
 
 
 @pytest.mark.parametrize("text", GUARDED.values(), ids=GUARDED)

@@ -1,31 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Help, exit codes, errors, notes and progress; `ltcl doctor` and `devices`."""
+"""Help, exit codes, errors, notes and progress; `ltcl devices`."""
 
 from __future__ import annotations
 
 import io
 import json
 import logging
+import os
 import re
+import signal
 import subprocess
 import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 import ltcl
 from ltcl.cli import command, doctor
 from ltcl.cli.main import main
 from ltcl.cli.progress import Progress
-from ltcl.device import Device, discovery
-from ltcl.solvers import METHODS
+from ltcl.device import discovery
 from tests import json_schema
-
-from .conftest import Program
 
 # Writing there fails as on a full disk; Linux and FreeBSD have it.
 FULL_DEVICE = Path("/dev/full")
@@ -38,6 +37,7 @@ COMMANDS = [
     "info",
     "analyze",
     "convert",
+    "align",
     "compress",
     "denoise",
     "invert",
@@ -60,7 +60,6 @@ CODES = [
     command.INTERRUPTED,
 ]
 EXIT_CODES = (json_schema.PAGES / "exit-codes.md").read_text(encoding="utf-8")
-KERNELS = {"csr", "dense", "tile", "wavelet", "form_factor", "southwell", "walk", "vector"}
 
 
 def test_version(program):
@@ -173,6 +172,53 @@ def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, nam
     assert json.loads(printed[1])[0]["file"] == str(path)
 
 
+@pytest.mark.parametrize("module", ["numpy", "scipy", "typer"])
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
+    """A module that interrupts its own import stands in the place of one that takes long."""
+    text = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)"
+    (tmp_path / f"{module}.py").write_text(text)
+    root = Path(ltcl.__file__).parents[1]
+    paths = os.pathsep.join([str(tmp_path), str(root)])
+    run = subprocess.run(
+        [sys.executable, "-m", "ltcl", "devices", *options],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 130
+    assert run.stderr == "ltcl: error: interrupted\n"
+    if options:
+        assert json.loads(run.stdout)["exit_code"] == 130
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_any_moment_is_one_line():
+    """From the moment at which Python imports ltcl, to the end; after that all is printed."""
+    words = [sys.executable, "-m", "ltcl", "devices"]
+    start = time.monotonic()
+    subprocess.run(words, capture_output=True, check=True)
+    duration = time.monotonic() - start
+    codes = set()
+    for share in np.linspace(0.15, 1.0, 18):
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(share * duration)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+        codes.add(process.returncode)
+        expected = {130: "ltcl: error: interrupted\n", 0: ""}
+        assert errors == expected[process.returncode]
+    assert 130 in codes
+
+
+def test_who_imports_ltcl_keeps_the_handlers_of_signals():
+    code = "import signal, ltcl; print(signal.getsignal(signal.SIGINT).__name__)"
+    words = [sys.executable, "-c", code]
+    run = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert run.stdout == "default_int_handler\n"
+
+
 def test_quiet_and_verbose(program, transport, tmp_path):
     arguments = ["convert", transport, tmp_path / "T.npy"]
     assert "--grid 5x10" in program(*arguments).err
@@ -204,85 +250,6 @@ def test_progress_is_a_bar_with_elapsed_time_and_time_left(capsys, monkeypatch, 
     is_shown = is_terminal and not quiet
     for part in ("frames", "0:00:0", "left"):
         assert (part in err) == is_shown
-
-
-def failed_checks(program: Program, *arguments: str) -> list[dict[str, Any]]:
-    """Run `ltcl doctor`, and return the checks that fail."""
-    outcome = program("doctor", *arguments, "--json")
-    assert outcome.code == 1
-    assert outcome.document["passed"] is False
-    return [check for check in outcome.document["checks"] if not check["passed"]]
-
-
-def test_doctor_tries_every_solver_and_product(program, device, monkeypatch):
-    kernel = Device.kernel
-    files = set()
-
-    def record(self: Device, file: str, *arguments: Any, **defines: Any) -> Any:
-        files.add(file)
-        return kernel(self, file, *arguments, **defines)
-
-    monkeypatch.setattr(Device, "kernel", record)
-    report = program("doctor", "--json").json
-    assert report["passed"] is True
-    names = {check["check"] for check in report["checks"]}
-    assert {f"solve, {method}" for method in METHODS} <= names
-    assert files >= KERNELS
-
-
-def test_a_compiler_prints_nothing(device, capfd):
-    """Remarks on a kernel of constants; a define of its own keeps the driver's cache out."""
-    device.kernel("form_factor", "form_factor_matvec", K=1, LANES=8, BLOCKS=0, FRESH=time.time_ns())
-    assert capfd.readouterr() == ("", "")
-
-
-def test_each_failed_check_has_a_fix(program, monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    monkeypatch.setenv("LTCL_CACHE", str(tmp_path / "file"))
-    monkeypatch.setitem(doctor.LIMITS, "product", 0.0)
-    cache, *products = failed_checks(program)
-    assert cache["check"] == "cache folder"
-    assert "LTCL_CACHE" in cache["fix"]
-    assert products != []
-    for check in products:
-        assert check["check"].startswith("product,")
-        assert "NumPy" in check["found"]
-
-
-def test_an_unknown_device_fails_a_check(program):
-    printed = program("doctor", "--device", "nonsense").out
-    for word in ("FAILED", "nonsense", "fix: ", "ltcl devices", "1 of "):
-        assert word in printed
-
-
-def test_a_missing_driver_fails_a_check(program, monkeypatch):
-    monkeypatch.setattr(discovery, "list_devices", list)
-    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    (check,) = failed_checks(program)
-    assert "OCL_ICD_VENDORS=/nowhere" in check["found"]
-
-
-@pytest.mark.slow
-def test_a_driver_that_crashes_or_hangs_is_named(program, monkeypatch, tmp_path):
-    """The trial runs the file of a driver, as the loader would load it."""
-    trial = "import os, time; exec(open(os.environ['OCL_ICD_VENDORS']).read())"
-    monkeypatch.setattr(doctor, "TRIAL", trial)
-    monkeypatch.setattr(doctor, "SECONDS", 2)
-    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
-    actions = {
-        "crash": "os.abort()",
-        "hang": "time.sleep(60)",
-        "good": "",
-        "odd": "raise RuntimeError",
-    }
-    for name, action in actions.items():
-        (tmp_path / f"{name}.icd").write_text(action)
-    (check,) = failed_checks(program)
-    crashing, working = check["found"].split("working")
-    # The driver of the wheel is there, too.
-    assert re.findall(r"(\w+)\.icd", crashing) == ["crash", "hang"]
-    assert {"good", "odd"} <= {*re.findall(r"(\w+)\.icd", working)}
-    assert "OCL_ICD_VENDORS" in check["fix"]
 
 
 def test_devices_mark_the_one_that_would_be_chosen(program, device):

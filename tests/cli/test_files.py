@@ -83,7 +83,7 @@ def test_info_of_sparse_and_rectangular_transports(program, sparse, rectangular)
         ("compressed", "compressed: .*analyze"),
         ("inverse", "inverse: .*analyze"),
         ("sparse", "grid: .*analyze .* --grid"),
-        ("rectangular", "grid: .*convert .* --camera-grid"),
+        ("rectangular", "grid: .*analyze .* --camera-grid"),
     ],
 )
 def test_info_tells_why_a_verdict_is_unknown(program, request, name, words):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 import math
 import re
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -50,6 +51,7 @@ HEADER = "common/lanes.h"
 DEFINES = {
     "K": 2,
     "STRIP": 2,
+    "STRIPS": 1,
     "WIDTH": 8,
     "PLACE": "int",
     "VALUES": 2,
@@ -103,8 +105,8 @@ def test_messages_name_file_line_and_defines(device, own_kernels):
 def test_missing_and_wrong_defines_and_names_are_refused(device, file):
     for name, defines, part in (
         ("matvec", {}, "needs -DK="),
-        ("matvec", {"K": 5, "STRIP": 1}, "1, 2, 3, 4 or 8"),
-        ("none", {"K": 1, "STRIP": 1}, f"{file}_none"),
+        ("matvec", {"K": 5, "STRIP": 1, "STRIPS": 1}, "1, 2, 3, 4 or 8"),
+        ("none", {"K": 1, "STRIP": 1, "STRIPS": 1}, f"{file}_none"),
     ):
         with pytest.raises(DeviceError, match=part):
             device.kernel(file, f"{file}_{name}", **defines)
@@ -263,3 +265,9 @@ def test_status_codes_say_what_to_do(device, monkeypatch, name, kind, advice):
     for act in (x.get, lambda: vectors.fill(x, 1.0)):
         with pytest.raises(kind, match=f"{device.name}: .*{name}.*{advice}|{name}.*{advice}"):
             act()
+
+
+def test_a_compiler_prints_nothing(device, capfd):
+    """Remarks on a kernel of constants; a define of its own keeps the driver's cache out."""
+    device.kernel("form_factor", "form_factor_matvec", K=1, LANES=8, BLOCKS=0, FRESH=time.time_ns())
+    assert capfd.readouterr() == ("", "")

@@ -52,7 +52,7 @@ def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
 def force_groups(monkeypatch: Any, device: Device, group: int) -> None:
     """Let all kernels run with work-groups of one size, as far as the device allows it."""
     # What was planned for other groups does not fit these.
-    monkeypatch.setattr(device, "reductions", {})
+    monkeypatch.setattr(device.session, "reductions", {})
     real = Kernel.group
 
     def forced(kernel: Kernel, wanted: Any) -> Any:

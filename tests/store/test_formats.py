@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import resource
 import struct
 import zipfile
 from dataclasses import replace
@@ -17,12 +18,13 @@ import scipy.io
 import scipy.sparse
 
 import ltcl
+from ltcl.device import Device
 from ltcl.errors import FileError, InputTypeError, LtclError, MemoryLimitError
 from ltcl.store import StoreRecord, formats
 from ltcl.store.record import Matrix
 from ltcl.transport.noise import Noise
 
-from .stores import dense, sparse
+from .stores import contents, dense, sparse
 
 random = np.random.default_rng()
 read: Any = formats.read
@@ -375,7 +377,8 @@ def test_an_honest_giant_is_a_matter_of_memory(
 
 REFUSED: list[tuple[str, Any, str]] = [
     (".npz", {"T": np.ones((2, 4, 4))}, "(2, 4, 4)"),
-    (".npz", {"T": dense(), "note": np.array({"by": "me"})}, "'note' is declared as object"),
+    (".npz", {"T": np.array({"by": "me"})}, "'T' is made of Python objects"),
+    (".npz", {"note": np.array({"by": "me"})}, "'note' (made of Python objects"),
     (".npz", {"T": np.ones((2, 2), complex)}, "complex128"),
     (".npz", {"T": dense(), "grid": [2.5, 3.0]}, "'grid' is [2.5, 3.0]"),
     (".npz", {"T": dense(), "first_bounce": np.ones(11)}, "(11,)"),
@@ -388,6 +391,9 @@ REFUSED: list[tuple[str, Any, str]] = [
     (".npz", parts(format="bsr", data=np.ones((3, 1, 1)), indices=[0, 9, 1]), "9"),
     (".npz", b"not an archive at all", "zip"),
     (".mtx", COORDINATE.replace(b"real", b"complex") + b"2 2 1\n1 1 1 1\n", "complex"),
+    (".mtx", COORDINATE.replace(b"real", b"pattern") + b"2 2 1\n1 1\n", "field is pattern"),
+    (".mtx", COORDINATE.replace(b"matrix", b"vector", 1) + b"2 1\n1 1\n", "object is vector"),
+    (".mtx", COORDINATE.replace(b"general", b"hermitian"), "symmetry is hermitian"),
     (".mtx", COORDINATE + b"-2 2 1\n1 1 1\n", "Line 2"),
     (".mtx", COORDINATE + b"9 9 1000000000000\n1 1 1\n", "1000000000000"),
     (".mtx", COORDINATE + b"9 9 2\n1 1 1.00\n2 2 1.00\n3 3 1.00\n", "3"),
@@ -398,6 +404,8 @@ REFUSED: list[tuple[str, Any, str]] = [
     (".mtx", COORDINATE.replace(b"real", b"integer") + b"9 9 1\n1 1 1.5\n", "'1 1 1.5'"),
     (".mtx", COORDINATE + b"2 2 2\n1 1 1\n1 0 1\n", "Line 4"),
     *((".mtx", ARRAY + b"1 1\n" + value, f"line 3 is {value!r}") for value in NO_NUMBERS),
+    (".mtx", b"no matrix\n", "no matrix"),
+    (".mtx", COORDINATE.replace(b" general", b""), "symmetry"),
     (".mat", b"MATLAB 4".ljust(600), "7.3"),
     (".mat", b"MATLAB 5.0 MAT-file".ljust(124) + b"\1\0MI" + bytes(600), "7.3"),
 ]
@@ -417,3 +425,202 @@ def test_without_h5py_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(FileError, match=r"T\.h5: .*h5py.*ltcl\[hdf5\]"):
         formats.write(tmp_path / "T.h5", StoreRecord((dense(),), (3, 4)))
     assert not list(tmp_path.iterdir())
+
+
+SHAPES = [(1, 1), (1, 2), (2, 1), (1, 3), (3, 1), (3, 3), (2, 3), (3, 2)]
+
+
+@pytest.mark.parametrize("extension", [".npz", ".npy", ".mtx", ".h5", ".mat", ".zarr"])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("make", [np.asarray, scipy.sparse.csr_array])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_smallest_transports_come_back(
+    tmp_path: Path, shape: tuple[int, int], make: Any, channels: int, extension: str
+) -> None:
+    """Axes of length 1 and 3 are told apart."""
+    M, N = shape
+    is_sparse = make is not np.asarray
+    if (extension == ".mtx" and channels == 3) or (extension == ".npy" and is_sparse):
+        return
+    is_bare = extension in (".npy", ".mtx")
+    F = None
+    if M == N and not is_bare:
+        F = random.uniform(1, 2, (N,) if channels == 1 else (3, N))
+    record = StoreRecord(
+        tuple(make(random.uniform(1, 2, shape)) for _ in range(channels)),
+        None if extension == ".npy" else (1, N),
+        None if extension == ".npy" or M == N else (1, M),
+        F,
+        np.eye(3) + 0.1 if channels == 3 and not is_bare else None,
+    )
+    formats.write(tmp_path / f"T{extension}", record)
+    loaded = read(tmp_path / f"T{extension}")
+    if loaded.stored:
+        loaded = replace(
+            loaded, matrices=tuple(make(as_dense(matrix)) for matrix in loaded.matrices)
+        )
+    same(loaded, record)
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse", "compressed"])
+def test_a_flipped_bit_in_the_directory_of_an_archive_loses_nothing(
+    tmp_path: Path, kind: str, device: Device
+) -> None:
+    path = tmp_path / "T.npz"
+    T = ltcl.scenes.dihedral(4).transport()
+    if kind == "compressed":
+        small = ltcl.Transport(T.matrices[0], T.grid, device=device)
+        ltcl.save(path, ltcl.compress(small, rtol=1e-2))
+    else:
+        matrix: Any = dense() if kind == "dense" else sparse()
+        formats.write(path, StoreRecord((matrix,), (3, 4), first_bounce=np.ones(12)))
+    good = path.read_bytes()
+    record: Any = read(path)
+    names = record.arrays if kind == "compressed" else record.arrays()
+    with zipfile.ZipFile(path) as archive:
+        start = archive.start_dir
+    # The lengths of names, extra fields and comments, and bits anywhere.
+    places = [start + 28 + offset for offset in range(6)]
+    places += random.integers(start, len(good), 60).tolist()
+    for place in places:
+        changed = bytearray(good)
+        changed[place] ^= 1 << int(random.integers(8))
+        path.write_bytes(changed)
+        try:
+            loaded: Any = read(path)
+        except FileError:
+            continue
+        assert set(loaded.arrays if kind == "compressed" else loaded.arrays()) == set(names)
+
+
+@pytest.mark.parametrize("name", ["T.npz", "T.npy", "T.mtx", "T.h5", "T.mat", "T.zarr", "s.npz",
+                                  "s.mtx", "s.h5", "s.mat", "s.zarr"])  # fmt: skip
+def test_a_full_disk_is_noticed_and_the_earlier_file_stays(tmp_path: Path, name: str) -> None:
+    """Files cannot become larger than a limit, in the place of a full disk."""
+    path = tmp_path / name
+    matrix: Any = dense(60, 60) if name.startswith("T") else sparse(60)
+    record = StoreRecord((matrix,), (6, 10))
+    formats.write(path, record)
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    size = max(file.stat().st_size for file in files)
+    before = contents(tmp_path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for share in (0.01, 0.5, 0.9, 0.999):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * size), limits[1]))
+        try:
+            with pytest.raises(FileError, match=f"^{path}: .*large"):
+                formats.write(path, record)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert contents(tmp_path) == before
+
+
+def test_objects_beside_a_matrix_are_left_out(tmp_path: Path) -> None:
+    np.savez(tmp_path / "T.npz", T=dense(), note=np.array({"by": "me"}), name=np.array("wall"))
+    with zipfile.ZipFile(tmp_path / "T.npz", "a") as archive:
+        archive.writestr("README.txt", "a wall")
+    np.testing.assert_array_equal(read(tmp_path / "T.npz").matrices[0], dense())
+    np.save(tmp_path / "T.npy", np.array([{"T": 1}], object), allow_pickle=True)
+    assert "Python objects" in refusal(tmp_path / "T.npy", FileError)
+
+
+GROUPS = {
+    "entry/data/transport": dense(),
+    "entry/title": "a wall",
+    "entry/time": np.arange(5.0),
+}
+
+
+def test_matrices_in_groups_of_hdf5(tmp_path: Path) -> None:
+    """A group with a member `data` is no sparse matrix."""
+    path = tmp_path / "T.h5"
+    with h5py.File(path, "w") as file:
+        file.update(GROUPS)
+    np.testing.assert_array_equal(read(path).matrices[0], dense())
+    with h5py.File(path, "a") as file:
+        file["entry/data/other"] = 2 * dense()
+    text = refusal(path, FileError)
+    assert "'entry/data/transport' (12, 12)" in text
+    assert "'entry/title' (text)" in text
+    for name in ("entry/data/other", "/entry/data/other"):
+        np.testing.assert_array_equal(read(path, variable=name).matrices[0], 2 * dense())
+    with pytest.raises(FileError, match=r"'nowhere' is missing.*entry/data/transport"):
+        formats.read(path, variable="nowhere")
+    with pytest.raises(FileError, match=r"'entry/title' is text"):
+        formats.read(path, variable="entry/title")
+
+
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [
+        (1j * np.eye(3), "complex"),
+        (scipy.sparse.csc_array(1j * np.eye(3)), "complex"),
+        ({"T": np.eye(3)}, "a struct"),
+        (np.array([[np.eye(3)], [np.eye(2)]], object), "a cell array"),
+        ("some text", "text"),
+    ],
+)
+@pytest.mark.parametrize("name", ["LTM", "wall"])
+def test_variables_of_matlab_that_are_no_matrix(
+    tmp_path: Path, name: str, value: Any, kind: str
+) -> None:
+    path = tmp_path / "T.mat"
+    scipy.io.savemat(path, {name: value})
+    text = refusal(path, FileError)
+    assert name in text
+    assert kind in text
+    with pytest.raises(FileError, match=f"'{name}' is {kind}"):
+        formats.read(path, variable=name)
+
+
+def test_complex_numbers_of_matlab_7_3(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "T.mat", "w", userblock_size=512) as file:
+        file["LTM"] = np.zeros((3, 3), [("real", "f8"), ("imag", "f8")])
+    assert "'LTM' is complex" in refusal(tmp_path / "T.mat", FileError)
+
+
+@pytest.mark.parametrize("spare", [{"ir"}, {"data"}, {"ir", "data"}])
+@pytest.mark.parametrize("entries", [0, 7])
+def test_sparse_matrices_with_room_to_spare(tmp_path: Path, entries: int, spare: set[str]) -> None:
+    """MATLAB reserves more entries than there are."""
+    T = sparse().tocsc()
+    if entries == 0:
+        T = scipy.sparse.csc_array((12, 12))
+    arrays = {"data": T.data, "ir": T.indices.astype("u8"), "jc": T.indptr.astype("u8")}
+    for name in spare:
+        arrays[name] = np.append(arrays[name], np.full(5, 3, arrays[name].dtype))
+    path = tmp_path / "T.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file.create_group("LTM").update(arrays)
+        file["LTM"].attrs["MATLAB_sparse"] = np.uint64(12)
+    np.testing.assert_array_equal(as_dense(read(path).matrices[0]), T.toarray())
+
+
+COLORS = {"T_red": dense(seed=1), "T_green": dense(seed=2), "T_blue": dense(seed=3)}
+
+
+@pytest.mark.parametrize(
+    "variable", ["T_red,T_green,T_blue", " T_red, T_green ,T_blue", tuple(COLORS)]
+)
+@pytest.mark.parametrize("extension", [".npz", ".h5", ".mat"])
+def test_three_matrices_by_their_names(tmp_path: Path, extension: str, variable: Any) -> None:
+    path = tmp_path / f"T{extension}"
+    if extension == ".npz":
+        np.savez(path, allow_pickle=False, **COLORS)
+    elif extension == ".mat":
+        scipy.io.savemat(path, COLORS)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(COLORS)
+    T = ltcl.load(path, grid=(3, 4), variable=variable)
+    np.testing.assert_array_equal(T.to_numpy(), list(COLORS.values()))
+    for wrong in ("T_red,T_green", "T_red,T_green,T_blue,T_red", "T_red,T_green,T_blu"):
+        with pytest.raises(FileError, match="variable"):
+            ltcl.load(path, grid=(3, 4), variable=wrong)
+
+
+def test_three_matrices_are_one_channel_each(tmp_path: Path) -> None:
+    stacks = {name: np.stack([matrix] * 3) for name, matrix in COLORS.items()}
+    np.savez(tmp_path / "T.npz", allow_pickle=False, **stacks)
+    with pytest.raises(FileError, match=r"\(3, 12, 12\)"):
+        read(tmp_path / "T.npz", variable=tuple(COLORS))

@@ -8,6 +8,7 @@ time. LTCL_KILLS=N in the environment takes N moments of each kind, and 0 every 
 from __future__ import annotations
 
 import functools
+import gc
 import itertools
 import os
 import shutil
@@ -24,7 +25,7 @@ import pytest
 
 import ltcl
 from ltcl.errors import FileError
-from ltcl.store import BlockStore
+from ltcl.store import BlockStore, StoreRecord, formats
 
 from . import stores
 
@@ -188,3 +189,51 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, name: str) -> None:
         assert not change.any() or np.array_equal(change, before.toarray())
     assert store.attributes == {"step": 1}
     np.testing.assert_array_equal(store.block(0, 1).matrix.toarray(), 2 * before.toarray())
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_readers_see_one_store_while_writers_replace_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_exchange: bool
+) -> None:
+    """No save fails, no load fails, and what was loaded stays as it was."""
+    if not can_exchange:
+        monkeypatch.setattr("ltcl.files.exchange", lambda one, two: False)
+    path = tmp_path / "T.zarr"
+
+    def save(scale: int) -> None:
+        formats.write(path, StoreRecord((scale * T,), (3, 4)))
+
+    def write(scale: int) -> None:
+        for _ in range(25):
+            save(scale)
+
+    save(1)
+    writers = [stores.in_child(lambda scale=scale: write(scale)) for scale in (2, 3)]
+    reads = 0
+    while reads < 40:
+        record: Any = formats.read(path)
+        (rows,) = record.matrices
+        time.sleep(0.01)
+        scales = {rows.tocsr().max() / T.max(), rows.rows(0, 12).max() / T.max()}
+        assert len(scales) == 1
+        assert scales <= {1.0, 2.0, 3.0}
+        reads += 1
+    assert [stores.status_of(writer) for writer in writers] == [0, 0]
+    rows = record = None
+    save(1)
+    assert os.listdir(tmp_path) == ["T.zarr"]
+
+
+def test_a_store_in_use_is_read_as_it_was_opened(tmp_path: Path) -> None:
+    path = tmp_path / "T.zarr"
+    ltcl.save(path, ltcl.Transport(T, (3, 4), on_dark="mask"))
+    loaded = ltcl.load(path)
+    ltcl.save(path, ltcl.Transport(2 * T, (3, 4), on_dark="mask"))
+    assert len(os.listdir(tmp_path)) == 2
+    picture = loaded @ np.ones((3, 4))
+    np.testing.assert_allclose(picture.ravel(), T @ np.ones(12), rtol=1e-6)
+    ltcl.save(path, loaded)  # onto the place that it came from
+    np.testing.assert_allclose(ltcl.load(path).to_numpy(), T.toarray())
+    del loaded
+    gc.collect()
+    assert os.listdir(tmp_path) == ["T.zarr"]

@@ -155,6 +155,6 @@ def test_gloss_takes_more_the_more_there_is(device, caplog):
         T = scene.transport(device=device)
         b = ltcl.separate(T, T @ np.ones(T.grid), bounces=1)
         assert "section 8.4" in b.warning
-        assert b.warning in caplog.text
+        assert "section 8.4" in caplog.text
         shares.append(b.negative_bounce)
     assert shares == sorted(shares)

@@ -26,6 +26,7 @@ LEVEL = 1e-4
 NOISE = "because of noise"
 EXPOSURES = "times as many exposures"
 GOOD = "errors by noise are .* in pictures"
+MATT = "as far as light between lit, matt surfaces explains"
 
 
 @pytest.fixture(autouse=True)
@@ -127,7 +128,7 @@ DAMAGES: list[tuple[str, Callable[..., Any], str, str, str]] = [
     (
         "flicker",
         lambda A, grid: A * random.normal(1.0, 0.05, len(A)),
-        "by [4-6].* % from col",
+        "by [4-6].* %.*perhaps drifted",
         "",
         "flicker",
     ),
@@ -173,7 +174,9 @@ def test_the_damage_is_named_and_nothing_else(name, damage, words, expected, cau
     height, width = T.grid
     if cause == "other_grid":
         height, width = width, height
-    judged = verdict(ltcl.Transport(changed, (height, width), noise=noise))
+    # diag(T) changes the third bounce of the box by more than 5 %.
+    first_bounce = "exact" if "b" in expected else "diagonal"
+    judged = verdict(ltcl.Transport(changed, (height, width), first_bounce, noise=noise))
     assert re.fullmatch(expected, good(judged)), judged.text
     assert re.search(words, judged.text, re.IGNORECASE), judged.text
     assert judged.causes[:1] == (cause,) * bool(cause), judged.text
@@ -187,7 +190,8 @@ def colours(order: tuple[int, ...], **settings: Any) -> ltcl.Transport:
     T = truth("corner").to_numpy()
     scales = (1.0, 0.7, 0.4)
     matrices = [scale * T for scale in scales]
-    first_bounce = [scales[c] * T.diagonal() for c in order]
+    exact = 1.0 / np.diagonal(np.linalg.inv(T))
+    first_bounce = [scales[c] * exact for c in order]
     return ltcl.Transport(matrices, (12, 24), first_bounce, **settings)
 
 
@@ -216,7 +220,9 @@ def blocks(order: tuple[int, ...]) -> ltcl.Transport:
         (lambda: blocks((0, 1, 2)), "bounces need one grid", "c"),
         (lambda: blocks((2, 1, 0)), "blue for red, red for blue", ""),
         (
-            lambda: ltcl.Transport(np.eye(288)[:96], (12, 24), camera_grid=(4, 24)),
+            lambda: ltcl.Transport(
+                np.eye(288)[:96], (12, 24), camera_grid=(4, 24), noise=Noise.uniform((96, 288), 0.0)
+            ),
             "bounces need one grid",
             "c",
         ),
@@ -306,7 +312,9 @@ def test_a_closed_bright_room_is_no_ambient_light(ambient, causes):
     "known", [{"sum_deviation": 0.07}, {"saturation": 0.07}, {"negative_bounce": 0.07}]
 )
 def test_numbers_from_elsewhere_count(known):
-    judged = verdict(truth("corner"), bounce_highest=np.nan, **known)  # which is not known
+    A = truth("corner").to_numpy()
+    T = ltcl.Transport(A, (12, 24), "exact")
+    judged = verdict(T, bounce_highest=np.nan, **known)  # which is not known
     assert (judged.causes, judged.bounces) == (tuple(known), False)
     assert "7 %" in judged.text
 

@@ -168,6 +168,12 @@ class VerdictNumbers(Report):
     bounce_1: Annotated[Measured, "Error of bounce 1, by noise."] = None
     bounce_2: Annotated[Measured, "Error of bounce 2, by noise."] = None
     bounce_3: Annotated[Measured, "Error of bounce 3, by noise."] = None
+    spread: Annotated[
+        Measured, "Largest of `spread_1` to `spread_3` if F is diag(T), else 0. Good up to 0.05."
+    ] = None
+    spread_1: Annotated[Measured, "Difference of bounce 1 by F = diag(T) or 1 / diag(T^-1)."] = None
+    spread_2: Annotated[Measured, "The same for bounce 2."] = None
+    spread_3: Annotated[Measured, "The same for bounce 3."] = None
     other_grid: Annotated[Measured, "1 if another grid fits better."] = None
     exchanged: Annotated[Measured, "Colour channels that look exchanged. Good: 0."] = None
     no_bounces: Annotated[Measured, "1 if T is not square."] = None
@@ -177,9 +183,13 @@ class VerdictNumbers(Report):
         "displaced in a common direction. Good up to 0.2.",
     ] = None
     hot_rows: Annotated[Measured, "Camera pixels with one value in all patterns. Good: 0."] = None
-    saturated: Annotated[Measured, "Entries equal to the largest direct light. Good up to 2."] = (
-        None
-    )
+    saturated: Annotated[Measured, "Entries equal to the brightest one. Good up to 2."] = None
+    quantized: Annotated[
+        Measured, "Step of the codes of T over its mean indirect light. Good up to 0.3."
+    ] = None
+    row_offset: Annotated[
+        Measured, "Offset of the camera's pixels over the light under white. Good up to 0.015."
+    ] = None
     ambient: Annotated[
         Measured,
         "Least light that parts of the picture exchange in one bounce, over "
@@ -193,14 +203,16 @@ class VerdictNumbers(Report):
         "neighbours do not confirm. Good: 0.",
     ] = None
     irreciprocal: Annotated[Measured, "`reciprocity_defect` beyond noise. Good up to 0.1."] = None
-    dark: Annotated[Measured, "Share of projector pixels that are masked. Good up to 0.05."] = None
-    gain: Annotated[Measured, "Brightness of a plain picture within reach, over white."] = None
-    negative_bounce: Annotated[
-        Measured, "Largest `negative_bounce` of a channel. Good up to 0.005."
-    ] = None
-    bounce_highest: Annotated[Measured, "Largest `bounce_highest` of a channel. Good up to 1."] = (
+    dark: Annotated[Measured, "Share of projector pixels that light nothing. Good up to 0.05."] = (
         None
     )
+    gain: Annotated[Measured, "Brightness of a plain picture within reach, over white."] = None
+    negative_bounce: Annotated[
+        Measured, "Share of light that a bounce takes away. Good up to 0.005."
+    ] = None
+    bounce_highest: Annotated[
+        Measured, "Light that 98 % of pixels return, at most. Good up to 1."
+    ] = None
     sum_deviation: Annotated[Measured, "`sum_deviation` of the scan. Good up to 0.03."] = None
     saturation: Annotated[Measured, "`saturated` of the scan. Good up to 0.01."] = None
 

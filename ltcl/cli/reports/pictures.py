@@ -76,6 +76,7 @@ class FrameReport(Report):
     number: Annotated[int, "Number of the frame, from 1."]
     name: Annotated[str, "Name of its file, or of the film."]
     digest: Annotated[str, "SHA-256 of the data that was read."]
+    output_digest: Annotated[str, "SHA-256 of the files that were written."]
     error: SceneError
     clipped: Clipped
 
@@ -114,6 +115,7 @@ class SeparatedPicture(Report):
 
     file: Annotated[Path, "Input file."]
     transport_error: TransportError
+    warning: Annotated[str, "What T leaves unknown of the bounces."]
     parts: Annotated[list[LightPart], "Direct light, bounces and the rest."]
 
 

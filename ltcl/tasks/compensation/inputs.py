@@ -202,10 +202,10 @@ def check_weights(
 
     The unit is a power of 2 that keeps their squares inside float64.
     """
-    if weights is None and not T.masked.any():
+    if weights is None and not T.unlit.any():
         return None, 1.0
     if weights is None:
-        is_lit = ~T.masked[:, None]
+        is_lit = ~T.unlit[:, None]
         return [np.broadcast_to(is_lit, d.shape).astype(np.float64) for d in desired], 1.0
     weights = checks.real("weights", weights).astype(np.float64, copy=False)
     channels = _check_frames("weights", weights, T, shape, desired)

@@ -13,15 +13,13 @@ import dataclasses
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 
-from ltcl.device import Device
 from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
-from ltcl.operators import Operator, ScaledColumns, as_operator
+from ltcl.operators import Operator, ScaledColumns
 from ltcl.solvers import SolveSettings
 from ltcl.solvers.bounded import Bounded, minimise
 from ltcl.transport.transport import Transport
@@ -34,8 +32,6 @@ BOUNDS_SLACK = 1e-6
 # Brightest pixels: from 1e-38 on float32 has all digits, and some devices have any.
 MIN_BRIGHTNESS = 1e-30
 MAX_BRIGHTNESS = 1e38
-# Products that estimate the norms of columns that cannot be read, to a factor of 2.
-NORM_PROBES = 16
 
 
 class ChannelSystem(NamedTuple):
@@ -236,37 +232,7 @@ def channel_systems(T: Transport) -> tuple[ChannelSystem, ...]:
     if T.is_square and not T.couples:
         F = np.atleast_2d(T.first_bounce)
         return tuple(map(ChannelSystem, T.systems, F))
-    norms = _column_norms(T)
+    norms = T.column_norms
     inverses = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)
     operators = map(ScaledColumns, T.operators, inverses)
     return tuple(map(ChannelSystem, operators, norms))
-
-
-def _column_norms(T: Transport) -> np.ndarray:
-    """Norms of the columns of each system, (systems, N or 3 N)."""
-    rows = T.blocks
-    if rows is None:
-        rows = [T.matrices]
-    squares_of_rows = []
-    for row in rows:
-        squares_of_rows.append([_squared_norms(matrix, T.device) for matrix in row])
-    squares = np.sum(squares_of_rows, axis=0)
-    if T.mixing is not None:
-        squares = np.square(T.mixing).T @ squares
-    return np.sqrt(squares.reshape(len(T.operators), -1))
-
-
-def _squared_norms(matrix: Any, device: Device) -> np.ndarray:
-    """Squared norms of the columns, (N,) float64.
-
-    With products alone they are estimated by random signs v, as E (A^T v)^2.
-    """
-    columns = matrix.shape[1]
-    if isinstance(matrix, np.ndarray):
-        return np.einsum("ij,ij->j", matrix, matrix, dtype=np.float64)
-    if isinstance(matrix, scipy.sparse.csr_array):
-        squares = matrix.data.astype(np.float64) ** 2
-        return np.bincount(matrix.indices, squares, minlength=columns)
-    A = as_operator(matrix, device)
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (A.shape[0], NORM_PROBES))
-    return np.mean(np.square(A.T @ signs, dtype=np.float64), axis=1)

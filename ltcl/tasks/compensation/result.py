@@ -95,7 +95,8 @@ class Compensation:
         pixels do not count.
     error : float
         ``||W (appearance - target)|| / ||W target||`` of all frames and colours together, with T
-        as it is, or `exact` where that was given; see `transport_error`.
+        as it is, or `exact` where that was given; see `transport_error`. If the target is black,
+        ``||W (appearance - target)||``.
     gap : float
         Bound on what the error is above the least: no pattern within the bounds has an error below
         error - gap.

@@ -17,6 +17,9 @@ import scipy.sparse
 
 # Pairs of rows to compare.
 PAIRS = 32
+# Light of rows that are compared, to that of the median one: others are dead, unlit or hot.
+MIN_LIGHT = 0.1
+MAX_LIGHT = 10.0
 # Sums of columns that are compared: noise averages out.
 COLUMN_BINS = 64
 # Difference of rows at the ends of a width, to that within, from which on they jump.
@@ -62,6 +65,9 @@ class _RowPairs:
         self.pixels = self.random.permutation(n)[:PAIRS]
         bin_size = -(-n // COLUMN_BINS)
         self.bin_starts = np.arange(0, n, bin_size)
+        light = T @ np.ones(n, np.float32)
+        typical = float(np.median(light[light > 0])) if np.any(light > 0) else 0.0
+        self.is_usual = (light > MIN_LIGHT * typical) & (light < MAX_LIGHT * typical)
 
     def difference_below(self, width: int) -> float:
         """Mean difference of rows one row of the grid apart; of random rows for a single row."""
@@ -70,7 +76,10 @@ class _RowPairs:
             j = np.where(i + width < self.n, i + width, i - width)
         else:
             j = self.random.permutation(self.n)[: len(i)]
-        return float(self._difference(i, j).mean())
+        is_usual = self.is_usual[i] & self.is_usual[j]
+        if not is_usual.any():
+            return 1.0
+        return float(self._difference(i[is_usual], j[is_usual]).mean())
 
     def jump_at_ends(self, width: int) -> bool:
         """True if rows differ more over the ends of a width than within."""

@@ -75,6 +75,7 @@ class ChannelNoise:
     columns: np.ndarray
     direct: float = 1.0
     neighbours: float = 0.0
+    is_known: bool = True
 
 
 def fit_channel(shape: tuple[int, int], parts: Samples, is_exact: bool) -> ChannelNoise:

@@ -34,7 +34,7 @@ from ltcl.transport.noise.comparison import compare, differences, shows_rows
 from ltcl.transport.noise.fit import ChannelNoise, Samples, fit_channel
 from ltcl.transport.noise.neighbours import filter_pictures, filtered_variance
 
-SOURCES = ("given", "acquired", "measured twice", "estimated")
+SOURCES = ("given", "acquired", "measured twice", "estimated", "unknown")
 # Largest finite number of a noise.
 MAX_NUMBER = 1e36
 # Largest standard deviation, times the brightest light: above, the units must be wrong.
@@ -56,7 +56,8 @@ class Noise:
     white : (channels, M) float64
         Variance of row sums, infinite where rows were not made to add up to a measured white.
     source : str
-        "acquired", "measured twice", "given", or "estimated" from T alone.
+        "acquired", "measured twice", "given", or "estimated" from T alone; "unknown" if T does not
+        show it: then the noise is at least the one stated.
     direct : (channels,) float64
         Factor of the variance of the first bounce: far below 1 for a path-traced T.
     neighbours : (channels,) float64
@@ -172,6 +173,11 @@ class Noise:
                 "measured with the same exposure and light"
             )
         return replace(noise, neighbours=neighbours)
+
+    @property
+    def is_measured(self) -> bool:
+        """False if T alone tells the noise, or does not tell it."""
+        return self.source not in ("estimated", "unknown")
 
     def __repr__(self) -> str:
         floor = ", ".join(f"{value:.2g}" for value in self.floor)

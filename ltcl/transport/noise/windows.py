@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
 
@@ -21,18 +21,18 @@ class Windows:
     ----------
     pixels : (windows, p)
         Numbers of the pixels.
-    weight : (windows, p)
-        1 / texture of the pixels.
     detail : (k, p)
         Orthonormal pictures that are orthogonal to polynomials below a degree along each axis.
-    gain : (windows, k)
-        Standard deviation of the detail of weighted noise of 1.
+    grid : (h, w)
+    side, order : int
+        Pixels along a side, and that degree.
     """
 
+    grid: tuple[int, int]
+    side: int
+    order: int
     pixels: np.ndarray
-    weight: np.ndarray
     detail: np.ndarray
-    gain: np.ndarray
 
     @classmethod
     def from_grid(
@@ -40,7 +40,6 @@ class Windows:
         grid: tuple[int, int],
         side: int,
         order: int,
-        texture: np.ndarray,
         overlap: bool = False,
     ) -> Self:
         """Windows of `side` pixels a side with detail of degree `order` or more.
@@ -57,10 +56,49 @@ class Windows:
         x = corners[:, [1]] + np.arange(sides[1])
         pixels = y[:, :, None] * grid[1] + x[:, None, :]
         pixels = pixels.reshape(len(corners), -1)
-        detail = np.kron(_detail_along(sides[0], order), _detail_along(sides[1], order))
-        weight = 1.0 / texture[pixels]
-        gain = np.sqrt(weight**2 @ detail.T**2)
-        return cls(pixels=pixels, weight=weight, detail=detail, gain=gain)
+        windows = cls(
+            grid=grid,
+            side=side,
+            order=order,
+            pixels=pixels,
+            detail=np.zeros((0, 0)),
+        )
+        return windows.with_order(order)
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Rows and columns of a window."""
+        height, width = self.grid
+        return min(self.side, height), min(self.side, width)
+
+    def with_order(self, order: int) -> Self:
+        """The same windows with detail of degree `order` or more."""
+        rows, columns = self.sides
+        detail = np.kron(_detail_along(rows, order), _detail_along(columns, order))
+        return replace(self, order=order, detail=detail)
+
+    def finest(self) -> Self:
+        """The same windows with the highest third of all degrees."""
+        return self.with_order(self.side - max(self.side // 3, 1))
+
+
+def distances(camera: Windows, projector: Windows) -> np.ndarray:
+    """Steps between each two windows, (camera windows, projector windows).
+
+    0 or less if they share a pixel; infinite if the grids differ.
+    """
+    if camera.grid != projector.grid:
+        return np.full((len(camera.pixels), len(projector.pixels)), np.inf)
+    y, x = np.divmod(camera.pixels, camera.grid[1])
+    v, u = np.divmod(projector.pixels, projector.grid[1])
+    return np.maximum(_gaps(y, v), _gaps(x, u))
+
+
+def _gaps(y: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Steps from the range of each row of y to that of each row of v; 0 or less if they meet."""
+    above = y.min(axis=1)[:, None] - v.max(axis=1)
+    below = v.min(axis=1) - y.max(axis=1)[:, None]
+    return np.maximum(above, below)
 
 
 def _corners(grid: tuple[int, int], sides: list[int], overlap: bool) -> np.ndarray:

@@ -19,7 +19,8 @@ class Damage:
         Limits of their own for what the damage spoils.
     cause, advice : str
         Texts, whose fields are {p} the number in percent, {n} the number, {where} a place in the
-        picture, {more} a number of exposures, {which} the bounces that are uncertain.
+        picture, {more} a number of exposures, {noisy} and {spread} the bounces that are uncertain
+        by noise, or by the choice of the first bounce. A guess at a cause is called "perhaps".
     """
 
     name: str
@@ -56,7 +57,7 @@ DAMAGES = (
     Damage(
         name="exchanged",
         threshold=0.0,
-        cause="colour channels look exchanged, {where}",
+        cause="colour channels are perhaps exchanged, {where}",
         advice="put them in one order",
     ),
     Damage(
@@ -78,6 +79,14 @@ DAMAGES = (
         advice="take shorter exposures, too",
     ),
     Damage(
+        name="quantized",
+        threshold=0.3,
+        cause="T is stored in steps of {p} of its mean indirect light, and less is lost",
+        advice="store T as floats",
+        # Measured: then pictures of rounded corners and boxes are off by 2 %.
+        compensation_limit=1.2,
+    ),
+    Damage(
         name="saturation",
         threshold=0.01,
         cause="{p} of the camera saturates",
@@ -92,8 +101,15 @@ DAMAGES = (
     Damage(
         name="ambient",
         threshold=0.05,
-        cause="{p} of a bounce is ambient light left in T",
+        cause="{p} of a bounce is perhaps ambient light left in T",
         advice="subtract black",
+    ),
+    Damage(
+        name="row_offset",
+        threshold=0.015,
+        cause="camera pixels have offsets, {p} under white, perhaps errors of the dark frame",
+        advice="measure black again, and subtract it",
+        compensation_limit=0.02,
     ),
     Damage(
         name="offset",
@@ -104,7 +120,7 @@ DAMAGES = (
     Damage(
         name="flicker",
         threshold=0.02,
-        cause="the light drifted by {p} from column to column",
+        cause="the light of projector pixels differs by {p}, and perhaps drifted in the scan",
         advice="scan again",
     ),
     Damage(
@@ -115,16 +131,10 @@ DAMAGES = (
         advice="measure these pixels again",
     ),
     Damage(
-        name="bounce_highest",
-        threshold=1.0,
-        cause="pixels return {p} of their light",
-        advice="check black level and exposures",
-    ),
-    Damage(
         name="irreciprocal",
         threshold=0.1,
         compensation_limit=NOISE_ALONE,
-        cause="T is not reciprocal to {p}, as of gloss",
+        cause="T is not reciprocal to {p}, perhaps by gloss",
         advice="bounces are approximate",
     ),
     Damage(
@@ -138,14 +148,20 @@ DAMAGES = (
         name="bounces",
         threshold=0.05,
         compensation_limit=NOISE_ALONE,
-        cause="{which} uncertain to {p} because of noise{where}",
+        cause="{noisy} uncertain to {p} because of noise{where}",
         advice="{more}",
+    ),
+    Damage(
+        name="bounce_highest",
+        threshold=1.0,
+        cause="pixels return {p} of their light",
+        advice="check black level and exposures",
     ),
     Damage(
         name="negative_bounce",
         threshold=0.005,
         compensation_limit=NOISE_ALONE,
-        cause="{p} of a bounce is negative, as of gloss",
+        cause="{p} of a bounce is negative, perhaps by gloss",
         advice="bounces are rough",
     ),
     Damage(
@@ -153,7 +169,7 @@ DAMAGES = (
         threshold=0.0,
         compensation_limit=NOISE_ALONE,
         cause="bounces need one grid for camera and projector",
-        advice="acquire T so",
+        advice="bring T onto it by 'ltcl align', or ltcl.align(T)",
     ),
     Damage(
         name="dark",
@@ -163,10 +179,18 @@ DAMAGES = (
         cause="{p} of projector pixels{where} stay unlit, too dark",
         advice="expose them longer",
     ),
+    Damage(
+        name="spread",
+        threshold=0.05,
+        compensation_limit=NOISE_ALONE,
+        cause="the first bounce, diag(T) or 1 / diag(T^-1), makes a difference of {p} in {spread}",
+        advice="give first_bounce='exact'",
+    ),
 )
-# Relative standard deviation of a bounce that makes it uncertain.
+# Relative deviation of a bounce, by noise or by the choice of the first bounce, that makes it
+# uncertain.
 BOUNCES_THRESHOLD = 0.05
 # Damages that cause most others, which are then not named.
-OF_GEOMETRY = frozenset({"other_grid", "exchanged", "shifted"})
+CAUSING_OTHERS = frozenset({"other_grid", "exchanged", "shifted", "quantized"})
 # Damages that are named only if nothing else is wrong, as the scene may be the cause.
-OF_SURFACES = frozenset({"bounce_highest", "irreciprocal", "negative_bounce"})
+OF_SURFACES = frozenset({"bounce_highest", "irreciprocal", "negative_bounce", "spread"})

@@ -17,23 +17,31 @@ import numpy as np
 
 from ltcl.transport import diagnostics
 from ltcl.transport.covariance import channel_matrices
+from ltcl.transport.diagnostics.choice import bounce_spread, solved_system
 from ltcl.transport.first_bounce import ENTRIES
 from ltcl.transport.transport import Transport
 from ltcl.transport.uncertainty import bounce_variances
 from ltcl.transport.verdict.colours import exchanged_colours
+from ltcl.transport.verdict.detail import LightDetail
 from ltcl.transport.verdict.host_system import HostErrors, HostSystem
+from ltcl.transport.verdict.nearest_system import nearest_system
 from ltcl.transport.verdict.row_sample import RowSample
+from ltcl.transport.verdict.saturation import quantization, saturated_entries
 
 # Fewer pixels tell neither parts of the picture nor noise.
 MIN_PIXELS = 64
-# Median of |x| to the standard deviation of normal x.
-MEDIAN_PER_STD = 0.6745
 # Factor of a standard deviation that was estimated.
 NOISE_MARGIN = 1.5
 # Share of pixels that a plain picture reaches.
 REACHED_SHARE = 0.9
-# Noise of indirect light, relative to it, from which on a drift is not seen.
-MAX_DRIFT_NOISE = 0.3
+# Direct light above the median of its column, to that of the median pixel: a pixel with less lights
+# nothing, if its column is not twice as bright where it should be either.
+DEAD_SHARE = 0.02
+DEAD_RATIO = 2.0
+# Offsets of rows, in pictures, from which on they are told from gains of columns.
+OFFSET_SHARE = 0.002
+# Quantile of the pixels that tells the largest albedo: a few pixels may be damaged.
+ALBEDO_QUANTILE = 0.98
 MIN_LIGHT = 1e-300
 
 
@@ -57,10 +65,13 @@ class Evidence:
             is_stored = hasattr(matrix, "row_blocks")
             self.matrices.append(matrix.tocsr() if is_stored else matrix)
         self.systems: list[HostSystem] = []
+        self.is_dark = T.masked
         if T.is_square:
             F = np.atleast_2d(T.first_bounce)
+            for matrix in self.matrices:
+                self.is_dark = self.is_dark | _dead_pixels(matrix)
             for channel, matrix in enumerate(self.matrices):
-                self.systems.append(HostSystem(matrix, F[channel]))
+                self.systems.append(HostSystem(matrix, np.where(self.is_dark, 0.0, F[channel])))
         self.errors = HostErrors(T, self.matrices, self.systems)
 
     def measures(self) -> Iterator[Measure]:
@@ -70,17 +81,31 @@ class Evidence:
         yield from self._measure_order()
         for channel in range(T.channels):
             yield from self._measure_pictures(channel)
-            if self._shows_damages(channel):
-                yield from self._measure_damages(channel)
+            yield from self._measure_range(channel)
+        yield from self.damages()
         if T.is_square:
             yield from self._measure_bounces()
-            place = describe_place(T.grid, np.flatnonzero(T.masked))
-            yield Measure("dark", T.masked.mean(), place)
+            place = describe_place(T.grid, np.flatnonzero(self.is_dark))
+            yield Measure("dark", self.is_dark.mean(), place)
 
-    def _shows_damages(self, channel: int) -> bool:
-        """True if the entries of a channel are read, and are enough."""
-        has_entries = isinstance(self.matrices[channel], ENTRIES)
-        return self.T.is_square and has_entries and len(self.T.masked) >= MIN_PIXELS
+    def damages(self) -> Iterator[Measure]:
+        """Numbers of damages of every channel, if the entries are read, and are enough."""
+        if not self.T.is_square:
+            nearest = nearest_system(self.T)
+            if nearest is not None:
+                yield from Evidence(nearest).damages()
+            return
+        for channel, matrix in enumerate(self.matrices):
+            if isinstance(matrix, ENTRIES) and len(self.T.masked) >= MIN_PIXELS:
+                yield from self._measure_damages(channel)
+
+    def _measure_range(self, channel: int) -> Iterator[Measure]:
+        """Entries at the upper end of the camera's range, and the steps of its codes."""
+        matrix = self.matrices[channel]
+        if isinstance(matrix, ENTRIES) and min(self.T.shape) >= MIN_PIXELS:
+            count, pixels = saturated_entries(matrix)
+            yield Measure("saturated", count, describe_place(self.T.camera_grid, pixels))
+            yield Measure("quantized", quantization(matrix))
 
     def _measure_order(self) -> Iterator[Measure]:
         """Another grid, and exchanged colours."""
@@ -122,9 +147,10 @@ class Evidence:
         yield self._relative_error("pictures", channel, gain * plain, deviation)
 
     def _measure_bounces(self) -> Iterator[Measure]:
-        """Errors of bounces 1 to 3 under white."""
+        """Errors of bounces 1 to 3 under white, and their change by the choice of F."""
         random = np.random.default_rng(0)
         for channel, S in enumerate(self.systems):
+            yield from self._measure_spread(S)
             bounces = [S.F]
             for _ in range(3):
                 b = bounces[-1]
@@ -136,6 +162,15 @@ class Evidence:
                 error = self._relative_error(f"bounce_{k}", channel, bounces[k], deviations[:, k])
                 yield error
                 yield error._replace(name="bounces")
+
+    def _measure_spread(self, S: HostSystem) -> Iterator[Measure]:
+        """The change of bounces by the choice of F; it counts where F is diag(T)."""
+        system = solved_system(S.T, S.F, S.matmat, S.solve)
+        spread = bounce_spread(system, S.F)
+        for k, value in enumerate(spread.tolist(), 1):
+            yield Measure(f"spread_{k}", value)
+        is_diagonal = np.allclose(system.diagonal, 1.0, rtol=1e-6)
+        yield Measure("spread", spread.max() if is_diagonal else 0.0)
 
     def _relative_error(
         self, name: str, channel: int, light: np.ndarray, deviation: np.ndarray
@@ -162,38 +197,30 @@ class Evidence:
         grid = self.T.grid
         S = self.systems[channel]
         yield Measure("ambient", diagnostics.ambient(S.solve, grid))
-        yield Measure("flicker", self._drift(channel))
+        detail = LightDetail(S, self.errors, channel, grid)
+        offset = detail.row_offset()
+        yield Measure("row_offset", offset)
+        yield Measure("flicker", detail.column_gain(offset > OFFSET_SHARE))
+        yield from self._measure_energy(S)
         sample = RowSample(self.T, S, channel)
         share, move = sample.shifted()
         yield Measure("shifted", share, move)
         hot = sample.hot_pixels()
         yield Measure("hot_rows", len(hot), describe_place(grid, hot))
-        entries, saturated = sample.saturated_entries()
-        yield Measure("saturated", entries, describe_place(grid, saturated))
         yield Measure("offset", sample.negative_offset())
         share, outliers = sample.outliers()
         yield Measure("outliers", share, describe_place(grid, outliers))
         yield Measure("irreciprocal", self._irreciprocity(channel, sample))
 
-    def _drift(self, channel: int) -> float:
-        """Relative change of smooth light from column to column, beyond noise."""
-        S = self.systems[channel]
-        ones = np.ones(self.T.shape[1])
-        deviation = self.errors.deviation(channel, ones)
-        direct_deviation = self.noise.diagonal(self.T.first_bounce)[channel]
-        is_lit = S.F > 0
-        # Bounced light under white, in units of F.
-        indirect = np.maximum((S.T @ ones - S.T.diagonal()) * S.inverse_F, 1e-30)
-        logs = np.log(np.where(is_lit, indirect, np.nan)).reshape(self.T.grid)
-        detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0
-        doubt = np.hypot(deviation / indirect, direct_deviation + direct_deviation / indirect)
-        noise = NOISE_MARGIN * np.median(doubt[is_lit] * S.inverse_F[is_lit])
-        if not noise < MAX_DRIFT_NOISE:
-            return 0.0
-        # One 0, so that the median exists.
-        known = np.append(detail[np.isfinite(detail)], 0.0)
-        change = float(np.median(np.abs(known))) / MEDIAN_PER_STD
-        return math.sqrt(max(change**2 - noise**2, 0.0))
+    def _measure_energy(self, S: HostSystem) -> Iterator[Measure]:
+        """Share of light that a bounce takes away, and the largest one that a pixel returns."""
+        between = diagnostics.between_parts(S.solve, self.T.grid, diagnostics.PARTS_PER_SIDE)
+        light = max(float(np.nansum(np.abs(between))), MIN_LIGHT)
+        negative = float(np.nansum(np.maximum(-between, 0.0)))
+        yield Measure("negative_bounce", negative / light)
+        ones = np.ones((len(S.F), 1))
+        returned = (ones - S.solve(ones))[S.F > 0]
+        yield Measure("bounce_highest", float(np.quantile(returned, ALBEDO_QUANTILE)))
 
     def _irreciprocity(self, channel: int, sample: RowSample) -> float:
         """The defect of reciprocity beyond that of noise, both of F^-1/2 R F^1/2."""
@@ -207,6 +234,18 @@ class Evidence:
         expected = min(NOISE_MARGIN**2 * noise_power / max(power, MIN_LIGHT), 1.0)
         defect = diagnostics.reciprocity_defect(S.T, S.F, entries=diagnostics.QUICK_ENTRIES)
         return math.sqrt(max(defect**2 - expected, 0.0))
+
+
+def _dead_pixels(matrix: Any) -> np.ndarray:
+    """Projector pixels (N,) that light nothing, though their column holds ambient light."""
+    if not isinstance(matrix, np.ndarray):
+        # Most entries of a sparse column are 0.
+        return np.zeros(matrix.shape[1], bool)
+    direct = matrix.diagonal()
+    typical = np.median(matrix, axis=0)
+    above = direct - typical
+    is_dim = above < DEAD_SHARE * np.median(above)
+    return is_dim & (direct < DEAD_RATIO * typical)
 
 
 def describe_place(grid: tuple[int, int], pixels: np.ndarray, F: np.ndarray | None = None) -> str:

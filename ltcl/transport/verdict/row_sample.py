@@ -20,8 +20,6 @@ PARTS_PER_ROW = 6
 HOT_ROW_RATIO = 5.0
 # Least light of a part of a hot row, to the mean of all parts.
 HOT_ROW_EVENNESS = 0.5
-# Share of different values among first bounces: without noise, values repeat everywhere.
-MEASURED_SHARE = 0.9
 # Quantile of the parts that tells an offset, and standard deviations of noise below 0.
 OFFSET_QUANTILE = 0.02
 OFFSET_SIGMAS = 5.0
@@ -58,7 +56,6 @@ class RowSample:
         self.direct = self.rows[index, self.pixels].copy()
         self._brightest = self.rows.argmax(axis=1)
         self._brightest_light = self.rows[index, self._brightest]
-        self._top_counts = (self.rows == self.direct.max()).sum(axis=1)
         others = self.rows.sum(axis=1) - self.direct
         self.rows[index, self.pixels] = others / max(N - 1, 1)
         self._average_parts()
@@ -103,14 +100,6 @@ class RowSample:
     def hot_pixels(self) -> np.ndarray:
         """Camera pixels that see all patterns alike."""
         return self.pixels[self.is_hot]
-
-    def saturated_entries(self) -> tuple[int, np.ndarray]:
-        """Number of entries as bright as the brightest direct light, and their camera pixels."""
-        counts = np.where(self.is_hot, 0, self._top_counts)
-        lower = self.direct[self.direct < self.direct.max()]
-        is_measured = len(np.unique(lower)) > MEASURED_SHARE * len(lower)
-        total = int(counts.sum()) if is_measured else 0
-        return total, self.pixels[counts > 0]
 
     def negative_offset(self) -> float:
         """Light below 0 of the darkest blocks, beyond noise, over the mean of all blocks."""

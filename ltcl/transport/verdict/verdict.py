@@ -2,11 +2,14 @@
 """The verdict on a measured T: two sentences that follow from numbers.
 
 T is good for compensation if errors by noise are at most 2 % in pictures, for bounces if they are
-at most 5 % in bounces 1 to 3, and if no damage spoils the use (`ltcl.transport.verdict.damages`).
-The numbers come from T itself (`ltcl.transport.verdict.evidence`) and from the caller.
+at most 5 % in bounces 1 to 3, as is their change by the choice of the first bounce, and if no
+damage spoils the use (`ltcl.transport.verdict.damages`). The numbers come from T itself
+(`ltcl.transport.verdict.evidence`) and from the caller.
 
-Known limits: T alone cannot show damages that another scene would explain as well: a gain of
-entries, camera pixels or colours; light that changes slowly during a scan (`sum_deviation` shows
+Known limits: bounces are those of light between surfaces that the projector lights and that are
+matt; light from other surfaces, gloss that T does not show as such, and light that returns to its
+own pixel are unknown. T alone cannot show damages that another scene would explain as well: a gain
+of entries, camera pixels or colours; light that changes slowly during a scan (`sum_deviation` shows
 it); saturation without noise; three channels exchanged as a whole; light of one colour in another
 without `mixing` or blocks; little ambient light, or any if gloss has bounces below 0.
 """
@@ -23,13 +26,15 @@ from ltcl.errors import InputError
 from ltcl.transport.transport import Transport, check_transport
 from ltcl.transport.verdict.damages import (
     BOUNCES_THRESHOLD,
+    CAUSING_OTHERS,
     DAMAGES,
-    OF_GEOMETRY,
     OF_SURFACES,
     Damage,
 )
 from ltcl.transport.verdict.evidence import MIN_PIXELS, Evidence, Measure
 
+# What T shows of bounces.
+BOUNCES_AS_EXPLAINED = "bounces as far as light between lit, matt surfaces explains T"
 # Four times as many exposures halve an error by noise.
 HALVING_EXPOSURES = 4.0
 
@@ -44,7 +49,8 @@ class Verdict:
         At most two sentences.
     compensation, bounces : bool or None
         Whether T is good for them: errors by noise are at most 2 % in pictures, 5 % in bounces 1 to
-        3, and no damage spoils them. None if that is unknown.
+        3, the choice of the first bounce changes these by at most 5 %, and no damage spoils them.
+        Bounces are good as far as light between lit, matt surfaces explains T. None if unknown.
     causes : tuple of str
         Names of those `numbers` that deviate, most important first; docs/reference/json.md lists
         them.
@@ -83,20 +89,21 @@ def verdict(T: Transport, **known: float) -> Verdict:
     ----------
     T : Transport
     known : float
-        Further numbers: `negative_bounce` and `bounce_highest` of `ltcl.analyze`; `sum_deviation`
-        and `saturation`, a share of the camera's pixels, of a scan. NaN does not count.
+        Further numbers, such as `sum_deviation` and `saturation`, a share of the camera's pixels,
+        of a scan. NaN does not count.
 
     Examples
     --------
     >>> import ltcl
-    >>> verdict(ltcl.scenes.dihedral(8, albedo=0.6).transport()).text.split(".")[0]
-    'Good for compensation and for bounces'
+    >>> T = ltcl.scenes.dihedral(8, albedo=0.6).transport(first_bounce="exact")
+    >>> verdict(T).text.split(".")[0]
+    'Good for compensation, and for bounces as far as light between lit, matt surfaces explains T'
     """
     numbers = {name: value for name, value in known.items() if not math.isnan(value)}
     places: dict[str, str] = {}
     try:
         check_transport(T, square=False)
-        _check_enough_pixels(T)
+        _check_noise_is_known(T)
         for measure in Evidence(T).measures():
             _keep_worst(measure, numbers, places)
     except (InputError, np.linalg.LinAlgError) as error:
@@ -105,11 +112,13 @@ def verdict(T: Transport, **known: float) -> Verdict:
     return _judge(numbers, places)
 
 
-def _check_enough_pixels(T: Transport) -> None:
-    if T.noise.source == "estimated" and min(T.shape) < MIN_PIXELS:
+def _check_noise_is_known(T: Transport) -> None:
+    if not T.noise.is_measured and min(T.shape) < MIN_PIXELS:
         raise InputError(
             f"fewer than {MIN_PIXELS} pixels do not tell their noise: use ltcl analyze --noise"
         )
+    if T.noise.source == "unknown":
+        raise InputError("T does not show its noise: use ltcl analyze --noise")
 
 
 def _keep_worst(measure: Measure, numbers: dict[str, float], places: dict[str, str]) -> None:
@@ -130,16 +139,20 @@ def _keep_worst(measure: Measure, numbers: dict[str, float], places: dict[str, s
 
 
 def _judge(numbers: dict[str, float], places: Mapping[str, str]) -> Verdict:
-    uncertain = _uncertain_bounces(numbers)
+    uncertain = {
+        "bounces": _uncertain_bounces(numbers, "bounce"),
+        "spread": _uncertain_bounces(numbers, "spread"),
+    }
     findings = _find_damages(numbers, places, uncertain)
     # Those that spoil a use first.
     findings.sort(key=lambda finding: not finding.spoils)
     spoils_compensation = [finding.name for finding in findings if finding.spoils_compensation]
     spoils_bounces = [finding.name for finding in findings if finding.spoils_bounces]
     refused = "bounces"
-    if spoils_bounces == ["bounces"]:
-        # Only noise spoils them: others of the bounces are good.
-        refused = _name_bounces(uncertain)
+    if set(spoils_bounces) <= set(uncertain):
+        # Other bounces are good.
+        refused_numbers = [k for name in spoils_bounces for k in uncertain[name]]
+        refused = _name_bounces(sorted({*refused_numbers}))
     is_good_for_compensation = not spoils_compensation
     is_good_for_bounces = not spoils_bounces
     uses = _describe_uses(is_good_for_compensation, is_good_for_bounces, refused)
@@ -155,11 +168,11 @@ def _judge(numbers: dict[str, float], places: Mapping[str, str]) -> Verdict:
 def _describe_uses(compensation: bool, bounces: bool, refused: str) -> str:
     """First sentence of the text; `refused` names the bounces that T is not good for."""
     if compensation and bounces:
-        return "Good for compensation and for bounces"
+        return f"Good for compensation, and for {BOUNCES_AS_EXPLAINED}"
     if compensation:
         return f"Good for compensation, not for {refused}"
     if bounces:
-        return "Good for bounces, not for compensation"
+        return f"Good for {BOUNCES_AS_EXPLAINED}, not for compensation"
     return f"Not good for compensation or {refused}"
 
 
@@ -167,8 +180,14 @@ def _explain(findings: list[Finding], numbers: Mapping[str, float]) -> str:
     """Second sentence: the first damage, advice, and the second damage; or the errors by noise."""
     if not findings:
         pictures = _round_percent(numbers.get("pictures", 0.0))
-        bounces = _round_percent(numbers.get("bounces", 0.0))
-        return f"Errors by noise are {pictures} in pictures and {bounces} in bounces at most"
+        text = f"Errors by noise are {pictures} in pictures"
+        if "bounces" in numbers:
+            spread = max(numbers[f"spread_{k}"] for k in (1, 2, 3))
+            text += (
+                f" and {_round_percent(numbers['bounces'])} in bounces at most; the choice of the "
+                f"first bounce makes {_round_percent(spread)} in bounces"
+            )
+        return text
     first = findings[0]
     text = f"{first.cause}: {first.advice}"
     text = text[0].upper() + text[1:]
@@ -178,18 +197,17 @@ def _explain(findings: list[Finding], numbers: Mapping[str, float]) -> str:
 
 
 def _find_damages(
-    numbers: Mapping[str, float], places: Mapping[str, str], uncertain: list[int]
+    numbers: Mapping[str, float], places: Mapping[str, str], uncertain: Mapping[str, list[int]]
 ) -> list[Finding]:
     """The damages that numbers show, most important first.
 
-    Damages that an earlier one explains are left out: most by one of geometry, those of surfaces by
-    any.
+    Damages that an earlier one explains are left out: those of surfaces by any.
     """
     findings = []
     spoilers: set[str] = set()
     for damage in DAMAGES:
         value = numbers.get(damage.name, 0.0)
-        explanations = spoilers if damage.name in OF_SURFACES else spoilers & OF_GEOMETRY
+        explanations = spoilers if damage.name in OF_SURFACES else spoilers & CAUSING_OTHERS
         if value <= damage.threshold or explanations:
             continue
         finding = _describe(damage, value, places.get(damage.name, ""), uncertain)
@@ -199,13 +217,17 @@ def _find_damages(
     return findings
 
 
-def _describe(damage: Damage, value: float, place: str, uncertain: list[int]) -> Finding:
-    verb = "are" if len(uncertain) > 1 else "is"
+def _describe(
+    damage: Damage, value: float, place: str, uncertain: Mapping[str, list[int]]
+) -> Finding:
+    noisy = uncertain["bounces"]
+    verb = "are" if len(noisy) > 1 else "is"
     facts = {
         "p": _round_percent(value),
         "n": _round(value),
         "where": place,
-        "which": f"{_name_bounces(uncertain)} {verb}",
+        "noisy": f"{_name_bounces(noisy)} {verb}",
+        "spread": _name_bounces(uncertain["spread"]),
         "more": _advise_exposures(value, damage.threshold),
     }
     return Finding(
@@ -226,11 +248,11 @@ def _advise_exposures(error: float, threshold: float) -> str:
     return f"{_round(exposures)} times as many exposures would bring that to {goal}"
 
 
-def _uncertain_bounces(numbers: Mapping[str, float]) -> list[int]:
-    """The bounces, of 1 to 3, with too large an error by noise."""
+def _uncertain_bounces(numbers: Mapping[str, float], name: str) -> list[int]:
+    """The bounces, of 1 to 3, whose number of this name is too large."""
     uncertain = []
     for k in (1, 2, 3):
-        if numbers.get(f"bounce_{k}", 0.0) > BOUNCES_THRESHOLD:
+        if numbers.get(f"{name}_{k}", 0.0) > BOUNCES_THRESHOLD:
             uncertain.append(k)
     return uncertain
 

@@ -36,7 +36,7 @@ def write_dng(path: Path, raw: np.ndarray, seconds: float, **sides: int) -> None
         257: sides.get("h", h),
         258: 16,
         259: 1,  # no compression
-        262: 32803,  # a colour filter array
+        262: sides.get("photometric", 32803),  # a colour filter array
         273: 0,  # Pillow adds the length of the directory
         274: 6,  # held upright: must not turn the pixels
         279: 2 * h * w,

@@ -176,9 +176,7 @@ def test_the_largest_gain(device, kind):
     assert 0.028 < more.error <= 0.03 * (1 + 1e-4)
 
 
-@pytest.mark.parametrize(
-    "use", [attrgetter("first_bounce"), attrgetter("interreflection"), ltcl.analyze]
-)
+@pytest.mark.parametrize("use", [attrgetter("first_bounce"), attrgetter("interreflection")])
 def test_blocks_have_no_S_of_one_colour(device, use):
     T = transport("blocks", device)
     with pytest.raises(InputError, match=r"T .*blocks"):

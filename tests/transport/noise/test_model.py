@@ -95,20 +95,22 @@ def dark(T: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("change", "upper"),
+    ("change", "lower", "upper"),
     [
-        (lambda T, grid: ltcl.Transport(T, grid), 1.5),
-        (lambda T, grid: ltcl.Transport(scipy.sparse.csr_array(T), grid), 1.5),
-        (lambda T, grid: ltcl.Transport([T, T, T], grid), 1.5),
-        (lambda T, grid: ltcl.Transport(T[:100], grid, camera_grid=(10, 10)), 1.5),
-        (lambda T, grid: ltcl.Transport(dark(T), grid), 1.5),
-        (lambda T, grid: ltcl.Transport(np.maximum(T, 0.0), grid), 1.5),
-        (lambda T, grid: ltcl.Transport(T, (1, 128)), 1.5),
+        (lambda T, grid: ltcl.Transport(T, grid), 0.67, 1.5),
+        (lambda T, grid: ltcl.Transport(scipy.sparse.csr_array(T), grid), 0.67, 1.5),
+        (lambda T, grid: ltcl.Transport([T, T, T], grid), 0.67, 1.5),
+        (lambda T, grid: ltcl.Transport(T[:100], grid, camera_grid=(10, 10)), 0.67, 1.5),
+        (lambda T, grid: ltcl.Transport(dark(T), grid), 0.67, 1.5),
+        # Dim entries have 0.58 of the deviation without their negative half.
+        (lambda T, grid: ltcl.Transport(np.maximum(T, 0.0), grid), 0.5, 1.5),
+        (lambda T, grid: ltcl.Transport(T, (1, 128)), 0.67, 1.5),
         # Three standard deviations are a threshold: what stays is larger than the noise.
         (
             lambda T, grid: ltcl.Transport(
                 scipy.sparse.csr_array(np.where(T > 0.002, T, 0.0)), grid
             ),
+            0.5,
             4.0,
         ),
     ],
@@ -123,11 +125,11 @@ def dark(T: np.ndarray) -> np.ndarray:
         "thresholded",
     ],
 )
-def test_estimate_of_any_transport(change: Any, upper: float) -> None:
+def test_estimate_of_any_transport(change: Any, lower: float, upper: float) -> None:
     T, grid, floor = noisy()
     noise = change(T, grid).noise
     assert noise.source == "estimated"
-    assert np.all(noise.floor > floor / 1.5)
+    assert np.all(noise.floor > lower * floor)
     assert np.all(noise.floor < upper * floor)
 
 

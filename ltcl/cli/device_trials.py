@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Trials of a device: calls that launch every kernel on it, whose results NumPy confirms.
+
+Some drivers end the process that uses them, in one kernel out of thirty. So `ltcl doctor` runs this
+module in a child process, which prints a line of JSON when a trial starts, and one when it ends.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import typer
+
+from ltcl import scenes
+from ltcl.cli.doctor import run_check
+from ltcl.cli.reports.program import Check
+from ltcl.device import Device, open_device
+from ltcl.errors import DeviceError
+from ltcl.operators import (
+    CSR,
+    Compressed,
+    Dense,
+    IdentityPlus,
+    Operator,
+    Pyramid,
+    ScaledColumns,
+    SubsetBasis,
+    Tiles,
+    Wavelet,
+)
+from ltcl.scenes.visibility import visibility
+from ltcl.solvers.bounded import minimise
+from ltcl.solvers.solve import METHODS, SAMPLED, solve
+
+# Relative errors; solves are to 1 %.
+LIMITS = {"product": 1e-4, "solve": 0.02}
+SAMPLES = 4096
+# Right-hand sides: 4 in one launch, and 1.
+COLUMNS = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A call on a device, and what NumPy says of it; `kind` has a limit in `LIMITS`."""
+
+    kind: str
+    name: str
+    call: Callable[[], Any]
+    truth: np.ndarray
+
+    def check(self, fix: str) -> Check:
+        """Run the call, and compare."""
+        return run_check(f"{self.kind}, {self.name}", self._compare, fix)
+
+    def _compare(self) -> str:
+        result = self.call()
+        # A solve returns a Solution.
+        values = getattr(result, "x", result)
+        error = np.linalg.norm(values - self.truth) / np.linalg.norm(self.truth)
+        limit = LIMITS[self.kind]
+        if not error < limit:
+            raise DeviceError(f"differs from NumPy by {error:.1e}; it must be below {limit:g}")
+        return f"agrees with NumPy to {error:.1e}"
+
+
+def trials(device: Device) -> Iterator[Trial]:
+    """All trials: products of each kind of operator, and solves by each method."""
+    scene = scenes.dihedral(4, albedo=0.3)
+    S = np.asarray(scene.transport(device=device).systems[0].to_dense())
+    random = np.random.default_rng(0)
+    x = random.random((len(S), COLUMNS))
+    for name, (A, matrix) in _operators(device, scene, S).items():
+        y = random.random((matrix.shape[0], COLUMNS))
+        yield Trial(
+            kind="product",
+            name=name,
+            call=partial(_both_products, A, x, y),
+            truth=np.vstack([matrix @ x, matrix.T @ y]),
+        )
+    W = Wavelet(device, scene.grid, "db2")
+    yield Trial(kind="product", name="wavelet", call=lambda: W.T @ (W @ x), truth=x)
+    yield Trial(
+        kind="product", name="visibility", call=partial(_visibility, device), truth=np.eye(2)
+    )
+    yield from _solves(device, S, x[:, 0])
+
+
+def _operators(device: Device, scene: Any, S: np.ndarray) -> dict[str, tuple[Operator, np.ndarray]]:
+    """Operators of each format, and the matrices that they must agree with."""
+    R = scipy.sparse.csr_array(S - np.eye(len(S)))
+    scale = np.linspace(0.5, 1.0, len(S))
+    order = np.arange(len(S))[::-2]
+    operators: dict[str, tuple[Any, Any]] = {
+        "sparse": (CSR(device, R), R.toarray()),
+        "dense": (Dense(device, S), S),
+        "pyramid": (Pyramid(device, scene.grid), _cells(*scene.grid)),
+        "scaled columns": (ScaledColumns(CSR(device, R), scale, 1.0), R * scale - np.eye(len(S))),
+        "subset": (SubsetBasis(device, scene.grid, order), np.eye(len(S))[order]),
+    }
+    patches = scenes.cut(scene.walls, 4)
+    form_factor = scenes.FormFactor(patches, albedo=0.3, device=device)
+    operators["form factor"] = (form_factor, scene.A)
+    for width, precision in ((8, "float32"), (1, "float16"), (8, "int8")):
+        tiles = Tiles(device, R, width, precision)
+        operators[f"tiles of {width}, {precision}"] = (tiles, tiles.to_dense())
+    return operators
+
+
+def _cells(height: int, width: int) -> np.ndarray:
+    """The matrix of `Pyramid`, for sides that are powers of two."""
+    levels = []
+    size = 1
+    while size < 2 * max(height, width):
+        rows = np.kron(np.eye(max(height // size, 1)), np.ones(min(size, height)))
+        columns = np.kron(np.eye(max(width // size, 1)), np.ones(min(size, width)))
+        levels.append(np.kron(rows, columns))
+        size *= 2
+    return np.vstack(levels)
+
+
+def _both_products(A: Operator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.vstack([A @ x, A.T @ y])
+
+
+def _visibility(device: Device) -> np.ndarray:
+    """What two opposite walls see of each other past a screen."""
+    walls = scenes.box(1, sides=6).walls
+    screen = [[(0.4, -1, -1), (0.6, 2, 2)]]
+    return visibility(scenes.cut((walls[1], walls[5]), 1), screen, device)
+
+
+def _solves(device: Device, S: np.ndarray, x: np.ndarray) -> Iterator[Trial]:
+    """Solves of S x = b by each method, and by variants that have kernels of their own."""
+    R = scipy.sparse.csr_array(S - np.eye(len(S)))
+    sparse = IdentityPlus(CSR(device, R))
+    dense = IdentityPlus(Dense(device, R.toarray()))
+    # A format that has no kernel for a step of an iteration.
+    composed = IdentityPlus(Compressed(CSR(device, R), None, None))
+    b = S @ x
+    for method in METHODS:
+        options = {"samples": SAMPLES} if method in SAMPLED else {}
+        yield _solve_trial(method, sparse, b, x, method, **options)
+    for method in ("gauss_seidel", "southwell"):
+        yield _solve_trial(f"{method}, dense", dense, b, x, method)
+    yield _solve_trial("richardson, composed", composed, b, x, "richardson")
+    yield _solve_trial(
+        "monte_carlo, adjoint", sparse, b, x, "monte_carlo", samples=SAMPLES, adjoint=True
+    )
+    colours = np.stack([x, 2.0 * x, 3.0 * x])
+    yield _solve_trial(
+        "hybrid, colours", [sparse] * 3, colours @ S.T, colours, "hybrid", samples=SAMPLES
+    )
+    yield Trial(kind="solve", name="bounded", call=partial(_bounded, dense, b), truth=x[:, None])
+
+
+def _solve_trial(
+    name: str, system: Any, b: np.ndarray, x: np.ndarray, method: str, **options: Any
+) -> Trial:
+    call = partial(solve, system, b, method, rtol=1e-2, **options)
+    return Trial(kind="solve", name=name, call=call, truth=x)
+
+
+def _bounded(system: Operator, b: np.ndarray) -> Any:
+    n = len(b)
+    return minimise(system, b[:, None], np.zeros(n), np.ones(n), np.zeros((n, 1)))
+
+
+def main(index: str, fix: str) -> None:
+    """Run all trials on the device of this index, and print them as lines of JSON."""
+    device = open_device(index)
+    for trial in trials(device):
+        typer.echo(json.dumps({"started": f"{trial.kind}, {trial.name}"}))
+        typer.echo(json.dumps(asdict(trial.check(fix))))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
