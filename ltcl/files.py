@@ -402,7 +402,7 @@ def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
             raise FileError(f"{target}: {name} cannot be placed there, a name in its path is used")
     folders = set()
     for file, destination in zip(files, destinations, strict=True):
-        _make_folders(destination.parent)
+        make_folders(destination.parent)
         os.replace(file, destination)
         folders.add(destination.parent)
     for folder in folders:
@@ -419,7 +419,7 @@ def _place_to_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(os.path.realpath(as_path(path)))
     created = _missing_folders(target.parent)
     try:
-        _make_folders(target.parent)
+        make_folders(target.parent)
         yield target
     except BaseException as error:
         _remove_empty(created)
@@ -443,7 +443,7 @@ def _missing_folders(folder: Path) -> list[Path]:
     return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
 
 
-def _make_folders(folder: Path) -> None:
+def make_folders(folder: Path) -> None:
     """Make a folder and its missing parents, each flushed into the one that holds it."""
     missing = _missing_folders(folder)
     folder.mkdir(parents=True, exist_ok=True)

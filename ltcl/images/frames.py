@@ -228,7 +228,7 @@ def write_video(
         The extension is unknown, or the file cannot be written.
     """
     # The import takes a while.
-    import av
+    from av.error import FFmpegError
 
     path = as_path(path)
     fps = checks.number("fps", fps, above=0.0)
@@ -236,7 +236,7 @@ def write_video(
     with replace_file(path) as temporary:
         try:
             count = _encode_video(path, temporary, pictures, fps)
-        except av.error.FFmpegError as error:
+        except FFmpegError as error:
             raise FileError(f"{path}: cannot be encoded; perhaps the disk is full") from error
         if count == 0:
             raise InputError(f"{path}: there are no frames to write")

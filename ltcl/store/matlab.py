@@ -21,8 +21,8 @@ import scipy.io
 
 from ltcl import checks
 from ltcl.errors import FileError
-from ltcl.store.hdf5 import SparseGroup, Variable, assemble_members, read_hdf5
-from ltcl.store.record import EXTRAS, FileNames, StoreRecord
+from ltcl.store.hdf5 import SparseGroup, assemble_members, read_hdf5
+from ltcl.store.record import EXTRAS, FileNames, StoreRecord, Variable
 
 NAMES = FileNames(matrix="LTM", channels=("LTM_r", "LTM_g", "LTM_b"), is_reversed=True)
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +28,7 @@ from ltcl.store.record import (
     CompressedRecord,
     FileContents,
     StoreRecord,
+    Variable,
     assemble,
 )
 
@@ -46,9 +47,7 @@ MAX_DATA_DESCRIPTOR = 24
 Headers = dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
-def read_npz(
-    path: Path, variable: str | Sequence[str] | None = None
-) -> StoreRecord | CompressedRecord:
+def read_npz(path: Path, variable: Variable = None) -> StoreRecord | CompressedRecord:
     """Read an .npz; MemoryLimitError or FileError before any array that does not fit is made."""
     headers = _headers(path)
     with np.load(path, allow_pickle=False) as archive:

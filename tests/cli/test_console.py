@@ -8,12 +8,15 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 import ltcl
@@ -188,6 +191,25 @@ def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
     assert run.stderr == "ltcl: error: interrupted\n"
     if options:
         assert json.loads(run.stdout)["exit_code"] == 130
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_any_moment_is_one_line():
+    """From the moment at which Python imports ltcl, to the end; after that all is printed."""
+    words = [sys.executable, "-m", "ltcl", "devices"]
+    start = time.monotonic()
+    subprocess.run(words, capture_output=True, check=True)
+    duration = time.monotonic() - start
+    codes = set()
+    for share in np.linspace(0.15, 1.0, 18):
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(share * duration)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+        codes.add(process.returncode)
+        expected = {130: "ltcl: error: interrupted\n", 0: ""}
+        assert errors == expected[process.returncode]
+    assert 130 in codes
 
 
 def test_who_imports_ltcl_keeps_the_handlers_of_signals():

@@ -164,6 +164,16 @@ WRONG = [
 LISTS = [json.dumps({"format": "ltcl shooting list 1", "shots": shots}) for shots in WRONG]
 
 
+@pytest.mark.parametrize("damage", [b"", b"damaged", None])
+def test_a_damaged_pattern_is_written_again(tmp_path: Path, damage: bytes | None) -> None:
+    prepared(tmp_path)
+    pattern = tmp_path / "patterns/pattern_000001.png"
+    good = pattern.read_bytes()
+    pattern.write_bytes(good[:-20] if damage is None else damage)
+    prepared(tmp_path)
+    assert pattern.read_bytes() == good
+
+
 @pytest.mark.parametrize("content", BROKEN + LISTS)
 def test_a_damaged_list_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "shots.json").write_text(content, encoding="utf-8")
