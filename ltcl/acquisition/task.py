@@ -27,7 +27,7 @@ from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.scanning import adaptive, columns, plan
-from ltcl.acquisition.scanning.pictures import ScanCamera, ScanGrid
+from ltcl.acquisition.scanning.pictures import LAMP_GAIN, ScanCamera, ScanGrid
 from ltcl.acquisition.session import (
     ProgressFunction,
     check_same,
@@ -397,6 +397,7 @@ def _scan(
     strategy = store.attributes["strategy"]
     side = settings.block if strategy == "block" else 1
     camera = ScanCamera(shots, calibration, side)
+    camera.lamp_gain = store.attributes.get(LAMP_GAIN, 1.0)
     if strategy == "adaptive":
         _run_adaptive(store, camera, camera, settings, progress)
         return

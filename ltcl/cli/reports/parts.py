@@ -208,7 +208,7 @@ class VerdictNumbers(Report):
     )
     gain: Annotated[Measured, "Brightness of a plain picture within reach, over white."] = None
     negative_bounce: Annotated[
-        Measured, "Share of light that a bounce takes away. Good up to 0.005."
+        Measured, "Light that a bounce takes away, beyond noise. Good up to 0.005."
     ] = None
     bounce_highest: Annotated[
         Measured, "Light that 98 % of pixels return, at most. Good up to 1."
