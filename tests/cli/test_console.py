@@ -172,6 +172,7 @@ def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, nam
     assert json.loads(printed[1])[0]["file"] == str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["numpy", "scipy", "typer"])
 @pytest.mark.parametrize("options", [[], ["--json"]])
 def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
