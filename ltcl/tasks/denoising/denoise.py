@@ -39,6 +39,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     Returns
     -------
     Transport
+        T itself, with a warning, if its noise is unknown or its pictures would become worse. Else
         float32, on the same grid, with the same first bounce, mixing and masked pixels, without
         negative entries off the diagonal. Its `noise` is that of T, scaled to the estimated error
         of a picture under white; the first bounce itself has that of T, and errors of neighbours
