@@ -16,9 +16,9 @@ rendered from the projector's own place, where camera and projector pixels are t
 walls are equally bright from there. Pixels with all neighbours well seen count; at the outline of
 the walls a projector pixel is partly dark.
 
-If the photographs of a real set-up are beside the checkout, their Gray code is decoded: 42
-photographs, 1280 x 1024, of a chessboard under Gray code for 1024 x 768, and the calibration that
-their authors found, who count a step of the code as two projector pixels.
+With `--photographs FOLDER` Gray code of a real set-up is decoded: 42 photographs, 1280 x 1024, of a
+chessboard under Gray code for 1024 x 768, and the calibration that their authors found, who count a
+step of the code as two projector pixels.
 """
 
 from __future__ import annotations
@@ -77,12 +77,13 @@ ALBEDO = [(0.8, 0.8, 0.8), (0.4, 0.4, 0.4)]
 RENDERED_SIZE = 3.5
 BASELINE = 0.5
 TRUE_SAMPLES = 512
-FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "graycode-real"
 # The real set-up: projector pixels, projector pixels of a step of the authors' code, and the codes
 # that white shows more than black on a lit pixel.
 BOARD_GRID = (768, 1024)
 STEP = 2.0
 LIT_DIFFERENCE = 30
+
+ARGUMENTS = {"photographs": {"type": Path, "help": "folder of real photographs"}}
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -309,10 +310,8 @@ def rendered_loop(n: int, samples: int, patterns: np.ndarray, device: Device) ->
     )
 
 
-def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
+def photographed(folder: Path) -> dict[str, float | str]:
     """Decoded pixels, flatness of the board, and agreement with the authors' calibration."""
-    if not folder.is_dir():
-        return {"real photographs": f"left out, {folder.name} is not beside the checkout"}
     paths = sorted(folder.glob("graycode_*.png"))
     photographs = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
     *_, white, black = photographs
@@ -381,6 +380,7 @@ class Results:
     scans: list[Scan]
     at_random: list[Scan]
     loop: RenderedLoop | None
+    photographs: Path | None
 
     def claims(self) -> list[Claim]:
         """Check the accuracy of T, and the gain of compensation."""
@@ -407,7 +407,9 @@ class Results:
         else:
             shape = self.loop.pattern.shape
             facts["rendered corner"] = f"{shape}, {self.loop.photographs} photographs of the scan"
-        return facts | photographed()
+        if self.photographs is not None:
+            facts |= photographed(self.photographs)
+        return facts
 
 
 def askance_claim(scan: Scan) -> Claim:
@@ -537,7 +539,7 @@ def _percent(axes: Axes) -> None:
 
 def main() -> None:
     """Run the bench."""
-    options = parse_options(__doc__)
+    options = parse_options(__doc__, ARGUMENTS)
     run = partial(run_scan, options.device, corner(N))
     cameras = list(CAMERAS)
     sizes = SIZES
@@ -566,7 +568,8 @@ def main() -> None:
         squares = held_patterns(n).T.reshape(-1, n, n)
         patterns = squares[:, : 3 * n // 4].astype(np.float32)
         loop = rendered_loop(n, samples, patterns, options.device)
-    results = Results(scans=scans, at_random=at_random, loop=loop)
+    folder = options.arguments.photographs
+    results = Results(scans=scans, at_random=at_random, loop=loop, photographs=folder)
     title = "A camera that is not aligned with the projector"
     draw_results = partial(draw, results)
     figures.conclude(options, title, results.claims(), results.facts(), draw_results)

@@ -21,6 +21,10 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+# Before all that takes long: Ctrl-C while the program is imported.
+from ltcl.cli import interrupt as _interrupt  # noqa: F401
+
+# isort: split
 from ltcl import errors
 from ltcl.batch import cluster
 from ltcl.device import Device, list_devices, open_device
@@ -38,7 +42,7 @@ from ltcl.transport.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
-    from ltcl.acquisition import acquire
+    from ltcl.acquisition import acquire, align
     from ltcl.viewer import view
 
 __version__ = "0.1.0"
@@ -54,6 +58,7 @@ __all__ = [
     "Transport",
     "acquire",
     "acquisition",
+    "align",
     "analyze",
     "batch",
     "compensate",
@@ -89,7 +94,7 @@ _PUBLIC_PATHS = {
 sys.modules.update(_PUBLIC_PATHS)
 
 _LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
-_FUNCTIONS = {"acquire": "acquisition", "view": "viewer"}
+_FUNCTIONS = {"acquire": "acquisition", "align": "acquisition", "view": "viewer"}
 
 
 def __getattr__(name: str) -> Any:

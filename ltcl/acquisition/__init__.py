@@ -15,6 +15,7 @@ Codes in [0, 1] are fed to a projector and come from a camera; they are not line
 
 from __future__ import annotations
 
+from ltcl.acquisition.alignment import Alignment, align
 from ltcl.acquisition.calibration import Calibration, Setup
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.project import Project
@@ -34,6 +35,7 @@ from ltcl.acquisition.settings import ScanSettings
 from ltcl.acquisition.task import acquire, finalize
 
 __all__ = [
+    "Alignment",
     "Calibration",
     "Correspondence",
     "Display",
@@ -50,6 +52,7 @@ __all__ = [
     "Shots",
     "VirtualRig",
     "acquire",
+    "align",
     "camera_map",
     "finalize",
 ]

@@ -13,6 +13,7 @@ import typer
 from ltcl import __version__
 from ltcl.cli import (
     acquire,
+    align,
     analyze,
     compensate,
     convert,
@@ -54,6 +55,7 @@ PANELS: dict[str, list[Any]] = {
         info.info,
         analyze.analyze,
         convert.convert,
+        align.align,
         transform.compress,
         transform.invert,
         transform.denoise,

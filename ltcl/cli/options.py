@@ -152,7 +152,9 @@ OnDark = Annotated[
 ShowDark = Annotated[Path | None, file_option(SHOW_DARK_HELP, callback=check_writable_file)]
 Variable = Annotated[
     str | None,
-    transport_option("Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME"),
+    transport_option(
+        "Name of the matrix in a .mat, .h5 or .npz file, or three: red,green,blue.", metavar="NAME"
+    ),
 ]
 
 

@@ -48,13 +48,13 @@ class Decoded:
         (h, w) or (h, w, 3) RGB, on the pixels of the file.
     orientation : int
         Orientation of EXIF.
-    png : Header or None
+    png_header : Header or None
         Header of a PNG file, which may name a curve.
     """
 
     codes: np.ndarray
     orientation: int = UPRIGHT
-    png: png.Header | None = None
+    png_header: png.Header | None = None
 
 
 @contextlib.contextmanager

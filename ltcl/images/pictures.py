@@ -91,9 +91,9 @@ def read(
     if upright:
         codes = turn_upright(codes, picture.orientation)
     codes = np.ascontiguousarray(codes)
-    if encoding == "auto" and picture.png is not None:
+    if encoding == "auto" and picture.png_header is not None:
         with decoding(path):
-            power = png.power(picture.png)
+            power = png.power(picture.png_header)
         if power is not None:
             return to_linear(codes, "linear") ** np.float32(power)
     return to_linear(codes, encoding)

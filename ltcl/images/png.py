@@ -51,7 +51,7 @@ GAMMA_TOLERANCE = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """What the chunks of a PNG file say of its pixels."""
+    """Size, kind and chunks of a PNG file."""
 
     width: int
     height: int
@@ -146,8 +146,9 @@ def transparent_pixels(header: Header, codes: np.ndarray) -> int:
 
 
 def power(header: Header) -> float | None:
-    """Exponent from codes to light, by the chunk of highest rank; None for sRGB or a profile.
+    """Exponent from codes to light, by the chunk of highest rank; None for sRGB.
 
+    Programs that write a profile (iCCP) tell its exponent by gAMA as well.
     FileError for HDR and other curves that are no power.
     """
     chunks = header.chunks
@@ -160,7 +161,7 @@ def power(header: Header) -> float | None:
                 "convert it to sRGB, or give the encoding 'srgb' or 'linear'"
             )
         return POWERS.get(curve)
-    if b"iCCP" in chunks or b"sRGB" in chunks or b"gAMA" not in chunks:
+    if b"sRGB" in chunks or b"gAMA" not in chunks:
         return None
     gamma = struct.unpack(">I", chunks[b"gAMA"][0])[0] / 1e5
     if gamma <= 0 or abs(gamma - SRGB_GAMMA) < GAMMA_TOLERANCE:

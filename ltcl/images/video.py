@@ -99,14 +99,17 @@ class _Converter:
 
     def codes(self, frame: Any) -> np.ndarray:
         """BGR codes, (h, w, 3) uint8; FileError for a frame that is transparent or sheared."""
-        if frame.format.has_palette or any(part.is_alpha for part in frame.format.components):
-            transparent = np.count_nonzero(self._convert(frame, "bgra")[..., 3] != 255)
+        components = frame.format.components
+        if frame.format.has_palette or any(channel.is_alpha for channel in components):
+            alpha = self._convert(frame, "bgra")[..., 3]
+            transparent = np.count_nonzero(alpha != 255)
             if transparent:
                 raise FileError(
                     f"has {transparent} transparent pixel(s) in a frame, whose light is not known; "
                     "make them opaque"
                 )
-        return _turn_upright(self._convert(frame, "bgr24"), frame.side_data.get("DISPLAYMATRIX"))
+        matrix = frame.side_data.get("DISPLAYMATRIX")
+        return _turn_upright(self._convert(frame, "bgr24"), matrix)
 
     def _convert(self, frame: Any, format: str) -> np.ndarray:
         converted = self._reformatter.reformat(
@@ -250,7 +253,7 @@ class _Decoder:
 
 
 def ffv1_checksums_hold(packet: bytes) -> bool:
-    """Whether a packet is made of slices, each with its size and a CRC that makes all of it zero.
+    """True if a packet is made of slices, each with its size and a CRC that makes all of it zero.
 
     The CRC has its bits the other way round than that of zlib, and begins with zeros.
     """

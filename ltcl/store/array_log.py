@@ -31,7 +31,9 @@ class ArrayLog:
     def names(self) -> list[str]:
         """Names of all committed sets, by whatever process they were written."""
         with about(self.path):
-            files = os.listdir(self.path) if self.path.exists() else []
+            files = []
+            if self.path.exists():
+                files = os.listdir(self.path)
         matches = map(ENTRY_FILE.fullmatch, files)
         return sorted(match[1] for match in matches if match is not None)
 

@@ -325,7 +325,9 @@ class BlockStore:
     @property
     def _root(self) -> Path:
         """Folder where the files are read."""
-        return self.path if self._folder is None else self._folder.root
+        if self._folder is None:
+            return self.path
+        return self._folder.root
 
     def _open(self) -> None:
         """Read the document again, and pin the folder of a final store."""

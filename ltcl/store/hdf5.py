@@ -11,7 +11,7 @@ A file is written in memory first: HDF5 that finds a disk full ends the process.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,14 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import FileError
 from ltcl.store.guards import EXPANSION, check_declared, sparse_floats
-from ltcl.store.record import CHANNELS, FileContents, FileNames, StoreRecord, assemble
+from ltcl.store.record import (
+    CHANNELS,
+    FileContents,
+    FileNames,
+    StoreRecord,
+    Variable,
+    assemble,
+)
 
 ROWS = "MATLAB_sparse"
 # Numbers by the kinds of NumPy; complex ones are refused by name.
@@ -36,9 +43,6 @@ class SparseGroup:
     """MATLAB's sparse matrix by columns; its arrays are members of the file next to it."""
 
     rows: int
-
-
-Variable = str | Sequence[str] | None
 
 
 def read_hdf5(path: Path, variable: Variable = None, names: FileNames | None = None) -> StoreRecord:
@@ -106,7 +110,7 @@ def _shape(member: Any) -> tuple[int, ...]:
 
 def _sparse(members: Mapping[str, Any], name: str) -> scipy.sparse.csr_array:
     """The matrix of a sparse group, whose arrays may have room to spare."""
-    starts = _numbers(members[f"{name}/jc"])
+    starts: Any = _numbers(members[f"{name}/jc"])
     entries = max(int(starts[-1]), 0)
     # MATLAB leaves out arrays of no entries.
     empty = np.zeros(0, np.int64)
@@ -114,7 +118,9 @@ def _sparse(members: Mapping[str, Any], name: str) -> scipy.sparse.csr_array:
     rows = _numbers(members.get(f"{name}/ir", empty))[:entries]
     shape = checks.grid(f"shape of {name!r}", (members[name].rows, len(starts) - 1))
     return sparse_floats(
-        lambda: scipy.sparse.csc_array((data, rows, starts), shape=shape), shape, data.size
+        lambda: scipy.sparse.csc_array((data, rows, starts), shape=shape),
+        shape,
+        data.size,
     )
 
 
@@ -142,13 +148,13 @@ def write_hdf5(path: Path, record: StoreRecord) -> None:
     with _h5py(path).File(content, "w") as file:
         file.update(arrays)
         if not record.dense:
-            names = ("T",) if len(matrices) == 1 else CHANNELS
+            names = CHANNELS if len(matrices) == 3 else ("T",)
             for name, matrix in zip(names, matrices, strict=True):
                 _write_sparse(file.create_group(name), matrix.tocsc())
     path.write_bytes(content.getbuffer())
 
 
-def _write_sparse(group: Any, columns: scipy.sparse.csc_array) -> None:
+def _write_sparse(group: Any, columns: Any) -> None:
     group.attrs[ROWS] = columns.shape[0]
     group["data"] = columns.data
     group["ir"] = columns.indices

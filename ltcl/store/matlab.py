@@ -21,8 +21,8 @@ import scipy.io
 
 from ltcl import checks
 from ltcl.errors import FileError
-from ltcl.store.hdf5 import SparseGroup, Variable, assemble_members, read_hdf5
-from ltcl.store.record import EXTRAS, FileNames, StoreRecord
+from ltcl.store.hdf5 import SparseGroup, assemble_members, read_hdf5
+from ltcl.store.record import EXTRAS, FileNames, StoreRecord, Variable
 
 NAMES = FileNames(matrix="LTM", channels=("LTM_r", "LTM_g", "LTM_b"), is_reversed=True)
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -122,7 +122,16 @@ def _inflate(content: memoryview) -> tuple[int, memoryview]:
     kind, size = struct.unpack("<II", inflate.decompress(content, 8))
     checks.fits_host("a variable", 3 * size)
     element = memoryview(inflate.decompress(inflate.unconsumed_tail, size + 1))
-    return (kind if inflate.eof else -1), element
+    if not inflate.eof:
+        kind = -1
+    return kind, element
+
+
+def _other_kind(number_class: int) -> str:
+    """What a variable is that holds no real numbers."""
+    if number_class & COMPLEX:
+        return "complex"
+    return OTHER_CLASSES.get(number_class, "of a type of MATLAB's own")
 
 
 def _variable(kind: int, content: memoryview) -> dict[str, Any]:
@@ -133,9 +142,8 @@ def _variable(kind: int, content: memoryview) -> dict[str, Any]:
     number_class = int.from_bytes(flags[:2], "little") & CLASS_AND_COMPLEX
     name = str(label, "ascii", "replace")
     if number_class not in NUMBER_CLASSES:
-        is_complex = bool(number_class & COMPLEX)
-        kind = OTHER_CLASSES.get(number_class, "of a type of MATLAB's own")
-        return {name: "complex" if is_complex else kind} if name else {}
+        # MATLAB keeps data of its own under an empty name.
+        return {name: _other_kind(number_class)} if name else {}
     shape = np.frombuffer(dimensions, "<i4").tolist()
     arrays = []
     for element_kind, values in elements:

@@ -108,6 +108,8 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
 
 
 Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
+# Name of an array, or names of three, "red,green,blue"; None takes the default.
+Variable = str | Sequence[str] | None
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,7 @@ class FileContents:
 
 def assemble(
     contents: FileContents,
-    variable: str | Sequence[str] | None = None,
+    variable: Variable = None,
     names: FileNames | None = None,
 ) -> StoreRecord:
     """Make a record of the arrays that a file holds by name.
@@ -259,8 +261,9 @@ def assemble(
 
 def _one_channel(first_bounce: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The first bounce of MATLAB, where one channel is a row or a column of N values, as (N,)."""
-    is_vector = first_bounce.size == shape[-1]
-    return first_bounce.ravel() if is_vector else first_bounce
+    if first_bounce.size == shape[-1]:
+        return first_bounce.ravel()
+    return first_bounce
 
 
 def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequence[str]:
@@ -274,13 +277,15 @@ def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequ
         if name in contents.unreadable:
             raise _unreadable(contents, name)
         if name not in contents.shapes:
-            present = ", ".join([*contents.shapes, *contents.unreadable]) or "none"
-            raise FileError(f"variable {name!r} is missing; it holds {present:.200}")
+            present = [*contents.shapes, *contents.unreadable] or ["none"]
+            listed = ", ".join(present)
+            raise FileError(f"variable {name!r} is missing; it holds {listed:.200}")
     return chosen
 
 
 def _unreadable(contents: FileContents, name: str) -> FileError:
-    return FileError(f"{name!r} is {contents.unreadable[name]}; T must be an array of real numbers")
+    kind = contents.unreadable[name]
+    return FileError(f"{name!r} is {kind}; T must be an array of real numbers")
 
 
 def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:
@@ -303,7 +308,8 @@ def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:
             matrices.append(name)
     if len(matrices) == 1:
         return matrices
-    listed += [f"{name!r} ({kind})" for name, kind in contents.unreadable.items()]
+    for name, kind in contents.unreadable.items():
+        listed.append(f"{name!r} ({kind})")
     if not shapes:
         listed.insert(0, "no numbers")
     raise FileError(

@@ -6,13 +6,17 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 import ltcl
@@ -33,6 +37,7 @@ COMMANDS = [
     "info",
     "analyze",
     "convert",
+    "align",
     "compress",
     "denoise",
     "invert",
@@ -165,6 +170,53 @@ def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, nam
         printed[len(options)] = stdout.read()
     assert ".npz" in printed[0]
     assert json.loads(printed[1])[0]["file"] == str(path)
+
+
+@pytest.mark.parametrize("module", ["numpy", "scipy", "typer"])
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
+    """A module that interrupts its own import stands in the place of one that takes long."""
+    text = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)"
+    (tmp_path / f"{module}.py").write_text(text)
+    root = Path(ltcl.__file__).parents[1]
+    paths = os.pathsep.join([str(tmp_path), str(root)])
+    run = subprocess.run(
+        [sys.executable, "-m", "ltcl", "devices", *options],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 130
+    assert run.stderr == "ltcl: error: interrupted\n"
+    if options:
+        assert json.loads(run.stdout)["exit_code"] == 130
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_any_moment_is_one_line():
+    """From the moment at which Python imports ltcl, to the end; after that all is printed."""
+    words = [sys.executable, "-m", "ltcl", "devices"]
+    start = time.monotonic()
+    subprocess.run(words, capture_output=True, check=True)
+    duration = time.monotonic() - start
+    codes = set()
+    for share in np.linspace(0.15, 1.0, 18):
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(share * duration)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+        codes.add(process.returncode)
+        expected = {130: "ltcl: error: interrupted\n", 0: ""}
+        assert errors == expected[process.returncode]
+    assert 130 in codes
+
+
+def test_who_imports_ltcl_keeps_the_handlers_of_signals():
+    code = "import signal, ltcl; print(signal.getsignal(signal.SIGINT).__name__)"
+    words = [sys.executable, "-c", code]
+    run = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert run.stdout == "default_int_handler\n"
 
 
 def test_quiet_and_verbose(program, transport, tmp_path):

@@ -197,7 +197,7 @@ def patterns(*, appearance: bool) -> Work:
     def judge(outcome: Any, committed: frozenset[Hashable]) -> str:
         if isinstance(outcome, str):
             return "wrong" if outcome == "other values" else "lost"
-        done: Any = max(committed, default=0)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        done: Any = max(committed, default=0)  # pyright: ignore[reportArgumentType]
         return "lost" if outcome < done else ""
 
     def resume(folder: Path) -> None:

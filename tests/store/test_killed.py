@@ -211,24 +211,24 @@ def test_readers_see_one_store_while_writers_replace_it(
     writers = [stores.in_child(lambda scale=scale: write(scale)) for scale in (2, 3)]
     reads = 0
     while reads < 40:
-        (rows,) = formats.read(path).matrices
+        record: Any = formats.read(path)
+        (rows,) = record.matrices
         time.sleep(0.01)
         scales = {rows.tocsr().max() / T.max(), rows.rows(0, 12).max() / T.max()}
         assert len(scales) == 1
         assert scales <= {1.0, 2.0, 3.0}
         reads += 1
     assert [stores.status_of(writer) for writer in writers] == [0, 0]
-    del rows
+    rows = record = None
     save(1)
     assert os.listdir(tmp_path) == ["T.zarr"]
 
 
 def test_a_store_in_use_is_read_as_it_was_opened(tmp_path: Path) -> None:
     path = tmp_path / "T.zarr"
-    for scale in (1, 2):
-        ltcl.save(path, ltcl.Transport(scale * T, (3, 4), on_dark="mask"))
-        if scale == 1:
-            loaded = ltcl.load(path)
+    ltcl.save(path, ltcl.Transport(T, (3, 4), on_dark="mask"))
+    loaded = ltcl.load(path)
+    ltcl.save(path, ltcl.Transport(2 * T, (3, 4), on_dark="mask"))
     assert len(os.listdir(tmp_path)) == 2
     picture = loaded @ np.ones((3, 4))
     np.testing.assert_allclose(picture.ravel(), T @ np.ones(12), rtol=1e-6)

@@ -2,12 +2,14 @@
 """Map from camera pixels to projector coordinates, from photographs of Gray code alone.
 
 A pixel is valid if every bit of its coordinates is certain, or all but one, and if they fit those
-of its neighbours. `subpixel` finds fractions of a pixel.
+of its neighbours. Where more bits are within the noise, the brighter pictures still give a
+coordinate; if it fits those of valid neighbours, it is right but once in thousands, and counts too.
+`subpixel` finds fractions of a pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,15 +17,30 @@ import cv2
 import numpy as np
 
 from ltcl import checks
+from ltcl.acquisition.geometry.axis import UNKNOWN, Axis
 from ltcl.acquisition.geometry.graycode import GrayCode
 from ltcl.acquisition.geometry.subpixel import refine
+from ltcl.acquisition.radiometry.strips import in_strips
 from ltcl.errors import InputError
 
 # Side of the neighbourhood that a coordinate must fit.
 NEIGHBOURHOOD = 5
 
-# Valid neighbours that a pixel must have.
+# Valid neighbours that a pixel must have, and a faint one.
 MIN_NEIGHBOURS = 3
+MIN_FAINT_NEIGHBOURS = 5
+
+# Times that faint pixels next to valid ones are compared with these.
+GROWTH_STEPS = 3
+
+# A test of coordinates (H, W) by those of valid pixels.
+NeighbourTest = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+# Rows around a strip that its comparison reads: a median of deviations from a median.
+COMPARED_REACH = 2 * (NEIGHBOURHOOD // 2)
+
+# Pixels of a strip of rows: its medians stay in the cache.
+STRIP_PIXELS = 1 << 16
 
 # Beyond any coordinate.
 FAR = np.float32(1e9)
@@ -102,7 +119,8 @@ def decode(
     ----------
     images : sequence of (H, W) or (H, W, 3) arrays
         Photographs of `GrayCode(grid).patterns()`, in that order: linear or raw, all of one
-        exposure.
+        exposure. Without the inverses, which is less sure: of every other pattern, then white and
+        black.
     grid : (int, int)
         Height and width of the projector.
     subpixel : bool
@@ -127,20 +145,55 @@ def decode(
     1.0
     """
     code = GrayCode(checks.grid("grid", grid))
-    x, y = code.decode(images, levels=levels, edges=checks.flag("subpixel", subpixel))
-    is_known = (x.width <= 2.0) & (y.width <= 2.0)
-    valid = is_known & _fits_neighbours(x.value, is_known) & _fits_neighbours(y.value, is_known)
+    checks.flag("subpixel", subpixel)
+    x, y = code.decode(images, levels=levels, edges=subpixel)
+    valid = _confirm(x, y)
     if not valid.any():
         raise InputError(
             "photographs: no pixel is decoded; patterns must be in view, sharp, above the noise"
         )
-    if not subpixel:
-        return Correspondence(x.value, y.value, valid, code.grid)
     h, w = code.grid
-    return Correspondence(refine(x, valid, w), refine(y, valid, h), valid, code.grid)
+    if subpixel:
+        return Correspondence(refine(x, valid, w), refine(y, valid, h), valid, code.grid)
+    return Correspondence(x.value, y.value, valid, code.grid)
 
 
-def _fits_neighbours(value: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _confirm(x: Axis, y: Axis) -> np.ndarray:
+    """Pixels (H, W) whose coordinates are known, or faint, and fit those of their neighbours.
+
+    Known pixels are compared with known ones first; then the others next to valid pixels with
+    these, and again those next to what this adds.
+    """
+    known = x.known & y.known
+    valid = known & _compare(x, y, known, known, _fits_plane)
+    readable = (x.state != UNKNOWN) & (y.state != UNKNOWN)
+    for _ in range(GROWTH_STEPS):
+        others = readable & ~valid
+        valid |= others & _compare(x, y, others, valid, _fits_median)
+    return valid
+
+
+def _compare(
+    x: Axis, y: Axis, compared: np.ndarray, neighbours: np.ndarray, test: NeighbourTest
+) -> np.ndarray:
+    """True (H, W) where both coordinates pass a test; compared are rows with such pixels."""
+    passed = np.zeros(neighbours.shape, bool)
+
+    def compare_rows(rows: slice) -> None:
+        if not compared[rows].any():
+            return
+        top = max(rows.start - COMPARED_REACH, 0)
+        window = slice(top, rows.stop + COMPARED_REACH)
+        inside = slice(rows.start - top, rows.stop - top)
+        near = neighbours[window]
+        both = test(x.rows(window).value, near) & test(y.rows(window).value, near)
+        passed[rows] = both[inside]
+
+    in_strips(len(passed), STRIP_PIXELS // passed.shape[1], compare_rows)
+    return passed
+
+
+def _fits_plane(value: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """True where valid coordinates (H, W) fit those of their neighbours.
 
     The centre of a plane is the median of its 5 x 5 neighbourhood. A pixel may deviate from that by
@@ -151,15 +204,28 @@ def _fits_neighbours(value: np.ndarray, valid: np.ndarray) -> np.ndarray:
     deviation = np.abs(value - _median_of_valid(value, valid, -FAR))
     # Invalid pixels count as half very near and half very far: they leave the median where it is.
     spread = np.minimum(_median_of_valid(deviation, valid, np.float32(0.0)), FAR / 4)
-    count = cv2.boxFilter(
+    has_neighbours = _count_valid(valid) > min(MIN_NEIGHBOURS, value.size - 1)
+    return has_neighbours & (deviation <= 1.0 + 2.0 * spread)
+
+
+def _fits_median(value: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """True where coordinates (H, W) deviate by one projector pixel from those of valid neighbours.
+
+    There must be five: a faint pixel is less sure.
+    """
+    deviation = np.abs(value - _median_of_valid(value, valid, -FAR))
+    return (_count_valid(valid) >= MIN_FAINT_NEIGHBOURS) & (deviation <= 1.0)
+
+
+def _count_valid(valid: np.ndarray) -> np.ndarray:
+    """Number of valid pixels in the neighbourhood of each, itself included."""
+    return cv2.boxFilter(
         valid.view(np.uint8),
         -1,
         (NEIGHBOURHOOD, NEIGHBOURHOOD),
         normalize=False,
         borderType=cv2.BORDER_CONSTANT,
     )
-    has_neighbours = count > min(MIN_NEIGHBOURS, value.size - 1)
-    return valid & has_neighbours & (deviation <= 1.0 + 2.0 * spread)
 
 
 def _median_of_valid(value: np.ndarray, valid: np.ndarray, low: np.float32) -> np.ndarray:

@@ -27,9 +27,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ltcl.acquisition.geometry.bits import FINE_BITS
 from ltcl.acquisition.geometry.correspondence import Correspondence
 from ltcl.acquisition.geometry.footprints import Footprints
-from ltcl.acquisition.geometry.graycode import FINE_BITS, GrayCode
+from ltcl.acquisition.geometry.graycode import GrayCode
 from ltcl.acquisition.geometry.resample import SEPARABLE_WIDTH, Resampling
 from ltcl.errors import AcquisitionError
 
@@ -44,6 +45,9 @@ MAP_ERROR_LEAK = 0.07
 
 # q of means by a tent: E |a + b + c|, even in [-1/2, 1/2] (footprint: a, tent: b + c).
 TENT_LEAK = 13 / 32
+
+# Camera pixels that are narrower, in projector pixels, are fine enough.
+FINE_WIDTH = 0.5
 
 # Patterns that determine l and q.
 MIN_PATTERNS = 3
@@ -140,14 +144,22 @@ class Sharpness:
         text = (
             f"camera pixels are {self.width:.2g} projector pixels wide, and {sharpness.own:.0%} of "
             "the light seen at a pixel is its own: pictures of fine detail have an error of "
-            f"{sharpness.blur:.1%}; move the camera closer, focus it and the projector, use a "
-            "longer lens or a projector_grid of fewer pixels, or scan with strategy='block' and "
-            f"block={2 * side}"
+            f"{sharpness.blur:.1%}; {self._advice()}use a projector_grid of fewer pixels, "
+            f"or scan with strategy='block' and block={2 * side}"
         )
         if sharpness.blur > MAX_BLUR:
             text += "; or photographs of the finest stripes are exchanged"
             raise AcquisitionError(f"the camera does not separate the projector's pixels: {text}")
         logger.warning("%s", text)
+
+    def _advice(self) -> str:
+        """What may help, by the width of camera pixels: finer ones do not sharpen a blur."""
+        advice = ""
+        if self.width > FINE_WIDTH:
+            advice += "move the camera closer or use a longer lens, "
+        if max(self.leak) > TENT_LEAK * self.width:
+            advice += "focus the camera and the projector, "
+        return advice
 
 
 def _measure_leak(R: Resampling, light: Sequence[np.ndarray], axis: int) -> float | None:

@@ -21,11 +21,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import cv2
 import numpy as np
 
-from ltcl.acquisition.geometry.graycode import BELOW_PAIR, RIGHT_PAIR, Axis
+from ltcl.acquisition.geometry.axis import NO_EDGE, Axis
+from ltcl.acquisition.geometry.bits import BELOW_PAIR, RIGHT_PAIR
 from ltcl.acquisition.radiometry.strips import in_strips
 
 # Projector pixels by which a plane may leave a pixel's cell: six times the error of an edge.
@@ -71,12 +73,14 @@ MIN_DETERMINANT = 1e-9
 ADDED_SPREAD = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Planes:
-    """Least-squares planes through the window about each pixel, arrays (...) float32.
+    """Least-squares planes through the windows about the pixels of some rows, (rows, W) float32.
 
     Attributes
     ----------
+    top : int
+        First of the rows.
     count : ndarray
         Weighted number of edges.
     u, v, x : ndarray
@@ -89,6 +93,7 @@ class Planes:
         Least variance of the edges' places.
     """
 
+    top: int
     count: np.ndarray
     u: np.ndarray
     v: np.ndarray
@@ -99,21 +104,66 @@ class Planes:
     extent: np.ndarray
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> Planes:
-        """Planes that are still to be written."""
-        return cls(*(np.empty(shape, np.float32) for _ in range(8)))
+    def fit(cls, axis: Axis, valid: np.ndarray, rows: slice, reach: int) -> Planes:
+        """Planes through the windows of `reach` pixels about each pixel of some rows."""
+        # One row more has the edges below the last one of the window.
+        top = max(rows.start - reach, 0)
+        bottom = min(rows.stop + reach + 1, len(valid))
+        moments = _moments(axis, valid, slice(top, bottom), 2 * reach + 1)
+        inside = slice(rows.start - top, rows.stop - top)
+        return cls.from_moments([moment[inside] for moment in moments], top, rows.start)
+
+    @classmethod
+    def from_moments(cls, moments: list[np.ndarray], origin: int, top: int) -> Planes:
+        """Planes of rows from `top` on; the moments count v from the row `origin`."""
+        n, *sums = moments
+        weight = 1.0 / np.maximum(n, MIN_COUNT)
+        means = [np.multiply(total, weight, out=total) for total in sums]
+        mean_u, mean_v, mean_x, uu, uv, vv, ux, vx, xx = means
+        uu += ADDED_SPREAD - mean_u**2
+        vv += ADDED_SPREAD - mean_v**2
+        uv -= mean_u * mean_v
+        ux -= mean_u * mean_x
+        vx -= mean_v * mean_x
+        xx -= mean_x**2
+
+        # Cramer's rule.
+        det = np.maximum(uu * vv - uv**2, MIN_DETERMINANT)
+        b = (ux * vv - vx * uv) / det
+        c = (vx * uu - ux * uv) / det
+        spread = np.sqrt(np.maximum(xx - b * ux - c * vx, 0.0))
+        spread[n < MIN_EDGES] = np.inf
+        return cls(
+            top=top,
+            count=np.maximum(n, MIN_COUNT).astype(np.float32),
+            u=mean_u.astype(np.float32),
+            v=(mean_v + origin).astype(np.float32),
+            x=mean_x.astype(np.float32),
+            slope_u=b.astype(np.float32),
+            slope_v=c.astype(np.float32),
+            spread=spread.astype(np.float32),
+            extent=(det / (uu + vv)).astype(np.float32),
+        )
+
+    def rows(self, rows: slice) -> Planes:
+        """Planes of some of the rows, as numbered in the picture."""
+        return self._select(np.s_[rows.start - self.top : rows.stop - self.top], rows.start)
 
     def take(self, v: np.ndarray, u: np.ndarray) -> Planes:
         """Planes of pixels (v, u)."""
+        return self._select((v - self.top, u), self.top)
+
+    def _select(self, index: Any, top: int) -> Planes:
         return Planes(
-            count=self.count[v, u],
-            u=self.u[v, u],
-            v=self.v[v, u],
-            x=self.x[v, u],
-            slope_u=self.slope_u[v, u],
-            slope_v=self.slope_v[v, u],
-            spread=self.spread[v, u],
-            extent=self.extent[v, u],
+            top=top,
+            count=self.count[index],
+            u=self.u[index],
+            v=self.v[index],
+            x=self.x[index],
+            slope_u=self.slope_u[index],
+            slope_v=self.slope_v[index],
+            spread=self.spread[index],
+            extent=self.extent[index],
         )
 
     def at(self, v: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -127,18 +177,33 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> np.ndarray:
     `size` is the number of projector pixels along the axis. Camera pixels that see a part of the
     outermost of these may lie beyond them.
     """
-    cell = _cells(axis, size)
-    reach = _window_reach(axis, valid)
-    planes = _fit_planes(axis, valid, reach)
     H, W = valid.shape
-    rows = np.arange(H, dtype=np.float32)[:, None]
-    columns = np.arange(W, dtype=np.float32)[None, :]
-    value = planes.at(rows, columns)
+    reach = _window_reach(axis, valid)
+    value = np.empty((H, W), np.float32)
 
-    is_poor = (planes.spread > MAX_SPREAD) | (planes.extent < MIN_LINE_SPREAD * reach**2)
-    v, u = np.nonzero(valid & is_poor)
+    def refine_rows(rows: slice) -> None:
+        value[rows] = _refine_strip(axis, valid, size, rows, reach)
+
+    in_strips(H, max(STRIP_PIXELS // W, 8 * reach), refine_rows)
+    return value
+
+
+def _refine_strip(axis: Axis, valid: np.ndarray, size: int, rows: slice, reach: int) -> np.ndarray:
+    """Coordinates of some rows, by windows of `reach` pixels, and smaller ones at borders."""
+    H, W = valid.shape
+    strip = axis.rows(rows)
+    cell = _cells(strip, size)
+    around = slice(max(rows.start - reach, 0), min(rows.stop + reach, H))
+    planes = Planes.fit(axis, valid, around, reach)
+    inside = planes.rows(rows)
+    lines = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None]
+    value = inside.at(lines, np.arange(W, dtype=np.float32)[None, :])
+
+    is_poor = (inside.spread > MAX_SPREAD) | (inside.extent < MIN_LINE_SPREAD * reach**2)
+    v, u = np.nonzero(valid[rows] & is_poor)
     while len(v):
-        value[v, u], spread = _best_window(cell[:, v, u], planes, reach, v, u)
+        place = v + rows.start, u
+        value[v, u], spread = _best_window(cell[:, v, u], planes, reach, place, H)
         # Windows with too few edges, of infinite spread, have fewer when they are smaller.
         is_border = (spread > MAX_SPREAD) & np.isfinite(spread)
         v = v[is_border]
@@ -146,15 +211,17 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> np.ndarray:
         if reach <= MIN_REACH or len(v) == 0:
             break
         reach = max(reach // 2, MIN_REACH)
-        planes = _fit_planes(axis, valid, reach)
+        planes = Planes.fit(axis, valid, around, reach)
     is_in_cell = (cell[0] <= value) & (value <= cell[1])
-    return np.where(valid & is_in_cell, value, axis.value)
+    return np.where(valid[rows] & is_in_cell, value, strip.value)
 
 
 def _cells(axis: Axis, size: int) -> np.ndarray:
-    """Least and largest coordinate that a plane may give each pixel, (2, H, W)."""
-    half = axis.width / 2 + MAX_CELL_EXCESS
-    cell = np.stack([axis.value - half, axis.value + half])
+    """Least and largest coordinate that a plane may give each pixel, (2, rows, W)."""
+    value = axis.value
+    # Faint places are those of two neighbouring pixels.
+    half = np.minimum(axis.width, 2.0) / 2 + MAX_CELL_EXCESS
+    cell = np.stack([value - half, value + half])
     low, high = cell
     low[low < 0] -= MAX_RIM_EXCESS
     high[high > size - 1] += MAX_RIM_EXCESS
@@ -163,23 +230,29 @@ def _cells(axis: Axis, size: int) -> np.ndarray:
 
 def _window_reach(axis: Axis, valid: np.ndarray) -> int:
     """Camera pixels on each side of a window for a few edges, by their mean distance."""
-    edges = np.count_nonzero(np.isfinite(axis.right)) + np.count_nonzero(np.isfinite(axis.below))
+    edges = 0
+    for steps in (axis.right_steps, axis.below_steps):
+        edges += np.count_nonzero(steps != NO_EDGE)
     reach = EDGES_PER_SIDE * np.count_nonzero(valid) / max(edges, 1) + 1
     return int(np.clip(reach, MIN_REACH, MAX_REACH))
 
 
 def _best_window(
-    cell: np.ndarray, planes: Planes, reach: int, v: np.ndarray, u: np.ndarray
+    cell: np.ndarray, planes: Planes, reach: int, place: tuple[np.ndarray, np.ndarray], height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values at pixels (v, u) of the window of least standard error at each, and its spread."""
-    H, W = planes.spread.shape
-    own = planes.take(v, u)
-    best_value = own.at(v, u)
-    best_spread = own.spread
+    """Values at a place (v, u) of the window of least standard error there, and its spread.
+
+    `planes` are those of all rows within `reach` of the pixels, in a picture of this height.
+    """
+    v, u = place
+    width = planes.spread.shape[1]
+    middle = planes.take(v, u)
+    best_value = middle.at(v, u)
+    best_spread = middle.spread
     least_error = np.full(len(v), np.inf)
     steps = (0, -reach, reach)
     for down, right in product(steps, steps):
-        plane = planes.take(np.clip(v + down, 0, H - 1), np.clip(u + right, 0, W - 1))
+        plane = planes.take(np.clip(v + down, 0, height - 1), np.clip(u + right, 0, width - 1))
         value = plane.at(v, u)
         squared_distance = (u - plane.u) ** 2 + (v - plane.v) ** 2
         error = (
@@ -195,53 +268,6 @@ def _best_window(
     return best_value, best_spread
 
 
-def _fit_planes(axis: Axis, valid: np.ndarray, reach: int) -> Planes:
-    """Planes through the windows of `reach` pixels about each pixel."""
-    H, W = valid.shape
-    planes = Planes.empty((H, W))
-
-    def fit_rows(rows: slice) -> None:
-        # One row more has the edges below the last one of the window.
-        top = max(rows.start - reach, 0)
-        bottom = min(rows.stop + reach + 1, H)
-        moments = _moments(axis, valid, slice(top, bottom), 2 * reach + 1)
-        inside = slice(rows.start - top, rows.stop - top)
-        _fit_strip(planes, rows, top, [moment[inside] for moment in moments])
-
-    in_strips(H, max(STRIP_PIXELS // W, 4 * reach), fit_rows)
-    return planes
-
-
-def _fit_strip(planes: Planes, rows: slice, top: int, moments: list[np.ndarray]) -> None:
-    """Write the planes of some rows; moments count v from the row `top`."""
-    n, *sums = moments
-    weight = 1.0 / np.maximum(n, MIN_COUNT)
-    means = [np.multiply(total, weight, out=total) for total in sums]
-    mean_u, mean_v, mean_x, uu, uv, vv, ux, vx, xx = means
-    uu += ADDED_SPREAD - mean_u**2
-    vv += ADDED_SPREAD - mean_v**2
-    uv -= mean_u * mean_v
-    ux -= mean_u * mean_x
-    vx -= mean_v * mean_x
-    xx -= mean_x**2
-
-    # Cramer's rule.
-    det = np.maximum(uu * vv - uv**2, MIN_DETERMINANT)
-    b = (ux * vv - vx * uv) / det
-    c = (vx * uu - ux * uv) / det
-    spread = np.sqrt(np.maximum(xx - b * ux - c * vx, 0.0))
-    spread[n < MIN_EDGES] = np.inf
-
-    planes.count[rows] = np.maximum(n, MIN_COUNT)
-    planes.u[rows] = mean_u
-    planes.v[rows] = mean_v + top
-    planes.x[rows] = mean_x
-    planes.slope_u[rows] = b
-    planes.slope_v[rows] = c
-    planes.spread[rows] = spread
-    planes.extent[rows] = det / (uu + vv)
-
-
 def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np.ndarray]:
     """Sums of w, w u, w v, w x, w uu, w uv, w vv, w ux, w vx and w xx over windows.
 
@@ -249,20 +275,22 @@ def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np
     counts from the first of the rows.
     """
     valid = valid[rows]
-    place = axis.place[rows]
+    axis = axis.rows(rows)
+    value = axis.value.astype(np.float64)
+    place = axis.place.astype(np.float64)
     height, width = valid.shape
     u = np.arange(width, dtype=np.float64)[None, :]
     v = np.arange(height, dtype=np.float64)[:, None]
     n = np.where(valid, WHOLE_NUMBER_WEIGHT, 0.0)
-    x = n * axis.value[rows].astype(np.float64)
-    xx = x * axis.value[rows].astype(np.float64)
+    x = n * value
+    xx = x * value
     r = np.zeros_like(n)
     rx = np.zeros_like(n)
     d = np.zeros_like(n)
     dx = np.zeros_like(n)
     for fractions, shift, shift_x, (pixels, neighbours) in (
-        (axis.right[rows], r, rx, RIGHT_PAIR),
-        (axis.below[rows], d, dx, BELOW_PAIR),
+        (axis.right, r, rx, RIGHT_PAIR),
+        (axis.below, d, dx, BELOW_PAIR),
     ):
         is_edge = np.isfinite(fractions[pixels]) & valid[pixels] & valid[neighbours]
         between = is_edge * (0.5 * (place[pixels] + place[neighbours]))

@@ -35,6 +35,7 @@ COMMANDS: dict[str, Any] = {
     ],
     "analyze": Annotated[list[transports.AnalyzedFile], "`ltcl analyze`: one entry for each file."],
     "convert": transports.ConvertReport,
+    "align": transports.AlignReport,
     "compress": transports.CompressReport,
     "invert": transports.InvertReport,
     "denoise": transports.DenoiseReport,

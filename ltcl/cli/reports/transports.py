@@ -227,6 +227,16 @@ class NoiseReport(Report):
 
 
 @dataclass(kw_only=True)
+class AlignReport(Heading):
+    """`ltcl align`."""
+
+    out: Annotated[Path, "File that was written."]
+    seen: Annotated[float, "Share of the projector's pixels that the camera sees."]
+    decoded: Annotated[float, "Share of the camera's pixels whose place is known."]
+    pictures: Annotated[list[Path], "Aligned pictures, in their order."]
+
+
+@dataclass(kw_only=True)
 class DenoiseReport(Heading):
     """`ltcl denoise`."""
 

@@ -34,7 +34,7 @@ MAX_PARTS_PER_SIDE = 6
 MEDIAN_PER_STD = 0.6745
 # Factor of a standard deviation that was estimated.
 NOISE_MARGIN = 1.5
-# Noise of distant light, relative to it, from which on a gain is not seen.
+# Noise of distant light, relative to it, from which on nothing is seen.
 MAX_NOISE = 0.3
 # d / b, from which on parts are too even to tell an offset from an albedo.
 MAX_EVENNESS = 0.8
@@ -120,6 +120,8 @@ class LightDetail:
         """Offset of a row, in the light of all its pixels, over the median light under white."""
         evenness = np.where(self.evenness < MAX_EVENNESS, self.evenness, np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
+            if not _median(np.abs(self.bright_std / self.bright)) < MAX_NOISE:
+                return 0.0
             scale = self.typical_bright / (1.0 - evenness)
             offset = scale * self.dark / self.bright
             noise = scale * np.hypot(self.dark_std, evenness * self.bright_std) / self.bright

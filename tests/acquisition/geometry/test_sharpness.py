@@ -101,6 +101,23 @@ def test_a_hopeless_camera_is_refused_before_the_scan(geometry: Any) -> None:
         acquire(camera(0.95), strategy="pixel", response=LINE, geometry=geometry)
 
 
+@pytest.mark.parametrize(
+    ("leak", "width", "closer", "focus"),
+    [(0.35, 0.9, True, False), (0.4, 0.3, False, True), (0.7, 0.9, True, True)],
+)
+def test_advice_is_what_can_help(
+    leak: float, width: float, closer: bool, focus: bool, caplog: Any
+) -> None:
+    """Fine camera pixels need no closer camera; coarse ones alone blur as much without focus."""
+    sharpness = Sharpness((leak, leak), width)
+    try:
+        sharpness.check()
+        text = caplog.text
+    except AcquisitionError as error:
+        text = str(error)
+    assert ("closer" in text, "focus" in text) == (closer, focus)
+
+
 def test_it_is_stored_and_reported(tmp_path: Path) -> None:
     """Out of focus: the store has it, and the report says it."""
     path = tmp_path / "T.zarr"

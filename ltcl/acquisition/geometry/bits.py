@@ -1,0 +1,346 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bits of Gray code from photographs, each with the noise of its pixel.
+
+A photograph k of a pattern shows g_k times the light of other photographs: projectors rescale fine
+patterns, lamps flicker, and colours of a wheel fall into other frames. The gain g_k is the median,
+over lit pixels where the pattern (or its inverse) is on, of
+
+    (p_b + q_b) / s,    s = sum_b d_b^2 (p_b + q_b) / sum_b d_b^2,    d_b = p_b - q_b
+
+with p_b and q_b the photographs of pattern b and its inverse, less black. With gains undone, the
+differences of p_b + q_b from s are the noise of the pixel, with the same weights: on the edges of
+stripes, where d_b is small, raw photographs that are not linear in light do not add up. At least
+half the median of all pixels counts.
+
+Without inverses, q_b = g_b w - p_b with w the photograph of white. Fine stripes are on and off at
+half of the pixels each, so that g_b is the sum of the quartiles of p_b / w; coarse ones get the
+median of these. The noise is the distance of p_b from the nearer one of the levels that fine
+stripes show. That is less sure: a single photograph decides each bit.
+
+Fine stripes light half of everything evenly, so that a pixel shows `l_d + l_g / 2` when its own
+stripe is on and `l_g / 2` when it is off (Nayar et al. 2006). With the direct light l_d and the
+indirect light l_g known, a bit is certain (Xu and Aliaga 2007) if it is above the noise, and
+
+    direct light outweighs indirect light: the brighter of pattern and inverse decides; or
+    one of the two shows more than l_g, so that it must be lit, and the other shows less than l_d,
+    so that it cannot be.
+
+Known limit: a pixel that gets more than twice as much light from elsewhere as from the projector,
+as in a closed white room, has no coordinate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ltcl.acquisition.geometry.axis import (
+    CERTAIN,
+    EDGE_AFTER,
+    EDGE_BEFORE,
+    FAINT,
+    FRACTION_STEPS,
+    NO_EDGE,
+    SHIFTS,
+    UNKNOWN,
+    Axis,
+)
+from ltcl.acquisition.geometry.photographs import Photographs
+
+# Bits of an axis whose stripes, 16 pixels and less, count as narrow enough to light evenly.
+FINE_BITS = 4
+
+# Standard deviations of a difference that counts. Noise alone passes all bits of a pixel once in
+# 10^5 with 4 bits; a bit that is wrong is found by the neighbours of the pixel.
+MIN_DEVIATIONS = 2.0
+
+# Least threshold, relative to direct light, of a pixel that is faint because of noise: others with
+# undecided bits lie on the border of two surfaces.
+MIN_FAINT_NOISE = 0.05
+
+# Standard deviations of a difference that the direct light of a faint pixel exceeds: 32 fine
+# photographs of noise alone differ by up to 3.
+MIN_FAINT_DEVIATIONS = 3.0
+
+# Noise of a pixel, by few photographs, that counts at least, as a part of the median.
+MIN_NOISE_SHARE = 0.5
+
+# Part of the photographs that are free to deviate from their mean, at least.
+MIN_FREEDOM = 0.1
+
+# Pixels that determine a gain, and those that are read for it.
+MIN_GAIN_PIXELS = 200
+MAX_GAIN_PIXELS = 1 << 16
+
+# Contrast d / (p + q) of a pixel that lies within a stripe.
+STRIPE_CONTRAST = 0.5
+
+# Light of the brightest pixels but a thousandth.
+BRIGHTEST_QUANTILE = 0.999
+
+# Light of the brightest pixels from which on a pixel tells a gain.
+GAIN_LIGHT = 0.2
+
+# Gains of a photograph; beyond, it is another pattern.
+MAX_GAIN = 2.0
+
+# Variances of a single photograph in 2 p - w - b, a bit without an inverse.
+SINGLE_VARIANCES = 6.0
+
+# Instead of a division by zero.
+TINY = np.float32(1e-20)
+
+# Pixels and those next to them, to the right and below.
+RIGHT_PAIR = (np.s_[..., :-1], np.s_[..., 1:])
+BELOW_PAIR = (np.s_[..., :-1, :], np.s_[..., 1:, :])
+
+
+class StripDecoder:
+    """Decodes photographs strip by strip of rows into the axes `x` and `y`.
+
+    Parameters
+    ----------
+    grid, bits : (int, int)
+        Height and width of the projector; number of bits of a column and of a row.
+    pictures : Photographs
+        Patterns, each followed by its inverse if there are inverses, then white and black.
+    min_difference : float
+        Least difference of two photographs that counts.
+    edges : bool
+        Also find where stripes end between pixels.
+    """
+
+    def __init__(
+        self,
+        grid: tuple[int, int],
+        bits: tuple[int, int],
+        pictures: Photographs,
+        min_difference: float,
+        edges: bool,
+    ) -> None:
+        self.grid = grid
+        self.bits = bits
+        self.pictures = pictures
+        self.min_difference = min_difference
+        self.edges = edges
+        self.has_inverses = pictures.count == 2 * sum(bits) + 2
+        self.x = Axis.unknown(pictures.shape)
+        self.y = Axis.unknown(pictures.shape)
+        self.gains = np.ones((2, sum(bits)), np.float32)
+        self.min_noise = 0.0
+        if sum(bits):
+            self._measure_gains()
+
+    def decode(self, rows: slice) -> None:
+        """Decode some rows."""
+        H = self.pictures.shape[0]
+        count = rows.stop - rows.start
+        if self.edges:  # one row more has the edges between this strip and the next
+            rows = slice(rows.start, min(rows.stop + 1, H))
+        pattern, inverse = self._read_pairs(rows)
+        difference = pattern - inverse
+        lowest, highest = self._fine_light(pattern, inverse, rows)
+        white, noise = self._statistics(pattern, inverse, lowest, highest)
+        np.maximum(noise, self.min_noise, out=noise)
+        threshold = np.maximum(self.min_difference, MIN_DEVIATIONS * noise)
+        is_on = difference > 0
+        np.abs(difference, out=difference)
+
+        np.maximum(lowest, 0.0, out=lowest)
+        direct = highest - lowest
+        indirect = 2.0 * lowest
+        is_dim = direct <= indirect
+        is_certain = difference > threshold
+        if is_dim.any():
+            bright = np.maximum(pattern, inverse)
+            faint = np.minimum(pattern, inverse)
+            is_certain &= ~is_dim | ((bright > indirect) & (faint < direct))
+        is_lit = direct > threshold
+        is_noisy = ~is_dim & (threshold > MIN_FAINT_NOISE * direct)
+        is_noisy &= (direct > MIN_FAINT_DEVIATIONS * noise) & (white > threshold)
+
+        h, w = self.grid
+        column_bits = self.bits[0]
+        for axis, size, bits in (
+            (self.x, w, np.s_[:column_bits]),
+            (self.y, h, np.s_[column_bits:]),
+        ):
+            strip = axis.rows(slice(rows.start, rows.start + count))
+            place, state = _decode_bits(is_on[bits], is_certain[bits], size)
+            is_unknown = ~is_lit | (~is_noisy & (state == FAINT))
+            strip.place[:] = place[:count]
+            strip.state[:] = np.where(is_unknown, UNKNOWN, state)[:count]
+            if self.edges and size > 1:
+                _mark_edges(strip, place, difference[bits])
+
+    def _read_pairs(self, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Patterns and inverses less black, at the same gain, (B, rows, W) each."""
+        black = self.pictures.read(-1, rows)
+        pattern_gains, inverse_gains = self.gains
+        last = self.pictures.count - 2
+        if self.has_inverses:
+            pattern = self._read_stack(range(0, last, 2), rows, black, pattern_gains)
+            inverse = self._read_stack(range(1, last, 2), rows, black, inverse_gains)
+            return pattern, inverse
+        pattern = self._read_stack(range(last), rows, black, np.ones(last))
+        white = self.pictures.read(-2, rows) - black
+        return pattern, pattern_gains[:, None, None] * white - pattern
+
+    def _read_stack(
+        self, numbers: range, rows: slice, black: np.ndarray, gains: np.ndarray
+    ) -> np.ndarray:
+        """Photographs less black, over their gains."""
+        stack = np.empty((len(numbers), *black.shape), np.float32)
+        for image, number, gain in zip(stack, numbers, gains, strict=True):
+            np.subtract(self.pictures.read(number, rows), black, out=image)
+            image /= gain
+        return stack
+
+    def _fine_light(
+        self, pattern: np.ndarray, inverse: np.ndarray, rows: slice
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest light under fine stripes, (rows, W): l_g / 2 and l_d + l_g / 2."""
+        if len(pattern) == 0:  # a single projector pixel: white and black alone show its light
+            white = self.pictures.read(-2, rows) - self.pictures.read(-1, rows)
+            return np.zeros_like(white), white
+        is_fine = _has_fine_stripes(self.bits)
+        pattern = pattern[is_fine]
+        inverse = inverse[is_fine]
+        lowest = np.minimum(pattern.min(axis=0), inverse.min(axis=0))
+        highest = np.maximum(pattern.max(axis=0), inverse.max(axis=0))
+        return lowest, highest
+
+    def _statistics(
+        self, pattern: np.ndarray, inverse: np.ndarray, lowest: np.ndarray, highest: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean s of the sums of pattern and inverse, and standard deviation of their differences.
+
+        (rows, W); one pair has no variance: 0.
+        """
+        weight = pattern - inverse
+        weight *= weight
+        weight += TINY
+        weight /= weight.sum(axis=0)
+        total = pattern + inverse
+        mean = np.einsum("b...,b...->...", weight, total)
+        if self.has_inverses:
+            deviation = total - mean
+            freedom = 1.0 - np.einsum("b...,b...->...", weight, weight)
+            scale = 1.0 / np.maximum(freedom, MIN_FREEDOM)
+        else:
+            deviation = np.minimum(highest - pattern, pattern - lowest)
+            np.maximum(deviation, 0.0, out=deviation)
+            scale = SINGLE_VARIANCES
+        deviation *= deviation
+        variance = scale * np.einsum("b...,b...->...", weight, deviation)
+        return mean, np.sqrt(variance)
+
+    def _measure_gains(self) -> None:
+        """Measure the gains of all photographs, and the least noise, at some of the rows."""
+        H, W = self.pictures.shape
+        rows = slice(0, H, -(-H * W // MAX_GAIN_PIXELS))
+        pattern, inverse = self._read_pairs(rows)
+        light = self._fine_light(pattern, inverse, rows)
+        total, _ = self._statistics(pattern, inverse, *light)
+        brightest = float(np.quantile(total, BRIGHTEST_QUANTILE))
+        is_lit = total > max(GAIN_LIGHT * brightest, self.min_difference)
+        if np.count_nonzero(is_lit) < MIN_GAIN_PIXELS:
+            return
+        total = total[is_lit]
+        if self.has_inverses:
+            for bit, pair in enumerate(zip(pattern, inverse, strict=True)):
+                p, q = (light[is_lit] / total for light in pair)
+                self.gains[:, bit] = _pair_gains(p, q)
+        else:
+            self.gains[0] = _single_gains(pattern[:, is_lit] / total, self.bits)
+        pattern, inverse = self._read_pairs(rows)
+        light = self._fine_light(pattern, inverse, rows)
+        _, noise = self._statistics(pattern, inverse, *light)
+        self.min_noise = MIN_NOISE_SHARE * float(np.median(noise[is_lit]))
+
+
+def _pair_gains(pattern: np.ndarray, inverse: np.ndarray) -> tuple[float, float]:
+    """Gains of a pattern and of its inverse, by their light (n,) relative to other bits."""
+    light = pattern + inverse
+    contrast = pattern - inverse
+    gain_of_both = float(np.median(light))
+    return (
+        _gain(light, contrast > STRIPE_CONTRAST, gain_of_both),
+        _gain(light, contrast < -STRIPE_CONTRAST, gain_of_both),
+    )
+
+
+def _gain(light: np.ndarray, is_on: np.ndarray, default: float) -> float:
+    """Median of the relative light of pixels where a pattern is on, if there are enough."""
+    gain = default
+    if np.count_nonzero(is_on) >= MIN_GAIN_PIXELS:
+        gain = float(np.median(light[is_on]))
+    return min(max(gain, 1.0 / MAX_GAIN), MAX_GAIN)
+
+
+def _single_gains(pattern: np.ndarray, bits: tuple[int, int]) -> np.ndarray:
+    """Sums of the levels on and off of patterns (B, n), whose light is relative to white.
+
+    Coarse stripes may be on, or off, at all pixels; they get the median of the fine ones.
+    """
+    is_fine = _has_fine_stripes(bits)
+    gains = np.quantile(pattern, [0.25, 0.75], axis=1).sum(axis=0)
+    gains[~is_fine] = np.median(gains[is_fine])
+    return gains
+
+
+def _has_fine_stripes(bits: tuple[int, int]) -> np.ndarray:
+    """True for bits whose stripes are fine, (B,)."""
+    column_bits, row_bits = bits
+    significance = np.concatenate([np.arange(column_bits)[::-1], np.arange(row_bits)[::-1]])
+    return significance < FINE_BITS
+
+
+def _decode_bits(
+    is_on: np.ndarray, is_certain: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whole coordinates and their states, from bits (B, rows, W), highest first."""
+    bits = len(is_on)
+    number = np.arange(1 << bits)
+    place_of_code = np.argsort(number ^ (number >> 1)).astype(np.int32)
+    powers = np.exp2(np.arange(bits)[::-1], dtype=np.float32)
+    code = np.tensordot(powers, is_on, 1).astype(np.int32)
+    undecided = np.tensordot(powers, ~is_certain, 1).astype(np.int32)
+    place = place_of_code.take(code)
+    # 1 or -1 if one bit is undecided, on an edge.
+    step = place_of_code.take(code ^ undecided) - place
+
+    state = np.full(place.shape, FAINT)
+    state[step == 0] = CERTAIN
+    state[step == -1] = EDGE_BEFORE
+    state[step == 1] = EDGE_AFTER
+    state[place + SHIFTS.take(state) > size - 1] = UNKNOWN
+    return place, state
+
+
+def _mark_edges(axis: Axis, place: np.ndarray, difference: np.ndarray) -> None:
+    """Mark the zeros of the difference of pattern and inverse (B, rows, W) between two pixels.
+
+    Albedo scales both pictures alike, and blur is even about an edge: neither moves the zero. At an
+    edge of two neighbouring columns n - 1 and n only the bit of the lowest one in n flips. `place`
+    and `difference` may have one row more than the axis.
+    """
+    bits = len(difference)
+    rows = len(axis.place)
+    number = np.arange(1 << bits)
+    _, lowest_one = np.frexp(number & -number)
+    flipped_bit = bits - lowest_one  # highest bit first
+    row_step = place.shape[1]
+    for steps, step, (pixels, neighbours) in (
+        (axis.right_steps, 1, RIGHT_PAIR),
+        (axis.below_steps, row_step, BELOW_PAIR),
+    ):
+        is_edge = np.zeros(place.shape, bool)
+        is_edge[pixels] = np.abs(place[neighbours] - place[pixels]) == 1
+        site = np.flatnonzero(is_edge[:rows])
+        higher = np.maximum(place.take(site), place.take(site + step))
+        index = flipped_bit.take(higher) * place.size + site
+        before = difference.take(index)
+        total = before + difference.take(index + step)
+        fraction = before / np.where(total > 0, total, 1.0)
+        counts = np.rint(FRACTION_STEPS * fraction)
+        steps.ravel()[site] = np.where(total > 0, counts, NO_EDGE)
