@@ -23,6 +23,8 @@ from ltcl.transport.transport import Transport, check_transport
 
 log = logging.getLogger(__name__)
 
+# Estimated squared error of pictures over that of T, at most, with room for the estimate's own.
+MAX_RISK = 1.05
 # Arrays of float32 of the size of T that are in memory at once.
 ARRAYS_AT_ONCE = 18
 
@@ -74,7 +76,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     for channel in range(T.channels):
         note = partial(_report_share, report, channel, T.channels)
         channels.append(_denoise_channel(T, channel, note))
-    kept = sum(channel.risk >= 1.0 for channel in channels)
+    kept = sum(channel.risk > MAX_RISK for channel in channels)
     if kept:
         log.warning(
             "%d of %d channels of T are not changed: they would lose more light than noise",
@@ -118,7 +120,7 @@ def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> DenoisedCha
     if not isinstance(matrix, np.ndarray):
         matrix = matrix.tocsr().toarray()
     Y = matrix.astype(np.float32)
-    unchanged = DenoisedChannel(entries=Y.copy(), variance_share=1.0, risk=1.0)
+    unchanged = DenoisedChannel(entries=Y.copy(), variance_share=1.0, risk=np.inf)
     # In this unit, a power of 2, squares fit into float32.
     _, exponent = np.frexp(np.abs(Y).max(initial=0.0))
     unit = np.float32(2.0 ** int(exponent))
@@ -133,7 +135,7 @@ def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> DenoisedCha
             Y, noise, channel, T.camera_grid, T.grid, may_be_reciprocal
         )
         denoised = _solve(problem, Y, note)
-        if denoised.risk <= 1.0:
+        if denoised.risk <= MAX_RISK:
             return dataclasses.replace(denoised, entries=unit * denoised.entries)
         if not problem.is_reciprocal:
             break

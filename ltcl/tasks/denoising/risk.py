@@ -19,7 +19,7 @@ from ltcl.tasks.denoising.multiwavelets import Grid
 from ltcl.tasks.denoising.problem import DenoisingProblem
 
 # Factor within which an estimated noise is right.
-ESTIMATE_FACTOR = 1.3
+NOISE_MARGIN = 1.25
 # Random patterns of each kind.
 PATTERNS = 4
 # Waves across a smooth pattern, at most.
@@ -33,19 +33,16 @@ def picture_risk(
 ) -> float:
     """Estimated squared error of pictures by D over that by Y, a mean over kinds of patterns.
 
-    `moved` is Y - D, `left` noise as it may be left in D, and `variance` that of Y, (M, N) each. An
-    estimated noise may be too large, and light would seem to be noise: the risk is the one that it
-    would be if the noise was by 1.3 smaller.
+    `moved` is Y - D, `left` noise as it may be left in D, and `variance` that of Y, (M, N) each. If
+    the noise of Y is less than stated, light seems to be noise: the risk is that for a noise that
+    is smaller by NOISE_MARGIN.
     """
-    uncertainty = 1.0
-    if not problem.noise.is_measured:
-        uncertainty = ESTIMATE_FACTOR**2
     risks = []
     for patterns in _patterns(problem.grid):
         filtered = problem.noise.filtered(patterns, problem.grid, problem.channel)
         V = np.sum(variance @ filtered**2)
         if V > 0.0:
-            change = uncertainty * np.sum((moved @ patterns) ** 2)
+            change = NOISE_MARGIN**2 * np.sum((moved @ patterns) ** 2)
             kept = np.sum((left @ patterns) ** 2)
             risks.append((change + 2.0 * kept) / V - 1.0)
     return float(np.mean(risks)) if risks else 0.0

@@ -37,6 +37,8 @@ MEDIAN_SQUARE = 0.4549
 MIN_VARIANCE = 1e-60
 # Part of the exponent L^2 / v that zeros may have, as both are estimates.
 ZEROS_EXPONENT = 0.5
+# Entries other than 0, at least: fewer may be anything.
+MIN_ENTRIES = 16
 # Pixels by which a blurred first bounce may reach beyond its own.
 BLUR_REACH = 2
 # Differences that count as one independent coefficient.
@@ -128,6 +130,8 @@ class BlockReader:
         self.distance = distances(camera, projector)
         self.variance = detail_variance(self.X, camera, projector)
         self.has_unexplained_zeros = has_unexplained_zeros(self.zeros, self.light, self.variance)
+        entries = self.X.shape[1] * self.X.shape[3]
+        self.has_unexplained_zeros |= (1.0 - self.zeros) * entries < min(MIN_ENTRIES, entries)
 
     def kinds(self) -> Iterator[Blocks]:
         """Blocks by each kind of detail."""
