@@ -172,6 +172,7 @@ def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, nam
     assert json.loads(printed[1])[0]["file"] == str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["numpy", "scipy", "typer"])
 @pytest.mark.parametrize("options", [[], ["--json"]])
 def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
@@ -269,3 +270,10 @@ def test_devices_without_the_one_that_is_named(program, monkeypatch):
     assert "->" not in outcome.out
     monkeypatch.setattr(discovery, "list_devices", list)
     program("devices").refused("no OpenCL device", "install")
+
+
+def test_ltcl_is_imported_whatever_the_words_of_the_process_are() -> None:
+    """Processes of multiprocessing have the words of the program that started them."""
+    code = "import sys; sys.argv = ['program'] * 50; import ltcl"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
