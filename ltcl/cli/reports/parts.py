@@ -177,6 +177,7 @@ class VerdictNumbers(Report):
     other_grid: Annotated[Measured, "1 if another grid fits better."] = None
     exchanged: Annotated[Measured, "Colour channels that look exchanged. Good: 0."] = None
     no_bounces: Annotated[Measured, "1 if T is not square."] = None
+    blocks: Annotated[Measured, "1 if T has blocks between colours, hence no bounces."] = None
     shifted: Annotated[
         Measured,
         "Share of the camera's pixels whose brightest projector pixel is "

@@ -86,7 +86,8 @@ class Evidence:
     def measures(self) -> Iterator[Measure]:
         """Numbers of the whole T, and of each channel."""
         T = self.T
-        yield Measure("no_bounces", not T.is_square)
+        yield Measure("no_bounces", T.camera_grid != T.grid)
+        yield Measure("blocks", T.blocks is not None)
         yield from self._measure_order()
         for channel in range(T.channels):
             yield from self._measure_range(channel)
