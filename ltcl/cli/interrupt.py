@@ -26,10 +26,13 @@ INTERRUPTED = 130
 
 def is_program() -> bool:
     """Return True if Python was started for `ltcl` or `python -m ltcl`."""
+    # Processes of multiprocessing have the words of the program that started them.
+    is_worker = "--multiprocessing-fork" in sys.orig_argv
+    if is_worker or len(sys.argv) > len(sys.orig_argv):
+        return False
     # Of `python -m ltcl info` sys.argv has two words by now, and the second last is the module.
     started = PurePath(sys.orig_argv[-len(sys.argv)])
-    is_worker = "--multiprocessing-fork" in sys.orig_argv
-    return started.stem == "ltcl" and not is_worker
+    return started.stem == "ltcl"
 
 
 @contextlib.contextmanager

@@ -24,6 +24,7 @@ from ltcl.errors import FileError
 from ltcl.store.guards import EXPANSION, check_declared, sparse_floats
 from ltcl.store.record import (
     CHANNELS,
+    DEFAULT_NAMES,
     FileContents,
     FileNames,
     StoreRecord,
@@ -45,7 +46,9 @@ class SparseGroup:
     rows: int
 
 
-def read_hdf5(path: Path, variable: Variable = None, names: FileNames | None = None) -> StoreRecord:
+def read_hdf5(
+    path: Path, variable: Variable = None, names: FileNames = DEFAULT_NAMES
+) -> StoreRecord:
     """Read T, or T_0 to T_2."""
     members: dict[str, Any] = {}
     with _h5py(path).File(path, "r") as file:
@@ -57,7 +60,7 @@ def read_hdf5(path: Path, variable: Variable = None, names: FileNames | None = N
 
 
 def assemble_members(
-    members: Mapping[str, Any], variable: Variable, names: FileNames | None
+    members: Mapping[str, Any], variable: Variable, names: FileNames
 ) -> StoreRecord:
     """Make a record of datasets (or arrays), sparse groups, and kinds of all else, by name."""
     shapes = {}
@@ -72,13 +75,12 @@ def assemble_members(
             unreadable[name] = kind
         elif isinstance(member, SparseGroup) or hasattr(member, "dtype"):
             shapes[name] = _shape(member)
-    is_reversed = names is not None and names.is_reversed
 
     def load(name: str) -> Any:
         if not hasattr(members[name], "dtype"):
             return _sparse(members, name)
         array = _numbers(members[name])
-        if not is_reversed or name == "first_bounce" or array.ndim < 2:
+        if not names.is_reversed or name == "first_bounce" or array.ndim < 2:
             return array
         return array.swapaxes(-1, -2)
 
@@ -87,7 +89,7 @@ def assemble_members(
 
 
 def _kind(member: Any) -> str:
-    """Why a member cannot be T; empty if it can, or is a group."""
+    """The reason that a member cannot be T; empty if it can, or is a group."""
     if isinstance(member, str):
         return member
     try:

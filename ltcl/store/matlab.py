@@ -128,7 +128,7 @@ def _inflate(content: memoryview) -> tuple[int, memoryview]:
 
 
 def _other_kind(number_class: int) -> str:
-    """What a variable is that holds no real numbers."""
+    """The kind of a variable that holds no real numbers."""
     if number_class & COMPLEX:
         return "complex"
     return OTHER_CLASSES.get(number_class, "of a type of MATLAB's own")

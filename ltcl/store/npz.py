@@ -90,7 +90,7 @@ def read_npz(path: Path, variable: Variable = None) -> StoreRecord | CompressedR
 
 
 def _kind(dtype: np.dtype) -> str:
-    """Why an array of this type cannot be T; empty if it can."""
+    """The reason that an array of this type cannot be T; empty if it can."""
     if dtype.hasobject:
         return OBJECTS
     if dtype.kind in "fiubc":

@@ -210,6 +210,9 @@ class FileNames:
     is_reversed: bool = False
 
 
+DEFAULT_NAMES = FileNames()
+
+
 @dataclass(frozen=True, kw_only=True)
 class FileContents:
     """Arrays that a file holds by name, and how to read one of them.
@@ -225,14 +228,13 @@ class FileContents:
 def assemble(
     contents: FileContents,
     variable: Variable = None,
-    names: FileNames | None = None,
+    names: FileNames = DEFAULT_NAMES,
 ) -> StoreRecord:
     """Make a record of the arrays that a file holds by name.
 
     T is the array `variable`, or three of them; else that of `names`, its three channels, or the
     only matrix in the file.
     """
-    names = names or FileNames()
     shapes = contents.shapes
     load = contents.load
     if variable is None:

@@ -107,13 +107,12 @@ def verdict(T: Transport, **known: float) -> Verdict:
         for measure in Evidence(T).measures():
             _keep_worst(measure, numbers, places)
     except (InputError, np.linalg.LinAlgError) as error:
-        # For example compressed entries without noise.
-        return Verdict(f"Unknown: {error}.", numbers=numbers)
-    judged = _judge(numbers, places)
-    if T.noise.source == "unknown" and judged.compensation and "quantized" not in judged.causes:
-        advice = "Unknown: T does not show its noise: use ltcl analyze --noise."
-        return Verdict(advice, numbers=numbers)
-    return judged
+        # For example compressed entries without noise. Some damages show without it.
+        judged = _judge(numbers, places)
+        if judged.compensation:
+            return Verdict(f"Unknown: {error}.", numbers=numbers)
+        return judged
+    return _judge(numbers, places)
 
 
 def _check_enough_pixels(T: Transport) -> None:

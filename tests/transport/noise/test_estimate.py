@@ -99,6 +99,7 @@ SHARED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filtered", SHARED.values(), ids=SHARED.keys())
 @pytest.mark.parametrize(("side", "enlarged"), [(12, 1), (8, 3)])
 def test_errors_that_camera_pixels_share_are_not_underrated(
