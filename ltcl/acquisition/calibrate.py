@@ -286,7 +286,7 @@ def measure(
     consistency.check_superposition(session, few[0], others[0], lit, ambient)
     resampling = view.resampling.ascertained(white.value, white.valid)
     return Calibration(
-        exposures=times.scan,
+        exposures=tuple(times.scan),
         response=session.camera.response,
         noise=session.camera.noise,
         offset=session.camera.offset,
