@@ -60,6 +60,13 @@ def real(name: str, value: Any) -> np.ndarray:
         raise InputError(
             f"{name} is ragged; it must be a rectangular array of real numbers"
         ) from error
+    except (RuntimeError, TypeError) as error:
+        # Tensors that require a gradient, or are sparse, in bfloat16, or on another device.
+        reason = str(error).partition("\n")[0]
+        raise InputTypeError(
+            f"{name} is a {type(value).__name__} that NumPy cannot read ({reason}); a tensor must "
+            "be dense: give it as .detach().cpu().float().numpy()"
+        ) from error
     if array.dtype.kind not in "fiub":
         content = "is None" if value is None else f"holds {array.dtype}"
         raise InputTypeError(f"{name} {content}; it must hold real numbers")

@@ -45,8 +45,15 @@ TEMPORARY_NAME = re.compile(rf"\..*-{HOST}-[0-9a-f]{{16}}(\.[^.]*)?", re.DOTALL)
 # Arguments of renameat2(2) and renamex_np(2) that exchange two names.
 CURRENT_FOLDER = -100
 RENAME_EXCHANGE = 2
-# Errors of file systems that cannot exchange.
-CANNOT_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EXDEV)
+# Errors of file systems that cannot exchange; EPERM is that of sandboxes.
+CANNOT_EXCHANGE = (
+    errno.EINVAL,
+    errno.ENOSYS,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.EXDEV,
+    errno.EPERM,
+)
 # Errors of file systems without locks; EBADF is that of NFS.
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EBADF)
 # Errors of a writer that another one overtakes.
@@ -395,7 +402,7 @@ def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
             raise FileError(f"{target}: {name} cannot be placed there, a name in its path is used")
     folders = set()
     for file, destination in zip(files, destinations, strict=True):
-        _make_folders(destination.parent)
+        make_folders(destination.parent)
         os.replace(file, destination)
         folders.add(destination.parent)
     for folder in folders:
@@ -412,7 +419,7 @@ def _place_to_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(os.path.realpath(as_path(path)))
     created = _missing_folders(target.parent)
     try:
-        _make_folders(target.parent)
+        make_folders(target.parent)
         yield target
     except BaseException as error:
         _remove_empty(created)
@@ -436,7 +443,7 @@ def _missing_folders(folder: Path) -> list[Path]:
     return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
 
 
-def _make_folders(folder: Path) -> None:
+def make_folders(folder: Path) -> None:
     """Make a folder and its missing parents, each flushed into the one that holds it."""
     missing = _missing_folders(folder)
     folder.mkdir(parents=True, exist_ok=True)

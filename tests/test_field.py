@@ -193,7 +193,6 @@ def test_a_broken_command_fails_alone(modules, scenes, tmp_path, monkeypatch, ca
         ("dense", "coloured", 0.01),
         ("threshold", "coloured", 0.3),
         ("ltcl", "corner", 0.01),
-        ("ltcl compressed", "corner", 0.02),
     ],
 )
 def test_baselines_compensate_and_separate(modules, scenes, name, scene, most) -> None:

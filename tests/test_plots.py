@@ -66,7 +66,8 @@ def test_pictures_are_shown_as_they_are_under_their_names(tmp_path: Path) -> Non
             plots.pictures(*rows)
 
 
-def draw_figures(device: Device) -> list[Any]:
+@pytest.fixture(scope="module")
+def figures(device: Device) -> list[Any]:
     """A figure of each kind; one solution or analysis may stand alone."""
     T = ltcl.scenes.box(3, albedo=0.8).transport(device=device)
     analysis = ltcl.analyze(T)
@@ -79,15 +80,15 @@ def draw_figures(device: Device) -> list[Any]:
     ]
 
 
-def test_notebooks_show_every_figure(device, tmp_path: Path) -> None:
-    for figure in draw_figures(device):
+def test_notebooks_show_every_figure(figures, tmp_path: Path) -> None:
+    for figure in figures:
         plots.save(figure, tmp_path / "saved.png")
         shown = Image.open(io.BytesIO(figure._repr_png_()))
         saved = images.read_codes(tmp_path / "saved.png")
         np.testing.assert_array_equal(np.asarray(shown)[..., :3], saved[..., :3])
 
 
-def test_prompts_show_every_figure(device, monkeypatch, caplog) -> None:
+def test_prompts_show_every_figure(figures, monkeypatch, caplog) -> None:
     sizes = []
 
     def view(picture: Image.Image, _title: str) -> bool:
@@ -95,7 +96,6 @@ def test_prompts_show_every_figure(device, monkeypatch, caplog) -> None:
         return len(sizes) > 1
 
     monkeypatch.setattr(ImageShow, "show", view)
-    figures = draw_figures(device)
     for figure in figures:
         assert "show()" in repr(figure)
         figure.show()

@@ -217,7 +217,8 @@ def _deviation_of_inverses(
         suspects += [first[pair], second[pair]]
     return Deviation(
         suspects=tuple(suspects),
-        cause="deviates: a pattern and its inverse must add up to white, as the other ones do",
+        cause="deviates: a pattern and its inverse must add up to white, as the other ones do "
+        "(is a dynamic contrast on?)",
     )
 
 

@@ -9,6 +9,11 @@ the movement d of
     p y / w = p s (p + d . grad p)
 
 The factor p leaves out pixels with nothing but indirect light.
+
+A lamp that fades scales all light of the projector: with the light x of the pattern in the
+calibration and y now, both less ambient light, the gain is g = sum y / sum x. It counts if the
+contrast says the same, g = cov(x, y) / var(x): the sum does not change where something moves, and
+the contrast hardly where another light is on.
 """
 
 from __future__ import annotations
@@ -27,6 +32,23 @@ from ltcl.acquisition.radiometry import Radiance
 MIN_WHITE_SHARE = 0.1
 # Least s, so that d is finite.
 MIN_SCALE = 0.05
+# Change of the lamp since the calibration below which it is none, as shutters repeat themselves no
+# better, in standard deviations of noise as well; and the largest that is corrected.
+MIN_LAMP_CHANGE = 0.01
+LAMP_SIGMAS = 5.0
+MAX_LAMP_CHANGE = 0.15
+# Difference of the two measures of a change, relative to it, that is allowed.
+MAX_LAMP_DOUBT = 0.25
+# Relative variance of the light of blocks, below which their contrast tells nothing.
+MIN_CONTRAST = 0.05
+
+
+def sparse_pattern(grid: tuple[int, int]) -> np.ndarray:
+    """Codes (h, w) with one pixel of sixteen on, the middle one among them."""
+    height, width = grid
+    rows = (np.arange(height) - height // 2) % 4 == 0
+    columns = (np.arange(width) - width // 2) % 4 == 0
+    return np.outer(rows, columns).astype(np.float32)
 
 
 def pattern(grid: tuple[int, int]) -> np.ndarray:
@@ -70,10 +92,50 @@ class Anchor:
             variance=sample(picture.variance, pixels),
         )
 
-    def deviation(self, image: np.ndarray, seconds: float, camera: CameraModel) -> Deviation | None:
-        """Compare a photograph (H, W[, c]) of the pattern with that of the calibration."""
-        known = self.value, self.variance
+    def deviation(
+        self,
+        image: np.ndarray,
+        seconds: float,
+        camera: CameraModel,
+        ambient: Radiance,
+        gain: float = 1.0,
+    ) -> Deviation | None:
+        """Compare a photograph (H, W[, c]) of the pattern with that of the calibration.
+
+        `gain` is that of the lamp since then.
+        """
+        room = sample(ambient.value, self.pixels)
+        value = self.value if gain == 1.0 else room + gain * (self.value - room)
+        known = value, self.variance
         return find_deviation([sample(image, self.pixels)], [seconds], camera, known)
+
+    def lamp_gain(
+        self, image: np.ndarray, seconds: float, camera: CameraModel, ambient: Radiance
+    ) -> float:
+        """Gain of the lamp since the calibration, by a photograph (H, W[, c]) of the pattern.
+
+        It is 1 if there is no change, or another one than that of the lamp.
+        """
+        codes = sample(image, self.pixels)
+        curve = codes if codes.shape[1] > 1 else codes[:, 0]
+        linear = camera.response.linear(curve).reshape(codes.shape)
+        is_clear = (linear < camera.noise.saturation).all(axis=1)
+        room = sample(ambient.value, self.pixels)[is_clear]
+        x = (self.value[is_clear] - room).sum(axis=1, dtype=np.float64)
+        y = ((linear - camera.offset)[is_clear] / seconds - room).sum(axis=1, dtype=np.float64)
+        if len(x) < 2 or x.sum() <= 0 or x.var() < MIN_CONTRAST * x.mean() ** 2:
+            return 1.0
+        by_sum = float(y.sum() / x.sum())
+        by_contrast = float(np.cov(x, y)[0, 1] / x.var(ddof=1))
+        noise = self.variance[is_clear].sum()
+        noise += camera.noise.variance(linear[is_clear]).sum() / seconds**2
+        least_change = max(MIN_LAMP_CHANGE, LAMP_SIGMAS * float(np.sqrt(noise) / x.sum()))
+        change = abs(by_sum - 1.0)
+        doubt = abs(by_sum - by_contrast)
+        is_of_lamp = doubt <= max(least_change, MAX_LAMP_DOUBT * change)
+        if is_of_lamp and least_change < change < MAX_LAMP_CHANGE:
+            return by_sum
+        return 1.0
 
 
 def compact(picture: Radiance) -> np.ndarray:

@@ -5,7 +5,8 @@
     response     of the camera, from ramps at a bracket of exposures
     geometry     which projector pixel a camera pixel sees, by Gray code
     black, white repeatedly: noise of the camera, its offset, ambient light, the row sums of T
-    projector    uniform codes: light of each channel, and how colours mix
+    projector    uniform codes: light of each channel, and how colours mix; few pixels and all
+                 others: does its light depend on the picture?
     anchor       a pattern that is photographed again during the scan: did anything move?
 
 Known limit: the unit of light is what the response reaches at the last code, which has no absolute
@@ -134,7 +135,7 @@ class Effort:
     def requests(
         self, grid: tuple[int, int], channels: int, repeats: int, times: CaptureTimes
     ) -> list[list[Request]]:
-        """Blocks, black, white, uniform codes of each channel, and blocks again.
+        """Blocks, black, white, uniform codes of each channel, few pixels, blocks, the others.
 
         The second photograph of blocks shows that nothing moved in between.
         """
@@ -157,7 +158,9 @@ class Effort:
         groups = [blocks[:1], dark_requests, bright_requests]
         for channel in lit_channels:
             groups.append([(np.float32(code) * channel, times.black[0]) for code in codes])
-        return [*groups, blocks]
+        few = anchor.sparse_pattern(grid)
+        others = 1.0 - few
+        return [*groups, [(few, times.black[0])], blocks, [(others, times.black[0])]]
 
 
 def _repeated(codes: np.ndarray, times: Sequence[float], count: int) -> list[Request]:
@@ -195,7 +198,7 @@ def expected_photographs(
     to a side of one of the projector's.
 
     >>> expected_photographs((8, 16)), expected_photographs((8, 16), by_hand=True)
-    (147, 37)
+    (149, 39)
     """
     effort = BY_HAND if by_hand else AUTOMATIC
     camera_pixels = 1 if aligned else EXPECTED_CAMERA_PIXELS
@@ -261,7 +264,7 @@ def measure(
     times = _choose_times(session, white_exposure, exposures)
     repeats = effort.repeats(frames, view.camera_pixels)
     requests = effort.requests(shots.grid, shots.channels, repeats, times)
-    before, dark, bright, *uniform, after = session.take(requests)
+    before, dark, bright, *uniform, few, after, others = session.take(requests)
 
     # 4. Noise and offset of the camera; then photographs can be compared.
     of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
@@ -284,9 +287,10 @@ def measure(
         consistency.check_map(
             session, view.resampling, view.stripes, view.light, block_light, white.value
         )
+    consistency.check_superposition(session, few[0], others[0], dark, bright)
     resampling = view.resampling.ascertained(white.value, white.valid)
     return Calibration(
-        exposures=times.scan,
+        exposures=tuple(times.scan),
         response=session.camera.response,
         noise=session.camera.noise,
         offset=session.camera.offset,

@@ -6,6 +6,7 @@
     uniform codes   show black and a rising part of white
     light           white is brighter than black, and the scan's exposures show it
     colours         red, green and blue add up to white, else it is a warning
+    superposition   few pixels and all others add up to white: no dynamic contrast
     map             no pattern of Gray code was exchanged with its inverse
 
 An AcquisitionError names photographs, an InputError an argument of `ltcl.acquire`.
@@ -41,6 +42,9 @@ LAMP_SIGMAS = 5.0
 # a projector does not add its colours: clean ones deviate by less than 1 %.
 MAX_COLOUR_DEVIATION = 0.03
 COLOUR_SIGMAS = 5.0
+# Relative deviation of few pixels and the others from white, from which on the projector's light
+# depends on the picture. Clean ones deviate by less than 1 %.
+MAX_CONTRAST_CHANGE = 0.03
 # Standard deviations of noise that white must be above.
 MIN_SIGMAS = 3.0
 # Relative deviation of a projector's curve from pixel to pixel that is allowed.
@@ -144,6 +148,47 @@ def check_colours(colours: Sequence[Radiance], white: Radiance, black: Radiance)
             "colours), so that coloured patterns are off by as much; choose another mode (sRGB, "
             "cinema, reference), and begin again",
             100.0 * (1.0 + worst),
+        )
+
+
+def check_superposition(
+    session: CaptureSession,
+    few: Photograph,
+    others: Photograph,
+    dark: Sequence[Photograph],
+    bright: Sequence[Photograph],
+) -> None:
+    """Refuse a projector whose light depends on the picture, as by dynamic contrast.
+
+    Few pixels and all others must add up to the same part of white where the few are, in a dark
+    picture, and elsewhere, in a bright one. A lamp that fades changes both.
+    """
+    black = session.merge_sampled(dark)
+    light = session.merge_sampled(bright) - black
+    few_light = session.merge_sampled([few]) - black
+    other_light = session.merge_sampled([others]) - black
+    total = few_light.value + other_light.value
+    variance = few_light.variance + other_light.variance
+    is_valid = light.valid & few_light.valid & other_light.valid & (light.value > 0)
+    is_few = few_light.value > 0.5 * light.value
+    shares = []
+    deviations = []
+    for pixels in (is_valid & is_few, is_valid & ~is_few):
+        W = light.value[pixels].astype(np.float64)
+        square = max(float(W @ W), 1e-30)
+        shares.append(float(W @ total[pixels]) / square)
+        deviations.append(math.sqrt(W**2 @ variance[pixels]) / square)
+    dark_share, bright_share = shares
+    if dark_share <= 0 or bright_share <= 0:
+        return
+    tolerance = max(COLOUR_SIGMAS * math.hypot(*deviations), MAX_CONTRAST_CHANGE)
+    change = dark_share / bright_share
+    if abs(change - 1.0) > tolerance:
+        raise AcquisitionError(
+            f"{session.name(few)} or {session.name(others)} deviates: pixels in a dark picture are "
+            f"{change:.2f} times as bright as in a bright one, so the projector's light depends on "
+            "the picture: switch off dynamic contrast, automatic iris and lamp, local dimming; or "
+            f"another pattern was shown; {ADVICE}"
         )
 
 

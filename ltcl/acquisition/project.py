@@ -32,7 +32,7 @@ from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration, is_calibrated
 from ltcl.acquisition.metering import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
-from ltcl.acquisition.rig import Shots
+from ltcl.acquisition.rig import RigError, Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
 from ltcl.acquisition.rigs.simulated import CURVES, Sensor
 from ltcl.acquisition.scanning.plan import Light, measured
@@ -190,12 +190,17 @@ class Project:
 
     @contextlib.contextmanager
     def naming(self, table: str) -> Iterator[None]:
-        """Begin refusals of values with the file and the table that they stand in."""
+        """Begin refusals of values with the file and the table that they stand in.
+
+        A `RigError` is about [rig], whatever the table.
+        """
         try:
             yield
         except FileError:
             # It begins with a file.
             raise
+        except RigError as error:
+            raise RigError(f"{self.folder / FILE}: [rig] {error}") from None
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.folder / FILE}: [{table}] {error}") from None
 

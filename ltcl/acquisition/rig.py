@@ -36,6 +36,10 @@ DIGEST_SIDE = 8
 ImageFormat = tuple[tuple[int, ...], np.dtype]
 
 
+class RigError(InputError):
+    """InputError about the rig, not about another argument of `ltcl.acquire`."""
+
+
 class Rig(Protocol):
     """A projector of (h, w) pixels, and a camera that looks at what it lights.
 
@@ -208,7 +212,10 @@ class Shots(Closing):
                 recall(codes, seconds, stored)
             self.image = np.asarray(stored)
         name = self.name(getattr(self.rig, "number", self.count + 1))
-        scaled = to_unit(name, self.image, self.rig, self._format)
+        try:
+            scaled = to_unit(name, self.image, self.rig, self._format)
+        except InputError as error:
+            raise RigError(*error.args) from None
         self._record_format(name)
         self.count += 1
         self._record_digest(codes, seconds, scaled)
@@ -257,7 +264,7 @@ class Shots(Closing):
         if self.expected is not None and self.expected != sizes:
             text = "{} pixels and {} levels"
             expected = text.format(*self.expected)
-            raise InputError(
+            raise RigError(
                 f"{name} has {text.format(*sizes)}; "
                 f"it must have {expected}, as the scan was begun with, or another store"
             )

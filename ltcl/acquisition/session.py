@@ -24,7 +24,7 @@ import numpy as np
 
 from ltcl.acquisition.agreement import AgreementRecord, CameraModel
 from ltcl.acquisition.radiometry import Radiance, Response, merge
-from ltcl.acquisition.rig import Shots, shot_key, to_unit
+from ltcl.acquisition.rig import RigError, Shots, shot_key, to_unit
 from ltcl.acquisition.scratch import ImageFile, StoredImage
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
 from ltcl.files import locked, sweep
@@ -37,12 +37,12 @@ VOLATILE_KEYS = frozenset(("survey", "seed", "mitsuba", "source", "backend", "in
 RIG_ENTRY = "rig"
 SHOT_PREFIX = "shot_"
 
-# Codes (h, w[, 3]) and seconds.
 # Pixels of a photograph that determine what is common to all, such as noise.
 MAX_SAMPLED_PIXELS = 1 << 15
 # Values of all photographs that are merged at once.
 MERGED_VALUES = 1 << 22
 
+# Codes (h, w[, 3]) and seconds.
 Request = tuple[np.ndarray, float]
 # Called with a step, how much of it is done, and of how much.
 ProgressFunction = Callable[[str, int, int], None]
@@ -304,16 +304,18 @@ def _open_log(path: Path, shots: Shots) -> ArrayLog:
 def check_same_rig(description: Any, shots: Shots, path: Path) -> None:
     """Refuse a rig with another description than that of the photographs in `path`."""
     now = shots.describe()["rig"]
-    check_same("rig", _identity(now), _identity(description), path)
+    check_same("rig", _identity(now), _identity(description), path, RigError)
 
 
-def check_same(name: str, now: Any, before: Any, path: Path) -> None:
+def check_same(
+    name: str, now: Any, before: Any, path: Path, error: type[InputError] = InputError
+) -> None:
     """Refuse to go on with `path` if a setting, or a fact about a rig, has another value."""
     if isinstance(now, dict) and isinstance(before, dict):
         for key in sorted(now.keys() | before.keys()):
-            check_same(f"{name}.{key}", now.get(key), before.get(key), path)
+            check_same(f"{name}.{key}", now.get(key), before.get(key), path, error)
     elif now != before:
-        raise InputError(
+        raise error(
             f"{name} is {now!r:.80}, but {path} was begun with {before!r:.80}; "
             "it must be that, or another store"
         )

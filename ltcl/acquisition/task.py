@@ -25,9 +25,9 @@ from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
-from ltcl.acquisition.rig import Rig, Shots
+from ltcl.acquisition.rig import Rig, RigError, Shots
 from ltcl.acquisition.scanning import adaptive, columns, plan
-from ltcl.acquisition.scanning.pictures import ScanCamera, ScanGrid
+from ltcl.acquisition.scanning.pictures import LAMP_GAIN, ScanCamera, ScanGrid
 from ltcl.acquisition.session import (
     ProgressFunction,
     check_same,
@@ -285,8 +285,9 @@ def _check_same_scan(store: BlockStore, shots: Shots, settings: ScanSettings) ->
         check_same(name, value, before.get(name), path)
     facts = store.provenance["acquisition"]
     grid = Calibration.of(store).resampling.grid
-    check_same("rig.projector_grid", shots.grid, grid, path)
-    check_same("rig.channels", shots.channels, store.layout.channels, path)
+    channels = store.layout.channels
+    check_same("rig.projector_grid", shots.grid, grid, path, RigError)
+    check_same("rig.channels", shots.channels, channels, path, RigError)
     check_same_rig(facts["rig"], shots, path)
     if facts.get("camera_grid"):
         # The first photograph shows whether they are the same.
@@ -303,7 +304,7 @@ def _check_same_view(shots: Shots, digests: dict[str, Any], path: Path) -> None:
         change = np.subtract(shots.digest[name]["cells"], digest["cells"])
         difference = np.mean(np.abs(change))
         if difference > MAX_VIEW_DIFFERENCE:
-            raise InputError(
+            raise RigError(
                 f"{name} differs by {difference:.1%} of full scale from that of {path}; "
                 "rig and scene must be the same"
             )
@@ -397,6 +398,7 @@ def _scan(
     strategy = store.attributes["strategy"]
     side = settings.block if strategy == "block" else 1
     camera = ScanCamera(shots, calibration, side)
+    camera.lamp_gain = store.attributes.get(LAMP_GAIN, 1.0)
     if strategy == "adaptive":
         _run_adaptive(store, camera, camera, settings, progress)
         return

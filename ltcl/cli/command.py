@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import typer
 from typer.models import ArgumentInfo
 
+from ltcl.cli import interrupt
 from ltcl.cli.progress import Progress
 from ltcl.cli.reports.parts import ErrorReport
 from ltcl.cli.reports.report import document
@@ -111,7 +112,7 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
             own_values = {name: values[name] for name in own_names}
             with _log_to_stderr(quiet, verbose):
                 try:
-                    with Progress(quiet) as progress:
+                    with interrupt.raised(), Progress(quiet) as progress:
                         context = Context(
                             name=function.__name__, options=options, progress=progress
                         )

@@ -28,6 +28,7 @@ ADVICE_SHARE = 0.01
 MAX_SHEET_ROWS = 12
 ADVICE = {
     "dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto",
+    "dark at the largest gain": "; a smaller --loss, or --weights, brings it nearer",
     "bright": ", by bounces or the background; brighten its dark parts",
 }
 COLUMNS = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
@@ -159,7 +160,7 @@ def compensate_pictures(
             report.pictures.append(entry)
             sheet.append(shown)
             rows.append(_table_row(path, name, entry))
-            _note_out_of_reach(path, entry)
+            _note_out_of_reach(path, entry, has_largest_gain=job.settings["gain"] == "auto")
         panels.contact_sheet(sheet[:MAX_SHEET_ROWS]).save(folder / "compensate.png")
         pictures.write_report(folder, report)
     lines = [
@@ -266,8 +267,11 @@ def all_solves(entry: CompensatedPicture) -> list[Solve]:
     return solved
 
 
-def _note_out_of_reach(path: Path, entry: CompensatedPicture) -> None:
+def _note_out_of_reach(path: Path, entry: CompensatedPicture, has_largest_gain: bool) -> None:
     shares = {"dark": entry.too_dark, "bright": entry.too_bright}
     for kind, share in shares.items():
+        advice = ADVICE[kind]
+        if kind == "dark" and has_largest_gain:
+            advice = ADVICE["dark at the largest gain"]
         if share > ADVICE_SHARE:
-            note(f"{path}: {100 * share:.0f} % of it stays too {kind}{ADVICE[kind]}")
+            note(f"{path}: {100 * share:.0f} % of it stays too {kind}{advice}")

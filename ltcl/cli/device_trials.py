@@ -125,7 +125,7 @@ def _cells(height: int, width: int) -> np.ndarray:
     return np.vstack(levels)
 
 
-def _both_products(A: Operator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _both_products(A: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.vstack([A @ x, A.T @ y])
 
 

@@ -21,7 +21,6 @@ from ltcl.cli import (
     doctor,
     film,
     info,
-    interrupt,
     ranks,
     relight,
     separate,
@@ -84,7 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns the exit code.
     """
-    interrupt.release()
     words = sys.argv[1:] if arguments is None else list(arguments)
     if "--mpi" in words:
         return ranks.run_on_every_rank(run, words)

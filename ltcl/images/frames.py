@@ -15,7 +15,9 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,7 +27,6 @@ from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
 from ltcl.images.pictures import BITS, as_picture, read
-from ltcl.images.utf8_names import name_to_write
 from ltcl.images.video import Video
 
 # Videos that store the number of their frames.
@@ -35,8 +36,26 @@ COUNTED_EXTENSIONS = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
 OTHER_EXTENSIONS = (".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv", ".flv", ".ogv")
 EXTENSIONS = COUNTED_EXTENSIONS + OTHER_EXTENSIONS
 
+
+class Codec(NamedTuple):
+    """Names that FFmpeg gives to a container, its codec, and the layout of its pixels."""
+
+    container: str
+    name: str
+    pixel_format: str
+
+
 # Videos that can be written, and the codec of each; FFV1 is lossless.
-CODECS = {".mkv": "FFV1", ".avi": "FFV1", ".mp4": "mp4v"}
+CODECS = {
+    ".mkv": Codec("matroska", "ffv1", "bgr0"),
+    ".avi": Codec("avi", "ffv1", "bgr0"),
+    ".mp4": Codec("mp4", "mpeg4", "yuv420p"),
+}
+# MPEG-4 gets as many bits as it can use.
+BITS_PER_PIXEL = 64
+MAX_BIT_RATE = 1 << 30
+# MPEG-4 stores the frames per second as a fraction of two 16-bit numbers.
+MAX_DENOMINATOR = 1001
 
 _logger = logging.getLogger(__name__)
 
@@ -173,7 +192,7 @@ def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") ->
 
 
 def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
-    """Refuse a video by its extension, or by an odd height or width, which OpenCV would cut."""
+    """Refuse a video by its extension, or by an odd height or width, which MPEG-4 cannot hold."""
     path = as_path(path)
     if path.suffix.lower() not in CODECS:
         raise FileError(f"{path}: {unknown_extension(path)}; a video must be {', '.join(CODECS)}")
@@ -208,60 +227,57 @@ def write_video(
     FileError
         The extension is unknown, or the file cannot be written.
     """
+    # The import takes a while.
+    from av.error import FFmpegError
+
     path = as_path(path)
     fps = checks.number("fps", fps, above=0.0)
     check_video(path, (0, 0))
-    codec = CODECS[path.suffix.lower()]
     with replace_file(path) as temporary:
-        with name_to_write(temporary) as name:
-            count = _encode_video(path, name, pictures, fps)
+        try:
+            count = _encode_video(path, temporary, pictures, fps)
+        except FFmpegError as error:
+            raise FileError(f"{path}: cannot be encoded; perhaps the disk is full") from error
         if count == 0:
             raise InputError(f"{path}: there are no frames to write")
-        # OpenCV does not say that a disk is full.
-        written = _count_written(temporary)
-        if written != count:
-            raise FileError(
-                f"{path}: holds {written} of {count} frames in {codec}; is the disk full?"
-            )
     return count
-
-
-def _count_written(path: Path) -> int | None:
-    """Number of frames in a file; None if it is no video."""
-    try:
-        return Video(path).count
-    except FileError:
-        return None
 
 
 def _encode_video(path: Path, temporary: Path, pictures: Iterable[np.ndarray], fps: float) -> int:
     """Encode pictures into the file `temporary`, which is for `path`; their number."""
-    writer = cv2.VideoWriter()
+    import av
+
+    codec = CODECS[path.suffix.lower()]
     count = 0
     shape: tuple[int, ...] = ()
-    try:
+    # FFmpeg does not tell that a disk is full, but Python does.
+    with temporary.open("wb") as file, av.open(file, "w", format=codec.container) as video:
+        stream: Any = video.add_stream(codec.name, Fraction(fps).limit_denominator(MAX_DENOMINATOR))
+        stream.thread_type = "AUTO"
+        stream.pix_fmt = codec.pixel_format
         for count, picture in enumerate(pictures, start=1):
-            codes = _bgr_codes(picture)
+            codes = _rgb_codes(picture)
             if count == 1:
                 shape = codes.shape
                 h, w = shape[:2]
                 check_video(path, (h, w))
-                fourcc = writer.fourcc(*CODECS[path.suffix.lower()])
-                writer.open(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (w, h))
+                stream.height = h
+                stream.width = w
+                stream.bit_rate = min(BITS_PER_PIXEL * fps * codes[..., 0].size, MAX_BIT_RATE)
             if codes.shape != shape:
                 raise InputError(f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}")
-            writer.write(codes)
-    finally:
-        writer.release()
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(codes, format="rgb24")))
+        if count:
+            video.mux(stream.encode(None))
     return count
 
 
-def _bgr_codes(picture: np.ndarray) -> np.ndarray:
-    """Codes of a linear picture in sRGB, uint8, (h, w, 3) in the order of OpenCV."""
+def _rgb_codes(picture: np.ndarray) -> np.ndarray:
+    """Codes of a linear picture in sRGB, uint8, (h, w, 3)."""
     codes = from_linear(as_picture("a frame", picture), "srgb", 8, is_float=False)
     if codes.ndim == 2:
-        return cv2.cvtColor(codes, cv2.COLOR_GRAY2BGR)
-    return cv2.cvtColor(codes, cv2.COLOR_RGB2BGR)
+        return np.repeat(codes[..., None], 3, axis=2)
+    return np.ascontiguousarray(codes)
 
 
 def _list_pictures(folder: Path) -> list[Path]:

@@ -44,8 +44,8 @@ LAYOUTS = {
     12: GREY,
     14: GREY,
     16: GREY | INVERTED | COLOUR,
-    32: GREY | COLOUR,
-    64: GREY | COLOUR,
+    32: GREY | COLOUR | {(BLACK_IS_ZERO, 3)},
+    64: GREY | COLOUR | {(BLACK_IS_ZERO, 3)},
 }
 KINDS = {
     WHITE_IS_ZERO: "inverted grey",
@@ -97,10 +97,12 @@ def read_directory(data: bytes) -> Directory:
 def check_layout(directory: Directory) -> None:
     """Refuse pixels in a layout that OpenCV does not decode, or decodes wrong."""
     samples = int(directory.get(SAMPLES, 1))
-    if samples > 1 and directory.get(PLANAR, 1) != 1:
-        raise FileError(f"stores its channels in separate planes; {CURE}")
     bits = _bits(directory)
     photometric = directory.get(PHOTOMETRIC)
+    are_planes = samples > 1 and directory.get(PLANAR, 1) != 1
+    # libtiff itself puts planes of 8 bits together.
+    if are_planes and (photometric, bits) != (RGB, 8):
+        raise FileError(f"stores its channels in separate planes; {CURE}")
     if (photometric, samples) not in LAYOUTS.get(bits, ()):
         kind = KINDS.get(photometric, f"kind {photometric}")
         raise FileError(f"holds {samples} channel(s) of {bits} bits, {kind}; {CURE}")

@@ -185,7 +185,8 @@ def _frame_count(container: Any, stream: Any) -> int | None:
     if container.duration is None or not stream.guessed_rate:
         return None
     # FFmpeg counts durations in microseconds.
-    return int(container.duration / 1e6 * float(stream.guessed_rate) + 0.5) or None
+    count = int(container.duration / 1e6 * float(stream.guessed_rate) + 0.5)
+    return count if count > 0 else None
 
 
 class _Decoder:

@@ -19,12 +19,13 @@ from ltcl.operators.epilogue import Epilogue, widths
 from ltcl.operators.knowledge import Float64Form
 from ltcl.operators.rows import RowOperator, Slab, cut
 
-# Chunks of rows of a transposed product on a GPU: enough groups for a large one, none too short.
-MAX_CHUNKS = 64
-MIN_CHUNK_ROWS = 32
-# Columns of a work-item of a transposed product: a CPU reads them as a stream.
-CPU_STRIP = 256
-GPU_STRIP = 1
+# Columns of a work-item of a transposed product, and work-items side by side: a CPU reads its
+# columns as a stream.
+CPU_STRIPS = {"STRIP": 256, "STRIPS": 1}
+GPU_STRIPS = {"STRIP": 1, "STRIPS": 16}
+# Slices of rows of a transposed product on a GPU: enough items for a large one, none too short.
+MAX_SLICES = 64
+MIN_SLICE_ROWS = 32
 
 
 class Dense(RowOperator):
@@ -61,8 +62,7 @@ class Dense(RowOperator):
         checks.finite("matrix", values)
         super().__init__(device, values.shape)
         device.require(4 * values.size, f"a dense matrix {values.shape}")
-        self.defines = {"STRIP": CPU_STRIP if device.is_cpu else GPU_STRIP}
-        self._ones: Array | None = None
+        self.defines = CPU_STRIPS if device.is_cpu else GPU_STRIPS
         self.slabs = self.upload(values)
 
     def upload(self, matrix: np.ndarray, first: int = 0) -> list[Slab]:
@@ -110,21 +110,19 @@ class Dense(RowOperator):
             epilogue = epilogue.added_to(out)
 
     def _queue_transposed_slab(self, slab: Slab, x: Array, out: Array, epilogue: Epilogue) -> None:
-        """Queue the product of one slab, on a GPU in chunks of rows to feed more work-items."""
-        strip = self.defines["STRIP"]
-        items = -(-self.shape[1] // strip)
-        if strip == GPU_STRIP:
-            group = 64
-            chunks = max(1, min(MAX_CHUNKS, -(-slab.rows // MIN_CHUNK_ROWS)))
-        else:
-            group = 1
-            chunks = 1
-        sums = out if chunks == 1 else self.device.empty((chunks, *out.shape))
+        """Queue the product of one slab, on a GPU with items for slices of rows."""
+        strips = self.defines["STRIPS"]
+        slices = 1
+        if not self.device.is_cpu:
+            slices = max(1, min(MAX_SLICES, -(-slab.rows // MIN_SLICE_ROWS)))
         for offset, width in widths(x.columns):
             kernel = self.kernel("dense_rmatvec", width, x.columns)
+            local_items = self.device.local_memory // (4 * width)
+            group = kernel.group(min(strips * slices, local_items))
+            columns_of_group = self.defines["STRIP"] * min(strips, group)
             kernel(
-                (items, chunks),
-                (group, 1),
+                -(-self.shape[1] // columns_of_group) * group,
+                group,
                 rows=slab.rows,
                 first=slab.first,
                 stride=x.columns,
@@ -134,30 +132,7 @@ class Dense(RowOperator):
                 c=epilogue.c,
                 x=x,
                 y=epilogue.operand(out),
-                out=sums,
+                out=out,
+                scratch=self.device.local(width * group),
                 **slab.arguments,
             )
-        if chunks > 1:
-            self._queue_chunk_sum(sums, chunks, out)
-
-    def _queue_chunk_sum(self, sums: Array, chunks: int, out: Array) -> None:
-        """Queue out = sum of the chunks, as a product of the transposed sums with ones."""
-        if self._ones is None:
-            self._ones = self.device.upload(np.ones(MAX_CHUNKS))
-        kernel = self.kernel("dense_rmatvec", 1, 1)
-        kernel(
-            (out.size, 1),
-            (64, 1),
-            rows=chunks,
-            first=0,
-            stride=1,
-            offset=0,
-            a=1.0,
-            b=0.0,
-            c=0.0,
-            x=self._ones,
-            y=out,
-            out=out,
-            width=out.size,
-            matrix=sums,
-        )

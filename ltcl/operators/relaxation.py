@@ -22,7 +22,7 @@ from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR
-from ltcl.operators.dense import Dense
+from ltcl.operators.dense import GPU_STRIPS, Dense
 from ltcl.operators.epilogue import widths
 from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.rows import Slab
@@ -363,7 +363,7 @@ class Sweeps:
         """Queue one block on a GPU: s_B, then x_B += P_BB^-1 s_B."""
         relaxation = self.relaxation
         sums = relaxation.kernel("relax_rows", **defines)
-        correct = sums.device.kernel("dense", "dense_matvec_group", STRIP=1, **defines)
+        correct = sums.device.kernel("dense", "dense_matvec_group", **GPU_STRIPS, **defines)
         group = min(sums.group(self.group), correct.group(self.group))
         local = self.x.device.local(2 * defines["K"] * group)
         for number, begin, end in self._panel_slabs(start):

@@ -220,7 +220,7 @@ class MonteCarlo(Sampler):
                 x=x,
                 status=Status.SAMPLED,
                 iterations=1,
-                products=channel.products,
+                products=channel.system.products,
                 residuals=(np.nan,),
                 method=self.name,
                 reason=reason,

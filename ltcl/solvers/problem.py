@@ -167,9 +167,12 @@ def check_square(name: str, S: Any) -> tuple[int, ...]:
     """Return the shape of S before it becomes an operator; refuse all but (N, N)."""
     # Asked of the object instead of its type, the property would upload the transport.
     if hasattr(type(S), "interreflection"):
-        raise InputTypeError(
-            f"{name} is a {type(S).__name__}; give its operator, T.interreflection"
-        )
+        advice = "give its operator, T.interreflection"
+        if not S.is_square:
+            advice = "it has no S to solve with; ltcl.compensate undoes its light"
+        elif S.channels == 3:
+            advice = "solve with each of its three operators, T.systems"
+        raise InputTypeError(f"{name} is a {type(S).__name__}; {advice}")
     shape = getattr(S, "shape", None)
     if not shape:
         shape = checks.real(name, S).shape

@@ -23,7 +23,7 @@ from ltcl.operators.walks import Tables
 from ltcl.solvers.method import Method
 from ltcl.solvers.problem import LinearProblem, naming_channel, unscale
 from ltcl.solvers.result import Solution, Status
-from ltcl.solvers.stopping import relative_residual
+from ltcl.solvers.stopping import CountedOperator, Monitor, relative_residual
 
 Callback = Callable[[int, float], object]
 # Called after each step.
@@ -47,20 +47,23 @@ class SampledChannel:
         self.rtol = min(problem.required_rtol, 1.0)
         self.maxiter = problem.rule.maxiter
         self.R, self.sign = walks.rows_of_R(self.S, method)
-        self.products = 0
-        self._right = self.S.device.upload(self.b)
+        right = self.S.device.upload(self.b)
+        norms = np.atleast_1d(np.linalg.norm(self.b.astype(np.float64), axis=0))
+        self.system = CountedOperator(S=self.S, b=right, norms=norms, host=self.b)
+        # Callbacks are called by the method.
+        self._rule = dataclasses.replace(problem.rule, callback=None)
+        self._r = right.like()
         if problem.x0 is None:
             self.x = np.zeros(self.b.shape)
-            self.r = self._right.get()
+            self.r = right.get()
         else:
             self.x = problem.x0.astype(np.float32).astype(np.float64)
             self.r = self.residual(self.x)
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Compute b - S x by one product."""
-        self.products += 1
-        on_device = self.S.device.upload(x)
-        return self.S.apply(on_device, scale=-1.0, add=self._right).get()
+        self.system.residual(x, self._r)
+        return self._r.get()
 
     def solution(
         self,
@@ -80,18 +83,20 @@ class SampledChannel:
             raise InputError(
                 "the estimate has grown beyond float32; rescale, or use method='chebyshev'"
             )
-        norms = np.linalg.norm(self.b.astype(np.float64), axis=0)
-        residual_norms = np.linalg.norm(self.residual(x).astype(np.float64), axis=0)
-        residual = relative_residual(residual_norms, norms)
+        system = self.system
+        monitor = Monitor(system=system, rule=self._rule)
+        norms = system.residual(x, self._r)
+        norms, is_solved = monitor.confirm(x, self._r, norms, is_last=True)
+        residual = relative_residual(norms, system.norms)
         status = Status.CONVERGED
-        if not (met_error and residual <= self.rtol):
+        if not (met_error and is_solved):
             status = Status.SAMPLED
             reason = f"{reason}; {advice}"
         return Solution(
             x=x,
             status=status,
             iterations=iterations,
-            products=self.products,
+            products=system.products,
             residuals=(1.0, residual),
             method=self.method,
             reason=reason,

@@ -202,7 +202,7 @@ class Monitor:
             self._recursion_steps += len(norms)
             self._travelled = self._travelled + travelled
 
-        self.norms, is_solved = self._confirm(x, r, newest)
+        self.norms, is_solved = self.confirm(x, r, newest)
         troubles = []
         for step_norms in (*earlier, self.norms):
             troubles.append(self._judge(step_norms))
@@ -294,12 +294,14 @@ class Monitor:
             digits = np.log(np.max(self.norms / goal, initial=1.0))
             return digits / -np.log(factor)
 
-    def _confirm(self, x: Any, r: Array, norms: np.ndarray) -> tuple[np.ndarray, bool]:
+    def confirm(
+        self, x: Any, r: Array, norms: np.ndarray, *, is_last: bool = False
+    ) -> tuple[np.ndarray, bool]:
         """Return norms (k,) of the newest residual, as exact as needed, and whether x solves.
 
         A claim is decided by the first of these that can decide it: the bound on what rounding may
         hide in the residual at hand; the same bound for the residual computed anew; the residual in
-        float64, where that is cheap (small systems) or after too many refusals.
+        float64, where that is cheap (small systems), after too many refusals, or if x `is_last`.
         """
         system = self.system
         seems_solved = bool(np.all(norms <= self._target))
@@ -320,7 +322,7 @@ class Monitor:
         if not seems_solved:
             return norms, False
 
-        is_last_refusal = self._refusals + 1 >= MAX_REFUSALS
+        is_last_refusal = is_last or self._refusals + 1 >= MAX_REFUSALS
         if is_cheap or (is_last_refusal and system.product_float64 is not None):
             norms = system.exact_residual(x, r)
             self._restart_recursion()

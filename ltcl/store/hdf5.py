@@ -11,7 +11,7 @@ A file is written in memory first: HDF5 that finds a disk full ends the process.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,15 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import FileError
 from ltcl.store.guards import EXPANSION, check_declared, sparse_floats
-from ltcl.store.record import CHANNELS, FileContents, FileNames, StoreRecord, assemble
+from ltcl.store.record import (
+    CHANNELS,
+    DEFAULT_NAMES,
+    FileContents,
+    FileNames,
+    StoreRecord,
+    Variable,
+    assemble,
+)
 
 ROWS = "MATLAB_sparse"
 # Numbers by the kinds of NumPy; complex ones are refused by name.
@@ -38,10 +46,9 @@ class SparseGroup:
     rows: int
 
 
-Variable = str | Sequence[str] | None
-
-
-def read_hdf5(path: Path, variable: Variable = None, names: FileNames | None = None) -> StoreRecord:
+def read_hdf5(
+    path: Path, variable: Variable = None, names: FileNames = DEFAULT_NAMES
+) -> StoreRecord:
     """Read T, or T_0 to T_2."""
     members: dict[str, Any] = {}
     with _h5py(path).File(path, "r") as file:
@@ -53,7 +60,7 @@ def read_hdf5(path: Path, variable: Variable = None, names: FileNames | None = N
 
 
 def assemble_members(
-    members: Mapping[str, Any], variable: Variable, names: FileNames | None
+    members: Mapping[str, Any], variable: Variable, names: FileNames
 ) -> StoreRecord:
     """Make a record of datasets (or arrays), sparse groups, and kinds of all else, by name."""
     shapes = {}
@@ -68,13 +75,12 @@ def assemble_members(
             unreadable[name] = kind
         elif isinstance(member, SparseGroup) or hasattr(member, "dtype"):
             shapes[name] = _shape(member)
-    is_reversed = names is not None and names.is_reversed
 
     def load(name: str) -> Any:
         if not hasattr(members[name], "dtype"):
             return _sparse(members, name)
         array = _numbers(members[name])
-        if not is_reversed or name == "first_bounce" or array.ndim < 2:
+        if not names.is_reversed or name == "first_bounce" or array.ndim < 2:
             return array
         return array.swapaxes(-1, -2)
 
@@ -83,7 +89,7 @@ def assemble_members(
 
 
 def _kind(member: Any) -> str:
-    """Why a member cannot be T; empty if it can, or is a group."""
+    """The reason that a member cannot be T; empty if it can, or is a group."""
     if isinstance(member, str):
         return member
     try:
@@ -114,7 +120,9 @@ def _sparse(members: Mapping[str, Any], name: str) -> scipy.sparse.csr_array:
     rows = _numbers(members.get(f"{name}/ir", empty))[:entries]
     shape = checks.grid(f"shape of {name!r}", (members[name].rows, len(starts) - 1))
     return sparse_floats(
-        lambda: scipy.sparse.csc_array((data, rows, starts), shape=shape), shape, data.size
+        lambda: scipy.sparse.csc_array((data, rows, starts), shape=shape),
+        shape,
+        data.size,
     )
 
 

@@ -21,8 +21,8 @@ import scipy.io
 
 from ltcl import checks
 from ltcl.errors import FileError
-from ltcl.store.hdf5 import SparseGroup, Variable, assemble_members, read_hdf5
-from ltcl.store.record import EXTRAS, FileNames, StoreRecord
+from ltcl.store.hdf5 import SparseGroup, assemble_members, read_hdf5
+from ltcl.store.record import EXTRAS, FileNames, StoreRecord, Variable
 
 NAMES = FileNames(matrix="LTM", channels=("LTM_r", "LTM_g", "LTM_b"), is_reversed=True)
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -128,7 +128,7 @@ def _inflate(content: memoryview) -> tuple[int, memoryview]:
 
 
 def _other_kind(number_class: int) -> str:
-    """What a variable is that holds no real numbers."""
+    """The kind of a variable that holds no real numbers."""
     if number_class & COMPLEX:
         return "complex"
     return OTHER_CLASSES.get(number_class, "of a type of MATLAB's own")

@@ -105,8 +105,12 @@ def read_mtx(path: Path) -> StoreRecord:
 
 def _check_kinds(line: bytes) -> None:
     """Refuse a first line with other words than those of real matrices."""
-    words = line.decode("ascii", "replace").lower().split()[1:]
-    for (name, allowed), word in zip(KINDS.items(), words, strict=False):
+    words = line.decode("ascii", "replace").lower().split()
+    if len(words) != 1 + len(KINDS) or words[0].lstrip("%") != "matrixmarket":
+        raise FileError(
+            f"the first line is {line[:60]!r}; it must be %%MatrixMarket and {', '.join(KINDS)}"
+        )
+    for (name, allowed), word in zip(KINDS.items(), words[1:], strict=True):
         if word not in allowed:
             raise FileError(f"the {name} is {word:.40}; it must be {' or '.join(allowed)}")
 

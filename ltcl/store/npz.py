@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +28,7 @@ from ltcl.store.record import (
     CompressedRecord,
     FileContents,
     StoreRecord,
+    Variable,
     assemble,
 )
 
@@ -46,9 +47,7 @@ MAX_DATA_DESCRIPTOR = 24
 Headers = dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
-def read_npz(
-    path: Path, variable: str | Sequence[str] | None = None
-) -> StoreRecord | CompressedRecord:
+def read_npz(path: Path, variable: Variable = None) -> StoreRecord | CompressedRecord:
     """Read an .npz; MemoryLimitError or FileError before any array that does not fit is made."""
     headers = _headers(path)
     with np.load(path, allow_pickle=False) as archive:
@@ -91,7 +90,7 @@ def read_npz(
 
 
 def _kind(dtype: np.dtype) -> str:
-    """Why an array of this type cannot be T; empty if it can."""
+    """The reason that an array of this type cannot be T; empty if it can."""
     if dtype.hasobject:
         return OBJECTS
     if dtype.kind in "fiubc":
@@ -134,6 +133,9 @@ def _headers(path: Path) -> Headers:
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
             with archive.open(info) as stream:
+                # Opened all the same: a name in the directory may be damaged.
+                if name == info.filename:
+                    continue
                 shape, dtype = _array_header(stream)
                 stored = info.file_size - stream.tell()
             most = EXPANSION * min(info.compress_size, file_size)
@@ -200,9 +202,10 @@ def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:
 def read_npy(path: Path) -> StoreRecord:
     """Read a dense matrix, or map it where memory has no room for two of it."""
     with path.open("rb") as file:
-        _, dtype = _array_header(file)
-    if dtype.hasobject:
-        raise FileError(f"is {OBJECTS}; it must be an array of real numbers")
+        shape, dtype = _array_header(file)
+    kind = _kind(dtype)
+    if kind:
+        raise FileError(f"holds an array {shape} that is {kind}; it must be of real numbers")
     mapped = np.lib.format.open_memmap(path, "r")  # reads the header and allocates nothing
     has_room = 2 * mapped.nbytes <= checks.host_memory()
 

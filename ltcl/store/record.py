@@ -108,6 +108,8 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
 
 
 Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
+# Name of an array, or names of three, "red,green,blue"; None takes the default.
+Variable = str | Sequence[str] | None
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,9 @@ class FileNames:
     is_reversed: bool = False
 
 
+DEFAULT_NAMES = FileNames()
+
+
 @dataclass(frozen=True, kw_only=True)
 class FileContents:
     """Arrays that a file holds by name, and how to read one of them.
@@ -222,15 +227,14 @@ class FileContents:
 
 def assemble(
     contents: FileContents,
-    variable: str | Sequence[str] | None = None,
-    names: FileNames | None = None,
+    variable: Variable = None,
+    names: FileNames = DEFAULT_NAMES,
 ) -> StoreRecord:
     """Make a record of the arrays that a file holds by name.
 
     T is the array `variable`, or three of them; else that of `names`, its three channels, or the
     only matrix in the file.
     """
-    names = names or FileNames()
     shapes = contents.shapes
     load = contents.load
     if variable is None:
@@ -275,8 +279,9 @@ def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequ
         if name in contents.unreadable:
             raise _unreadable(contents, name)
         if name not in contents.shapes:
-            present = ", ".join([*contents.shapes, *contents.unreadable]) or "none"
-            raise FileError(f"variable {name!r} is missing; it holds {present:.200}")
+            present = [*contents.shapes, *contents.unreadable] or ["none"]
+            listed = ", ".join(present)
+            raise FileError(f"variable {name!r} is missing; it holds {listed:.200}")
     return chosen
 
 
@@ -305,7 +310,8 @@ def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:
             matrices.append(name)
     if len(matrices) == 1:
         return matrices
-    listed += [f"{name!r} ({kind})" for name, kind in contents.unreadable.items()]
+    for name, kind in contents.unreadable.items():
+        listed.append(f"{name!r} ({kind})")
     if not shapes:
         listed.insert(0, "no numbers")
     raise FileError(

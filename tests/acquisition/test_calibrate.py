@@ -148,7 +148,7 @@ def coloured_calibration() -> Replaying:
     T = ltcl.scenes.dihedral(8, albedo=(0.8, 0.6, 0.4)).transport()
     camera = Replaying(T, T.grid)
     measure(Shots(camera), geometry="aligned", frames=2)
-    assert len(camera.images) == 59
+    assert len(camera.images) == 61
     return camera
 
 

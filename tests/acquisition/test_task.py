@@ -202,7 +202,7 @@ def test_a_camera_of_its_own_pixels(
     """It is decoded by Gray code. Pixels that it does not see are masked, the others are right.
 
     The pattern for the measured transport shows the picture under the true one to 30 dB. By hand,
-    with all defaults, it takes at most 300 photographs.
+    with all defaults, it takes at most 305 photographs.
     """
     path = tmp_path / "T.zarr"
     size = (27, 50)
@@ -213,7 +213,7 @@ def test_a_camera_of_its_own_pixels(
     oblique.keeps_photographs = by_hand
     T = acquire(oblique, strategy=strategy, store=path)
     if by_hand:
-        assert oblique.count <= 300
+        assert oblique.count <= 305
 
     area = np.asarray(view.sum(axis=0))
     seen = ~T.masked

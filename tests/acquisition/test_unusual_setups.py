@@ -139,3 +139,52 @@ def test_a_camera_without_short_exposures_is_calibrated(
     light = calibration.response.linear(black).mean() - float(np.mean(calibration.offset))
     expected = camera.radiance(np.zeros(grid)).mean() * camera.sensitivity * exposures[0]
     assert light == pytest.approx(expected, abs=0.001)
+
+
+class Dimmed(VirtualRig):
+    """A projector whose light is multiplied by gain(mean light of the picture, photographs)."""
+
+    def __init__(self, gain: Any, **options: Any) -> None:
+        super().__init__(corner(), GRID, **{"bits": 12, "ambient": 0.01, **options})
+        self._gain = gain
+        self._photographs = 0
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        self._photographs += 1
+        self._last = None
+        return super().photograph(codes, seconds)
+
+    def _light(self, codes: np.ndarray) -> np.ndarray:
+        light = super()._light(codes)
+        return light * self._gain(light.mean(), self._photographs)
+
+
+DEPENDING = {
+    "iris": lambda mean, count: 0.9 if mean < 0.3 else 1.0,
+    "dynamic contrast": lambda mean, count: 0.95 + 0.05 * mean,
+    "limited power": lambda mean, count: 1.1 - 0.1 * mean,
+}
+
+
+@pytest.mark.parametrize("gain", DEPENDING.values(), ids=DEPENDING)
+@pytest.mark.parametrize("response", ["srgb", "film"])
+def test_light_that_depends_on_the_picture_is_refused(gain: Any, response: str) -> None:
+    with pytest.raises(AcquisitionError, match=r"photograph \d+ .*deviates.*contrast"):
+        measure(Shots(Dimmed(gain, response=response)), geometry="aligned")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["hadamard", "pixel", "adaptive"])
+@pytest.mark.parametrize("fade", [0.1, -0.05])
+def test_a_lamp_that_fades_is_corrected(strategy: str, fade: float) -> None:
+    """It has changed by this part after 500 photographs; a scan takes that many."""
+    lamp = Dimmed(lambda mean, count: 1.0 - fade * count / 500)
+    T = acquire(lamp, geometry="aligned", strategy=strategy)
+    assert relative_error(dense(T), corner(), GRID) < 0.012
+
+
+@pytest.mark.slow
+def test_a_lamp_that_changes_at_once_is_refused() -> None:
+    lamp = Dimmed(lambda mean, count: 0.8 if count > 300 else 1.0)
+    with pytest.raises(AcquisitionError, match="photographs"):
+        acquire(lamp, geometry="aligned", strategy="hadamard")

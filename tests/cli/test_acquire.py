@@ -153,9 +153,13 @@ def test_a_live_scan_with_all_photographs_opens_no_camera(program, finished):
 
 
 def test_a_scan_with_other_settings_is_refused(program, finished):
+    """The table is named that the setting stands in."""
+    change(finished, "bits = 12", "bits = 14")
+    program("acquire", "run", finished).refused("acquisition.toml: [rig]", "bits is 14", "12")
+    change(finished, "bits = 14", "bits = 12")
     change(finished, 'strategy = "pixel"', 'strategy = "hadamard"')
     outcome = program("acquire", "run", finished)
-    outcome.refused("acquisition.toml: [", "strategy is 'hadamard'", "'pixel'")
+    outcome.refused("acquisition.toml: [acquire]", "strategy is 'hadamard'", "'pixel'")
 
 
 @pytest.mark.parametrize("command", ["plan", "run"])

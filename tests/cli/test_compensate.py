@@ -262,3 +262,13 @@ def test_a_failed_run_changes_nothing(program, transport, picture, tmp_path):
     arguments = [transport, picture, "--weights", black, "--gain", "auto", "--out", tmp_path]
     program("compensate", *arguments).refused("weights", "0 to 0", "sky.exr")
     assert {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)} == before
+
+
+@pytest.mark.parametrize("gain", ["5", "auto"])
+def test_advice_is_not_what_was_asked_for(program, transport, picture, tmp_path, gain):
+    options = ["--gain", gain, "--out", tmp_path / "out"]
+    if gain == "auto":
+        options += ["--loss", "0.6"]
+    outcome = program("compensate", transport, picture, *options)
+    assert "stays too dark" in outcome.err
+    assert ("--gain auto" in outcome.err) == (gain != "auto")

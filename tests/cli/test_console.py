@@ -8,12 +8,15 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 import ltcl
@@ -169,6 +172,7 @@ def test_names_are_printed_on_every_stdout(transport, tmp_path, monkeypatch, nam
     assert json.loads(printed[1])[0]["file"] == str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["numpy", "scipy", "typer"])
 @pytest.mark.parametrize("options", [[], ["--json"]])
 def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
@@ -188,6 +192,25 @@ def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
     assert run.stderr == "ltcl: error: interrupted\n"
     if options:
         assert json.loads(run.stdout)["exit_code"] == 130
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_any_moment_is_one_line():
+    """From the moment at which Python imports ltcl, to the end; after that all is printed."""
+    words = [sys.executable, "-m", "ltcl", "devices"]
+    start = time.monotonic()
+    subprocess.run(words, capture_output=True, check=True)
+    duration = time.monotonic() - start
+    codes = set()
+    for share in np.linspace(0.3, 1.0, 9):
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(share * duration)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+        codes.add(process.returncode)
+        expected = {130: "ltcl: error: interrupted\n", 0: ""}
+        assert errors == expected.get(process.returncode), process.returncode
+    assert 130 in codes
 
 
 def test_who_imports_ltcl_keeps_the_handlers_of_signals():
@@ -247,3 +270,10 @@ def test_devices_without_the_one_that_is_named(program, monkeypatch):
     assert "->" not in outcome.out
     monkeypatch.setattr(discovery, "list_devices", list)
     program("devices").refused("no OpenCL device", "install")
+
+
+def test_ltcl_is_imported_whatever_the_words_of_the_process_are() -> None:
+    """Processes of multiprocessing have the words of the program that started them."""
+    code = "import sys; sys.argv = ['program'] * 50; import ltcl"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -51,6 +51,7 @@ HEADER = "common/lanes.h"
 DEFINES = {
     "K": 2,
     "STRIP": 2,
+    "STRIPS": 1,
     "WIDTH": 8,
     "PLACE": "int",
     "VALUES": 2,
@@ -104,8 +105,8 @@ def test_messages_name_file_line_and_defines(device, own_kernels):
 def test_missing_and_wrong_defines_and_names_are_refused(device, file):
     for name, defines, part in (
         ("matvec", {}, "needs -DK="),
-        ("matvec", {"K": 5, "STRIP": 1}, "1, 2, 3, 4 or 8"),
-        ("none", {"K": 1, "STRIP": 1}, f"{file}_none"),
+        ("matvec", {"K": 5, "STRIP": 1, "STRIPS": 1}, "1, 2, 3, 4 or 8"),
+        ("none", {"K": 1, "STRIP": 1, "STRIPS": 1}, f"{file}_none"),
     ):
         with pytest.raises(DeviceError, match=part):
             device.kernel(file, f"{file}_{name}", **defines)

@@ -98,7 +98,7 @@ def test_a_folder_that_cannot_be_made_is_refused(
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "file" / "folder"))
     fresh = Device(device.description)
     with pytest.raises(DeviceError, match="POCL_CACHE_DIR"):
-        ltcl.operators.Dense(fresh, np.eye(2)) @ np.ones(2)
+        ltcl.operators.Dense(fresh, np.eye(2)).matvec(np.ones(2))
 
 
 @pytest.mark.parametrize(

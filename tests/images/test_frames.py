@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import resource
 import struct
 
 import cv2
@@ -135,3 +136,29 @@ def test_bad_frames_leave_the_earlier_video(tmp_path, name, pictures, fps, text)
     with pytest.raises(InputError, match=text):
         write_video(tmp_path / name, pictures, fps)
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [(name, b"old")]
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "a.avi", "a.mp4", "a.png", "a.exr", "a.tif", "a.jpg"])
+def test_a_full_disk_is_noticed_and_the_earlier_file_stays(tmp_path, name):
+    """Files cannot become larger than a limit, in the place of a full disk."""
+    path = tmp_path / name
+    pictures = [np.random.default_rng(seed).random((40, 60, 3)) for seed in range(8)]
+
+    def write() -> None:
+        if path.suffix in (".mkv", ".avi", ".mp4"):
+            write_video(path, pictures)
+        else:
+            images.write(path, pictures[0])
+
+    write()
+    before = path.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for share in (0.01, 0.5, 0.999):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(before)), limits[1]))
+        try:
+            with pytest.raises(FileError, match=str(path)):
+                write()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert path.read_bytes() == before
+        assert len(list(tmp_path.iterdir())) == 1

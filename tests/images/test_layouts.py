@@ -93,6 +93,18 @@ def test_plain_tiffs_are_read(tmp_path, dtype, photometric, channels, compressio
     np.testing.assert_array_equal(images.read_codes(path), codes.squeeze())
 
 
+@pytest.mark.parametrize(
+    ("dtype", "photometric", "planar"), [("u1", RGB, True), ("f4", BLACK_IS_ZERO, False)]
+)
+def test_planes_of_8_bits_and_floats_that_say_grey_are_in_colour(
+    tmp_path, dtype, photometric, planar
+):
+    codes = codes_of(dtype, 3)
+    path = tmp_path / "a.tif"
+    path.write_bytes(tiff(codes, photometric, planar=planar))
+    np.testing.assert_array_equal(images.read_codes(path), codes)
+
+
 @pytest.mark.parametrize("bits", [10, 12, 14])
 def test_codes_of_10_to_14_bits_are_the_upper_ones_of_16(tmp_path, bits):
     codes = random.integers(0, 1 << bits, (H, 8))
@@ -125,7 +137,7 @@ def test_grey_with_alpha_keeps_its_bits_or_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "data",
     [
-        tiff(codes_of("u1", 3), RGB, planar=True),
+        tiff(codes_of("u1", 2), BLACK_IS_ZERO, planar=True),
         tiff(codes_of("u2", 3), RGB, planar=True, compression=DEFLATE),
         tiff(codes_of("f4", 3), RGB, planar=True),
         tiff(codes_of("f4", 1), WHITE_IS_ZERO),

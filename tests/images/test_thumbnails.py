@@ -56,7 +56,7 @@ def test_text_is_one_line(results: dict[str, Any], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("Transport", 1), ("Compensation", 4), ("Separation", 4), ("Analysis", 3)]
+    ("name", "count"), [("Transport", 1), ("Compensation", 4), ("Separation", 4), ("Analysis", 0)]
 )
 def test_html_holds_small_pictures(results: dict[str, Any], name: str, count: int) -> None:
     html = results[name]._repr_html_()

@@ -161,13 +161,24 @@ def test_slabs_have_no_more_values_than_32_bits_count(device, monkeypatch):
 
 
 @pytest.mark.parametrize("name", gallery.DENSE)
-@pytest.mark.parametrize("strip", [1, 256])
-def test_dense_transposes_meet_their_twin(device, monkeypatch, name, strip):
+@pytest.mark.parametrize(("strip", "strips"), [(1, 1), (1, 16), (256, 1)])
+def test_dense_transposes_meet_their_twin(device, monkeypatch, name, strip, strips):
     monkeypatch.setattr(helpers, "COLUMNS", (None, 2, 11))
     matrix = gallery.DENSE[name]
     A = Dense(device, matrix)
-    monkeypatch.setattr(A, "defines", {"STRIP": strip})
+    monkeypatch.setattr(A, "defines", {"STRIP": strip, "STRIPS": strips})
     helpers.meets_twin(A.T, reference.dense_rmatvec(matrix, np.eye(len(matrix))))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(33, 5), (300, 16), (500, 33), (2100, 3)])
+def test_slices_of_a_dense_transpose_add_up(shaped, rows, columns):
+    """On a GPU a group has many slices of the rows, up to 64 and fewer than its limit allows."""
+    random = np.random.default_rng(0)
+    matrix = random.normal(size=(rows, columns)).astype(np.float32)
+    A = Dense(shaped, matrix)
+    for x in (random.normal(size=rows), random.normal(size=(rows, 11))):
+        expected = matrix.T.astype(np.float64) @ x
+        np.testing.assert_allclose(A.T @ x, expected, rtol=0, atol=1e-5 * rows**0.5)
 
 
 def test_unsorted_and_repeated_entries_are_put_in_order(device):

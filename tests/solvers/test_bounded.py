@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 import ltcl
-from ltcl.operators import Dense, IdentityPlus, Operator
+from ltcl.device import Device
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles
 from ltcl.solvers import Bounded, Status
 from ltcl.solvers.bounded import minimise
 from ltcl.solvers.column_reductions import ColumnReductions
@@ -246,3 +248,20 @@ def test_a_column_that_float32_has_lost_is_not_certified(device, seed):
     s = within(IdentityPlus(Dense(device, T / F - np.eye(2))), b, 0, F, 0.5 * F[:, None], rtol=1e-3)
     assert (s.least <= errors(T, exact(T, b, 0, 1), b) + 1e-6).all()
     assert (errors(T, s.x / F[:, None], b) <= s.least + s.gap * np.linalg.norm(b) + 1e-6).all()
+
+
+@pytest.mark.parametrize("form", [CSR, Dense, Tiles])
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_step_is_six_launches(shaped: Device, form: Any, k: int) -> None:
+    """In the shapes of CPUs and GPUs; dense transposes of many rows are one launch, too."""
+    n = 300
+    G = scipy.sparse.diags_array([0.45, 0.45], offsets=[-1, 1], shape=(n, n)).tocsr()
+    S = IdentityPlus(form(shaped, G.toarray() if form is Dense else G))
+    b = random.random((n, k))
+    counts = []
+    for steps in (6, 6, 14):
+        before = shaped.launches.total()
+        minimise(S, b, np.full(n, 0.2), np.full(n, 0.5), np.zeros((n, k)), rtol=1e-9, maxiter=steps)
+        counts.append(shaped.launches.total() - before)
+    # The first solve also times variants of kernels.
+    assert counts[2] - counts[1] == 8 * 6

@@ -225,3 +225,21 @@ def test_errors_with_attributes_unpickle(device):
         )
         assert isinstance(error, LtclError)
     assert (pickle.loads(pickle.dumps(below)).least, missing.number) == (1e-6, 3)  # noqa: S301
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-6, 1e-3])
+@pytest.mark.parametrize("gather", [False, True])
+@pytest.mark.parametrize("method", ["monte_carlo", "hybrid"])
+def test_methods_that_sample_claim_no_more_than_they_reach(device, method, gather, size):
+    """A residual in float32 is 0 where that of the numbers given is not."""
+    random = np.random.default_rng(7)
+    claims = 0
+    for n in (2, 20, 40):
+        S = np.eye(n) + size * random.random((n, n)) / n
+        for b in (random.normal(size=n), random.normal(size=(n, 3))):
+            for rtol in (1e-1, 1e-4, 1e-6, 1e-7, 1e-9, 1e-12):
+                solution = ltcl.solve(S, b, method, rtol=rtol, throw=False, gather=gather)
+                if solution.converged:
+                    claims += 1
+                    assert true_residual(S, solution.x, b) <= 1.01 * rtol
+    assert claims >= 6

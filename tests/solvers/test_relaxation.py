@@ -104,3 +104,17 @@ def test_one_row_a_step_is_the_textbook_of_southwell(device, dual):
         x, r = reference.southwell_step(S, 1, x, r)
     np.testing.assert_allclose(s.x, x, rtol=0, atol=1e-5)
     np.testing.assert_allclose(s.residuals[-1], residual(S, x, b), rtol=1e-2)
+
+
+@pytest.mark.parametrize("exponent", [3, 5, 20, 37])
+@pytest.mark.parametrize("n", [2, 100, 200])
+@pytest.mark.parametrize("name", ["gauss_seidel", "sor", "rows of 7"])
+@FORMS
+def test_what_overflows_has_diverged(shaped, form, n, name, exponent):
+    """A triangle with a diagonal is not singular, however large its inverse is."""
+    method, options = OPTIONS[name]
+    R = np.random.default_rng(n).random((n, n)) * 10.0**exponent
+    S = IdentityPlus(as_operator(form(R), shaped))
+    solution = ltcl.solve(S, np.ones(n), method, throw=False, maxiter=50, **options)
+    assert solution.status is Status.DIVERGED
+    assert np.all(np.isfinite(solution.x))

@@ -404,6 +404,8 @@ REFUSED: list[tuple[str, Any, str]] = [
     (".mtx", COORDINATE.replace(b"real", b"integer") + b"9 9 1\n1 1 1.5\n", "'1 1 1.5'"),
     (".mtx", COORDINATE + b"2 2 2\n1 1 1\n1 0 1\n", "Line 4"),
     *((".mtx", ARRAY + b"1 1\n" + value, f"line 3 is {value!r}") for value in NO_NUMBERS),
+    (".mtx", b"no matrix\n", "no matrix"),
+    (".mtx", COORDINATE.replace(b" general", b""), "symmetry"),
     (".mat", b"MATLAB 4".ljust(600), "7.3"),
     (".mat", b"MATLAB 5.0 MAT-file".ljust(124) + b"\1\0MI" + bytes(600), "7.3"),
 ]
@@ -515,6 +517,8 @@ def test_a_full_disk_is_noticed_and_the_earlier_file_stays(tmp_path: Path, name:
 
 def test_objects_beside_a_matrix_are_left_out(tmp_path: Path) -> None:
     np.savez(tmp_path / "T.npz", T=dense(), note=np.array({"by": "me"}), name=np.array("wall"))
+    with zipfile.ZipFile(tmp_path / "T.npz", "a") as archive:
+        archive.writestr("README.txt", "a wall")
     np.testing.assert_array_equal(read(tmp_path / "T.npz").matrices[0], dense())
     np.save(tmp_path / "T.npy", np.array([{"T": 1}], object), allow_pickle=True)
     assert "Python objects" in refusal(tmp_path / "T.npy", FileError)

@@ -37,6 +37,7 @@ def test_save(extension: str, replaces: bool) -> None:
     assert_safe(survey_of(works.saving(place, replaces=replaces)))
 
 
+@pytest.mark.slow
 def test_save_where_folders_cannot_be_exchanged() -> None:
     with mock.patch("ltcl.files.exchange", return_value=False):
         work = works.saving("T.zarr", replaces=True)

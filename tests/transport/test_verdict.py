@@ -217,7 +217,7 @@ def blocks(order: tuple[int, ...]) -> ltcl.Transport:
             "",
         ),
         (lambda: colours((0, 1, 2), mixing=0.8 * np.eye(3) + 0.1), GOOD, "cb"),
-        (lambda: blocks((0, 1, 2)), "bounces need one grid", "c"),
+        (lambda: blocks((0, 1, 2)), "bounces need a T without blocks", "c"),
         (lambda: blocks((2, 1, 0)), "blue for red, red for blue", ""),
         (
             lambda: ltcl.Transport(

@@ -162,3 +162,12 @@ def test_bounces_are_good_as_far_as_T_shows(device, first_bounce):
         assert judged.numbers[f"spread_{k + 1}"] == pytest.approx(expected, rel=0.03)
         assert T.bounce_spread[k] == pytest.approx(expected, rel=0.03)
         assert f"{100 * T.bounce_spread[k]:.2g}" in b.warning
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("level", [1e-4, 1e-3])
+def test_noise_is_no_gloss(name, level):
+    """Its negative light averages out between parts of the picture, but for its own share."""
+    judged = judge(name, measured(name, level))
+    assert judged.numbers["negative_bounce"] < 0.001
+    assert "negative_bounce" not in judged.causes

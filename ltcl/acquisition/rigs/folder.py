@@ -31,7 +31,7 @@ from ltcl.acquisition.rigs.photographs import (
 )
 from ltcl.acquisition.rigs.shooting_list import ShootingList, Shot, ShotKey
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
-from ltcl.files import as_path, input_file, replace_file
+from ltcl.files import as_path, input_file, make_folders, replace_file
 
 PHOTOGRAPH_NAME = re.compile(r"photo_(\d{1,9})", re.IGNORECASE | re.ASCII)
 
@@ -121,6 +121,8 @@ class FolderRig:
             self._projector = checks.grid("projector", projector)
         enlarge(np.zeros(self.projector_grid), self._projector)  # refuses a grid that does not fit
         self._list = ShootingList(self.folder)
+        # Patterns that are on the disk as they should be.
+        self._intact_patterns: set[str] = set()
         self._files: dict[int, list[Path]] = {}
         self._photographed: Counter[ShotKey] = Counter()
 
@@ -235,25 +237,26 @@ class FolderRig:
         }
 
     def _enter(self, codes: Any, seconds: float, repeats: Counter[ShotKey]) -> tuple[Shot, ShotKey]:
-        """Put a shot on the list and its pattern in the folder, unless they are there."""
+        """Put a shot on the list and its pattern in the folder, unless they are there, intact."""
         codes, seconds = as_shot(self, codes, seconds)
         # The hash is that of the projected levels: shots that differ by less are the same.
         largest_level = (1 << self._pattern_bits) - 1
         levels = np.rint(codes * largest_level).astype("<u2")
         size = () if self._projector is None else self._projector
         key = ShotKey(shot_key(levels, *size), seconds)
-        is_new = not self._list.has_pattern(key)
         shot = self._list.add(key, repeats[key])
         path = self.folder / shot.pattern
-        if is_new or not path.exists():
+        if shot.pattern not in self._intact_patterns or not path.exists():
             pattern = enlarge(codes, self._projector)
-            images.write(path, pattern, encoding="linear", bits=self._pattern_bits)
+            if not _holds(path, pattern, 1 / largest_level):
+                images.write(path, pattern, encoding="linear", bits=self._pattern_bits)
+            self._intact_patterns.add(shot.pattern)
         return shot, key
 
     def _save(self) -> None:
         """Write the list, and make the folder of the photographs."""
         self._list.save()
-        (self.folder / "photographs").mkdir(exist_ok=True)
+        make_folders(self.folder / "photographs")
 
     def _list_photographs(self) -> dict[int, list[Path]]:
         """Files in the folder of photographs, by number."""
@@ -310,6 +313,18 @@ class FolderRig:
                 # Two photographs of black may be equal: each copy stands for one file.
                 copied.remove(twin)
         return new
+
+
+def _holds(path: Path, pattern: np.ndarray, step: float) -> bool:
+    """True if a file holds a pattern, to half a step of its codes."""
+    try:
+        stored = images.read(path, encoding="linear")
+    except FileError:
+        return False
+    if stored.shape[:2] != pattern.shape[:2]:
+        return False
+    difference = np.atleast_3d(stored) - np.atleast_3d(pattern)
+    return bool(np.abs(difference).max() < 0.51 * step)
 
 
 def enlarge(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:

@@ -18,6 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from ltcl import images
 from ltcl.acquisition.rig import load_extra
 from ltcl.errors import AcquisitionError, FileError, MemoryLimitError
+from ltcl.files import input_file
 
 T = TypeVar("T")
 
@@ -97,7 +98,8 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
     user = f"{path}, camera RAW instead of 16-bit TIFF,"
     rawpy = load_extra("rawpy", "camera", user)
     try:
-        with rawpy.imread(str(path)) as raw:
+        # An open file, as LibRaw takes names in UTF-8 alone.
+        with input_file(path).open("rb") as file, rawpy.imread(file) as raw:
             codes = raw.postprocess(
                 gamma=(1, 1),
                 no_auto_bright=True,

@@ -70,10 +70,6 @@ class ShootingList:
     def _json_path(self) -> Path:
         return self.folder / "shots.json"
 
-    def has_pattern(self, key: ShotKey) -> bool:
-        """True if some shot projects the same pattern."""
-        return key.pattern_hash in self._pattern_numbers
-
     def add(self, key: ShotKey, repeats: int) -> Shot:
         """The shot after `repeats` equal ones, put at the end of the list if it is new."""
         shot = self._shots.get((key, repeats))

@@ -372,6 +372,7 @@ class PictureLog:
                 f"{self._store.path}: the next batch of patterns is not photographed"
             )
         pictures = self._camera.take(patterns, self._count)
+        self._camera.keep_lamp_gain(self._store)
         self._write(batch, pictures)
         return pictures
 

@@ -201,6 +201,7 @@ class ColumnScan:
         self.camera.announce(patterns, int(counts.max()))
         for block in missing:
             pictures = self.camera.take(self._patterns(block), progress)
+            self.camera.keep_lamp_gain(self.store)
             self._commit(block, pictures)
 
     def _count_patterns(self, block: int) -> int:

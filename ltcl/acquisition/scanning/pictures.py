@@ -9,6 +9,8 @@ noise (`agreement`):
     exposures     of one pattern show the same light
     patterns      no picture of a batch shows the pattern of another
     anchor        after each batch, the pattern of blocks looks as in the calibration
+
+A lamp that fades (`anchor`) is corrected linearly between the ends of two batches.
 """
 
 from __future__ import annotations
@@ -36,6 +38,8 @@ UNKNOWN = np.float32(1e12)
 """The variance of an unknown value."""
 KNOWN_VARIANCE = 1e-3 * UNKNOWN
 """The variance from which on a value is unknown."""
+# Attribute of a store: the gain of the lamp at the end of the last batch.
+LAMP_GAIN = "lamp_gain"
 # Valid share of a projector pixel's camera pixels; less determines nothing.
 MIN_VALID_SHARE = 0.5
 # Standard deviations by which white must be above 0 for a pixel to count in comparisons.
@@ -64,6 +68,13 @@ class Picture(NamedTuple):
     def known(self) -> np.ndarray:
         """Mask of known values, (channels, M) bool."""
         return self.variance < KNOWN_VARIANCE
+
+    def scaled(self, factor: float) -> Picture:
+        """The picture of light that is brighter by a factor."""
+        if factor == 1.0:
+            return self
+        variance = np.where(self.known, self.variance * np.float32(factor**2), self.variance)
+        return Picture(value=self.value * np.float32(factor), variance=variance)
 
 
 class ScanGrid:
@@ -168,6 +179,8 @@ class ScanCamera(ScanGrid):
         # Photographs are compared at some of the pixels that see the projector.
         seeing = np.unique(calibration.resampling.weights.indices)
         self._pixels = spread(seeing)
+        # Gain of the lamp since the calibration at the last batch; a store keeps it.
+        self.lamp_gain = 1.0
 
     def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:
         """Announce the patterns that come next to the rig, in batches of `size`."""
@@ -202,8 +215,10 @@ class ScanCamera(ScanGrid):
             progress(1)
         self._check_patterns(patterns, pictures, exposed)
         blocks = self._photograph(anchor.marked(batch), times[:1])
-        self._check_anchor(blocks, exposed)
-        return pictures
+        first = self.lamp_gain
+        self.lamp_gain = self._check_anchor(blocks, exposed)
+        gains = np.linspace(first, self.lamp_gain, len(pictures)).tolist()
+        return [picture.scaled(1.0 / g) for picture, g in zip(pictures, gains, strict=True)]
 
     def _photograph(self, codes: np.ndarray, seconds: Sequence[float]) -> _ExposedPattern:
         images = [self.shots.photograph(codes, t) for t in seconds]
@@ -285,8 +300,10 @@ class ScanCamera(ScanGrid):
     def _names(self, photographs: _ExposedPattern) -> str:
         return " or ".join(self.shots.name(number) for number in photographs.numbers)
 
-    def _check_anchor(self, blocks: _ExposedPattern, exposed: Sequence[_ExposedPattern]) -> None:
+    def _check_anchor(self, blocks: _ExposedPattern, exposed: Sequence[_ExposedPattern]) -> float:
         """Raise AcquisitionError if the pattern of blocks deviates from that of the calibration.
+
+        Returns the gain of the lamp since then.
 
         It names the photographs of the batch (with `anchor.compact` images) that show it first, or
         just not.
@@ -295,9 +312,11 @@ class ScanCamera(ScanGrid):
         [image] = blocks.images
         [seconds] = blocks.seconds
         if known.anchor is None:
-            return
-        if known.anchor.deviation(image, seconds, known.camera) is None:
-            return
+            return 1.0
+        shot = image, seconds, known.camera, known.ambient
+        gain = known.anchor.lamp_gain(*shot)
+        if known.anchor.deviation(*shot, gain) is None:
+            return gain
         light = self._compact.append(anchor.compact(self._merge(blocks)))
         series = [*exposed, replace(blocks, images=[], light=light)]
         setup = known.white, known.ambient, known.resampling
@@ -315,6 +334,11 @@ class ScanCamera(ScanGrid):
             "projector, the scene or the light changed "
             f"(moved by {np.hypot(*moved):.2g} camera pixels); {ADVICE}"
         )
+
+    def keep_lamp_gain(self, store: BlockStore) -> None:
+        """Keep the gain of the lamp in the store of a scan, which may go on from there."""
+        if self.lamp_gain != store.attributes.get(LAMP_GAIN, 1.0):
+            store.update(**{LAMP_GAIN: self.lamp_gain})
 
 
 class _Rearrangement:

@@ -177,6 +177,7 @@ class VerdictNumbers(Report):
     other_grid: Annotated[Measured, "1 if another grid fits better."] = None
     exchanged: Annotated[Measured, "Colour channels that look exchanged. Good: 0."] = None
     no_bounces: Annotated[Measured, "1 if T is not square."] = None
+    blocks: Annotated[Measured, "1 if T has blocks between colours, hence no bounces."] = None
     shifted: Annotated[
         Measured,
         "Share of the camera's pixels whose brightest projector pixel is "
@@ -208,7 +209,7 @@ class VerdictNumbers(Report):
     )
     gain: Annotated[Measured, "Brightness of a plain picture within reach, over white."] = None
     negative_bounce: Annotated[
-        Measured, "Share of light that a bounce takes away. Good up to 0.005."
+        Measured, "Light that a bounce takes away, beyond noise. Good up to 0.005."
     ] = None
     bounce_highest: Annotated[
         Measured, "Light that 98 % of pixels return, at most. Good up to 1."

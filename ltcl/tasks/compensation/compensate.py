@@ -117,9 +117,10 @@ def compensate(
         gain within `loss`, an `rtol` below the error of a compressed T without `exact` or of
         `inverse`, or an inverse of another transport.
     ConvergenceError
-        A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where
-        float32 is too coarse to prove it, the best light found is returned, and `gap` tells what
-        is proved.
+        A solve did not reach `rtol` in `maxiter` steps, or not at all by the `method` that was
+        given, or with `clamp`. A singular T, whose light cannot be undone, still has a best pattern
+        within the bounds, which is returned. Where float32 is too coarse to prove that it is the
+        best, the best light found is returned, and `gap` tells what is proved.
 
     Examples
     --------
@@ -189,28 +190,46 @@ class BoundedLight:
 
 def _undo_light(request: CompensationRequest) -> StartingLight:
     """Step 2: the light without bounds, at the gain, or at the largest gain within the loss."""
+    if not request.T.is_square:
+        return _start_without_light(request)
+    try:
+        if request.gain is None:
+            return _undo_light_at_largest_gain(request)
+        return _undo_light_at_gain(request, request.gain)
+    except ConvergenceError as error:
+        has_choice = request.method == "auto" and not request.clamp
+        if not has_choice or error.solution.status is Status.MAXITER:
+            raise
+        # S may be singular, and yet some pattern within the bounds is the best.
+        return _start_without_light(request)
+
+
+def _start_without_light(request: CompensationRequest) -> StartingLight:
+    """No light, or the nearest one at the largest gain, where S^-1 does not exist."""
     problem = request.problem
     if request.gain is None:
-        return _undo_light_at_largest_gain(request)
-    if not request.T.is_square:
-        columns = problem.desired[0].shape[1]
-        light = [np.zeros((len(scale), columns)) for _, scale in problem.systems]
-        return StartingLight(gain=request.gain, light=light)
-    solutions = _solve_channels(request, problem.light_to_add(request.gain))
+        gain, light = gain_within_loss(problem, request.loss)
+        return StartingLight(gain=gain, light=light)
+    columns = problem.desired[0].shape[1]
+    light = [np.zeros((len(scale), columns)) for _, scale in problem.systems]
+    return StartingLight(gain=request.gain, light=light)
+
+
+def _undo_light_at_gain(request: CompensationRequest, gain: float) -> StartingLight:
+    problem = request.problem
+    solutions = _solve_channels(request, problem.light_to_add(gain))
     # S^-1 meets every pixel but masked ones, which count only where weights say so.
+    is_on_target = not problem.counts_masked_pixels
     return StartingLight(
-        gain=request.gain,
+        gain=gain,
         light=_projector_light(request, [s.x for s in solutions]),
         solutions=solutions,
-        is_on_target=not problem.counts_masked_pixels,
+        is_on_target=is_on_target and _has_undone_light(solutions),
     )
 
 
 def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
     problem = request.problem
-    if not request.T.is_square:
-        gain, light = gain_within_loss(problem, request.loss)
-        return StartingLight(gain=gain, light=light)
     # Light is affine in the gain: desired and background are solved side by side, once.
     columns = problem.desired[0].shape[1]
     sides = [np.hstack(pair) for pair in zip(problem.desired, problem.background, strict=True)]
@@ -220,7 +239,7 @@ def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
     gain = None
     if request.is_exact_gain_allowed:
         gain = exact_gain(slopes, shifts, problem.limits)
-    is_on_target = gain is not None
+    is_on_target = gain is not None and _has_undone_light(solutions)
     if gain is None:
         gain, light = gain_within_loss(problem, request.loss)
     else:
@@ -231,6 +250,11 @@ def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
         solutions=tuple(_solution_at_gain(s, gain) for s in solutions),
         is_on_target=is_on_target,
     )
+
+
+def _has_undone_light(solutions: tuple[Solution, ...]) -> bool:
+    """False if some solve with ``throw=False`` came no nearer than no light."""
+    return all(s.status is Status.CONVERGED or s.residual < 1.0 for s in solutions)
 
 
 def _solve_channels(request: CompensationRequest, targets: Columns) -> tuple[Solution, ...]:

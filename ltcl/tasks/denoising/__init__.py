@@ -12,6 +12,8 @@
 4. Products (`walls`): between two walls, light depends on rows and on columns of the picture
    nearly as a sum of few products. Singular values below those of the remaining noise are dropped.
 5. Negative entries become 0; dim entries between the same two blocks of pixels lose as much light.
+6. Entries that no noise explains beside their neighbours stay as measured (`problem`). If pictures
+   would be worse than those of T, it is solved without reciprocity, or T stays (`risk`).
 
 Known limits: at low noise or with few pixels, most coefficients stand out of the noise;
 `bench/denoise.py` prints the bound. Where d spans a factor of over 20, reciprocity is left out:

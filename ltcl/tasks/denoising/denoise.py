@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,13 +15,18 @@ from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
 from ltcl.tasks.denoising.problem import DenoisingProblem
+from ltcl.tasks.denoising.risk import picture_risk
 from ltcl.tasks.denoising.shrinkage import NoteShare, first_estimate, refine
 from ltcl.tasks.requirements import check_progress
 from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport, check_transport
 
+log = logging.getLogger(__name__)
+
+# Estimated squared error of pictures over that of T, at most, with room for the estimate's own.
+MAX_RISK = 1.05
 # Arrays of float32 of the size of T that are in memory at once.
-ARRAYS_AT_ONCE = 15
+ARRAYS_AT_ONCE = 18
 
 
 def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = None) -> Transport:
@@ -35,6 +41,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     Returns
     -------
     Transport
+        T itself, with a warning, if its noise is unknown or its pictures would become worse. Else
         float32, on the same grid, with the same first bounce, mixing and masked pixels, without
         negative entries off the diagonal. Its `noise` is that of T, scaled to the estimated error
         of a picture under white; the first bounce itself has that of T, and errors of neighbours
@@ -47,7 +54,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     InputError
         3 x 3 blocks between colours.
     MemoryLimitError
-        The host lacks memory for 15 arrays of float32 of the size of T.
+        The host lacks memory for 18 arrays of float32 of the size of T.
 
     Examples
     --------
@@ -61,13 +68,26 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     """
     _check_entries(T)
     report = check_progress(progress)
-    matrices = []
-    variance_shares = np.ones(T.channels)
+    if T.noise.source == "unknown":
+        log.warning("T does not show its noise, and is not changed: give noise= (--noise)")
+        report("denoising", 1.0)
+        return T
+    channels = []
     for channel in range(T.channels):
         note = partial(_report_share, report, channel, T.channels)
-        entries, variance_shares[channel] = _denoise_channel(T, channel, note)
-        matrices.append(entries)
-    return _transport_like(T, matrices, _scaled_noise(T.noise, variance_shares))
+        channels.append(_denoise_channel(T, channel, note))
+    kept = sum(channel.risk > MAX_RISK for channel in channels)
+    if kept:
+        log.warning(
+            "%d of %d channels of T are not changed: they would lose more light than noise",
+            kept,
+            T.channels,
+        )
+    if kept == T.channels:
+        return T
+    matrices = [channel.entries for channel in channels]
+    shares = np.array([channel.variance_share for channel in channels])
+    return _transport_like(T, matrices, _scaled_noise(T.noise, shares))
 
 
 def _check_entries(T: Any) -> None:
@@ -85,12 +105,22 @@ def _check_entries(T: Any) -> None:
     checks.fits_host("denoising", 4 * ARRAYS_AT_ONCE * rows * columns)
 
 
-def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> tuple[np.ndarray, float]:
-    """Denoised entries (M, N), and the share of the variance of noise that they have left."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DenoisedChannel:
+    """Entries (M, N), the share of the variance of noise that is left, and the risk of pictures."""
+
+    entries: np.ndarray
+    variance_share: float
+    risk: float
+
+
+def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> DenoisedChannel:
+    """The channel with less noise, or as it is if its pictures would become worse."""
     matrix = T.matrices[channel]
     if not isinstance(matrix, np.ndarray):
         matrix = matrix.tocsr().toarray()
     Y = matrix.astype(np.float32)
+    unchanged = DenoisedChannel(entries=Y.copy(), variance_share=1.0, risk=np.inf)
     # In this unit, a power of 2, squares fit into float32.
     _, exponent = np.frexp(np.abs(Y).max(initial=0.0))
     unit = np.float32(2.0 ** int(exponent))
@@ -100,17 +130,36 @@ def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> tuple[np.nd
         photons=T.noise.photons / unit,
         floor=T.noise.floor / unit,
     )
-    problem = DenoisingProblem.from_entries(Y, noise, channel, T.camera_grid, T.grid)
-    pilot = first_estimate(problem, note)
-    estimate = refine(problem, pilot, lambda share: note(1.0 + share))
+    for may_be_reciprocal in (True, False):
+        problem = DenoisingProblem.from_entries(
+            Y, noise, channel, T.camera_grid, T.grid, may_be_reciprocal
+        )
+        denoised = _solve(problem, Y, note)
+        if denoised.risk <= MAX_RISK:
+            return dataclasses.replace(denoised, entries=unit * denoised.entries)
+        if not problem.is_reciprocal:
+            break
+    return unchanged
+
+
+def _solve(problem: DenoisingProblem, Y: np.ndarray, note: NoteShare) -> DenoisedChannel:
+    """Denoised entries of a problem with the measured entries Y, (M, N)."""
+    first = first_estimate(problem, note)
+    problem = first.problem
+    estimate = refine(problem, first.pilot, lambda share: note(1.0 + share))
     entries = problem.restore_entries(estimate.Z, Y)
+    left = np.where(problem.is_outstanding, 0.0, estimate.noise / problem.gauge)
+    variance = problem.noise.variance(entries, problem.channel)
     # Errors of a picture under white, before and after.
-    error_under_white = (estimate.noise / problem.gauge).sum(axis=1, dtype=float)
-    variance_before = noise.variance(entries, channel).sum()
+    variance_before = variance.sum()
     if variance_before == 0.0:
         variance_before = 1.0
+    error_under_white = left.sum(axis=1, dtype=float)
     share = error_under_white @ error_under_white / variance_before
-    return unit * entries, share
+    # The first bounce and outstanding entries stay, with their errors.
+    variance[entries == Y] = 0.0
+    risk = picture_risk(Y - entries, left, variance, problem)
+    return DenoisedChannel(entries=entries, variance_share=share, risk=risk)
 
 
 def _scaled_noise(noise: Noise, variance_shares: np.ndarray) -> Noise:

@@ -7,7 +7,7 @@ weights 1 / variance. Else Z is T. The diagonal of a square T is 0 in Z.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from ltcl.transport.noise import Noise
 BLOCK_SIDE = 4
 # Variance of Z - Z^T between blocks, at most, over that of noise, if the scene is reciprocal.
 MAX_RECIPROCITY_EXCESS = 1.5
+# Standard deviations, and photons, from which on an entry, or a pair, stands out.
+OUTSTANDING = 6.0
+# Times that d is fitted, without the pairs that stand out.
+PAIR_PASSES = 3
 # Standard deviations up to which an entry may well be 0.
 DIM_DEVIATIONS = 3.0
 
@@ -40,6 +44,9 @@ class DenoisingProblem:
     half_difference : (N, N) float32, optional
         (Z - Z^T) / 2 as measured, where errors of neighbouring columns cancel, so that one entry
         of a pair may be known better than the other in some coefficients.
+    is_outstanding : (M, N) bool
+        Entries that no noise explains beside their neighbours, as of dead pixels or small shadows.
+        They stay as measured.
     """
 
     Z: np.ndarray
@@ -50,11 +57,18 @@ class DenoisingProblem:
     grid: Grid
     noise: Noise
     channel: int
+    is_outstanding: np.ndarray
     half_difference: np.ndarray | None = None
 
     @classmethod
     def from_entries(
-        cls, Y: np.ndarray, noise: Noise, channel: int, camera_grid: Grid, grid: Grid
+        cls,
+        Y: np.ndarray,
+        noise: Noise,
+        channel: int,
+        camera_grid: Grid,
+        grid: Grid,
+        may_be_reciprocal: bool = True,
     ) -> DenoisingProblem:
         """Fit reciprocity to the measured entries Y, (M, N) float32."""
         is_square = camera_grid == grid
@@ -72,20 +86,31 @@ class DenoisingProblem:
             grid=grid,
             noise=noise,
             channel=channel,
+            is_outstanding=np.zeros(X.shape, bool),
         )
-        if not is_square or not X.any():
+        if not (is_square and may_be_reciprocal and X.any()):
             return without_reciprocity
 
-        log_d = fit_log_factors(X, variance, light, grid)
-        if np.ptp(log_d) > MAX_LOG_FACTOR:
-            return without_reciprocity
-        gauge = pair_gauge(log_d)
-        Z = X * gauge
-        Z_variance = np.maximum(variance * gauge**2, TINY)
+        pairs = X
+        for _ in range(PAIR_PASSES):
+            log_d = fit_log_factors(pairs, variance, light, grid)
+            if np.ptp(log_d) > MAX_LOG_FACTOR:
+                return without_reciprocity
+            gauge = pair_gauge(log_d)
+            Z = X * gauge
+            Z_variance = np.maximum(variance * gauge**2, TINY)
+            photon = _photon_light(noise, channel) * gauge
+            pair_deviation = np.sqrt(Z_variance + Z_variance.T) + photon + photon.T
+            is_unlike = np.abs(Z - Z.T) > OUTSTANDING * pair_deviation
+            if not is_unlike.any():
+                break
+            # Such pairs say nothing of d.
+            pairs = np.where(is_unlike, (Z + Z.T) / 2 / gauge, X)
         if _is_glossy(Z, Z_variance, grid):
             return without_reciprocity
 
-        mean = (Z * Z_variance.T + Z.T * Z_variance) / (Z_variance + Z_variance.T)
+        pair_variance = Z_variance + Z_variance.T
+        mean = (Z * Z_variance.T + Z.T * Z_variance) / pair_variance
         half_difference = None
         if noise.neighbours[channel]:
             half_difference = (Z - Z.T) / 2
@@ -99,6 +124,7 @@ class DenoisingProblem:
             noise=noise,
             channel=channel,
             half_difference=half_difference,
+            is_outstanding=is_unlike,
         )
 
     @property
@@ -129,10 +155,25 @@ class DenoisingProblem:
             variance *= 2.0 * share * (row_share / total)
         return C, variance
 
+    def without_outstanding(self, pilot: np.ndarray) -> DenoisingProblem:
+        """The problem with `pilot` in the place of entries that stand out of it."""
+        photon = _photon_light(self.noise, self.channel) * self.gauge
+        deviation = np.sqrt(self.variance) + photon
+        is_outstanding = np.abs(self.Z - pilot) > OUTSTANDING * deviation
+        is_outstanding |= self.is_outstanding
+        if self.is_square:
+            np.fill_diagonal(is_outstanding, False)
+        Z = np.where(is_outstanding, pilot, self.Z)
+        return replace(self, Z=Z, is_outstanding=is_outstanding)
+
+    @property
+    def is_square(self) -> bool:
+        """True if T has a diagonal, the first bounce."""
+        return self.camera_grid == self.grid
+
     def restore_entries(self, Z: np.ndarray, Y: np.ndarray) -> np.ndarray:
         """Entries of T without negative ones; the diagonal of a square T is that of Y."""
-        is_square = self.camera_grid == self.grid
-        if is_square:
+        if self.is_square:
             Z = Z - np.diag(np.diag(Z))
         # Negative entries become 0; dim entries of the same blocks lose the light that adds.
         not_negative = np.maximum(Z, 0.0)
@@ -143,7 +184,8 @@ class DenoisingProblem:
         available = camera_blocks.T @ dim @ projector_blocks
         share = np.minimum(surplus / np.maximum(available, TINY), 1.0)
         T = (not_negative - dim * (camera_blocks @ share @ projector_blocks.T)) / self.gauge
-        if is_square:
+        T = np.where(self.is_outstanding, np.maximum(Y, 0.0), T)
+        if self.is_square:
             np.fill_diagonal(T, np.diag(Y))
         return T
 
@@ -155,6 +197,12 @@ def _light_of_blocks(X: np.ndarray, camera_grid: Grid, grid: Grid) -> np.ndarray
     sizes = np.outer(camera_blocks.sum(axis=0), projector_blocks.sum(axis=0))
     means = camera_blocks.T @ X @ projector_blocks / sizes
     return camera_blocks @ means @ projector_blocks.T
+
+
+def _photon_light(noise: Noise, channel: int) -> np.ndarray:
+    """Light of one photon, (M, N): entries of few photons deviate by one of them."""
+    photons = noise.photons[channel] * noise.rows[channel]
+    return np.outer(photons, noise.columns[channel]).astype(np.float32)
 
 
 def _is_glossy(Z: np.ndarray, variance: np.ndarray, grid: Grid) -> bool:

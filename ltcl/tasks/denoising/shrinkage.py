@@ -25,6 +25,8 @@ from ltcl.tasks.denoising.problem import DenoisingProblem
 from ltcl.tasks.denoising.reciprocity import SHIFTS, SIGNIFICANCE, TINY
 from ltcl.tasks.denoising.walls import shrink_wall_products
 
+# Times that outstanding entries are looked for.
+OUTSTANDING_PASSES = 3
 # Called with the share of a step that is done.
 NoteShare = Callable[[float], object]
 
@@ -37,7 +39,27 @@ class Estimate:
     noise: np.ndarray
 
 
-def first_estimate(problem: DenoisingProblem, note: NoteShare) -> np.ndarray:
+@dataclass(frozen=True, kw_only=True)
+class FirstEstimate:
+    """A problem without its outstanding entries, and its estimate Z."""
+
+    problem: DenoisingProblem
+    pilot: np.ndarray
+
+
+def first_estimate(problem: DenoisingProblem, note: NoteShare) -> FirstEstimate:
+    """Z (M, N) by thresholds, and once more without the entries that stand out of it."""
+    pilot = _pilot(problem, note)
+    for _ in range(OUTSTANDING_PASSES):
+        found = np.count_nonzero(problem.is_outstanding)
+        problem = problem.without_outstanding(pilot)
+        if np.count_nonzero(problem.is_outstanding) == found:
+            break
+        pilot = _pilot(problem, _ignore_share)
+    return FirstEstimate(problem=problem, pilot=pilot)
+
+
+def _pilot(problem: DenoisingProblem, note: NoteShare) -> np.ndarray:
     """Z (M, N) by thresholds; of a reciprocal T once more in its own singular vectors.
 
     Where T is not reciprocal, these are left out: they move light of bounces at low noise.

@@ -7,6 +7,7 @@ from ltcl.transport.diagnostics.bounce import (
     ambient_share,
     between_parts,
     negative_bounce,
+    picture_parts,
 )
 from ltcl.transport.diagnostics.choice import bounce_spread_of_system
 from ltcl.transport.diagnostics.energy import Energy, check_energy
@@ -24,5 +25,6 @@ __all__ = [
     "check_energy",
     "negative_bounce",
     "other_grid",
+    "picture_parts",
     "reciprocity_defect",
 ]

@@ -67,12 +67,8 @@ def between_parts(
     It is NaN within a part. `inverse` is S^-1 of (N, k); the picture has `side` parts along each
     side.
     """
-    height, width = grid
-    part_rows = np.arange(height) * min(side, height) // height
-    part_columns = np.arange(width) * min(side, width) // width
-    number = (part_rows[:, None] * (part_columns[-1] + 1) + part_columns).ravel()
-    # Indicators e of the parts, (N, parts).
-    parts = (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)
+    # Indicators e of the parts.
+    parts = picture_parts(grid, side)
     pixels = parts.sum(axis=0)
     sources = parts[:, ::step]
     # e^T A e
@@ -80,6 +76,15 @@ def between_parts(
     between = light / (pixels[:, None] * pixels[::step])
     np.fill_diagonal(between[::step], np.nan)
     return between
+
+
+def picture_parts(grid: tuple[int, int], side: int) -> np.ndarray:
+    """Indicators (N, parts) of rectangles, `side` along each side of a picture."""
+    height, width = grid
+    part_rows = np.arange(height) * min(side, height) // height
+    part_columns = np.arange(width) * min(side, width) // width
+    number = (part_rows[:, None] * (part_columns[-1] + 1) + part_columns).ravel()
+    return (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)
 
 
 def ambient(inverse: Callable[[np.ndarray], Any], grid: tuple[int, int], step: int = 1) -> float:

@@ -65,7 +65,8 @@ class _RowPairs:
         self.pixels = self.random.permutation(n)[:PAIRS]
         bin_size = -(-n // COLUMN_BINS)
         self.bin_starts = np.arange(0, n, bin_size)
-        light = T @ np.ones(n, np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            light = T @ np.ones(n, np.float32)
         typical = float(np.median(light[light > 0])) if np.any(light > 0) else 0.0
         self.is_usual = (light > MIN_LIGHT * typical) & (light < MAX_LIGHT * typical)
 

@@ -8,8 +8,8 @@ kinds of detail:
 - `Windows.detail` along all four axes of a block, orthogonal to smooth light.
 - Second differences along one axis of each picture, of T over its row sums: a texture of the wall
   that the camera sees does not matter, and an edge or a dead entry spoils few of them.
-- The same of Z - Z^T, Z_ij = T_ij (d_j / d_i)^(1/2), d from T_ij d_j = T_ji d_i: in a reciprocal
-  scene it has no light at all.
+- The same, or none, of Z - Z^T, Z_ij = T_ij (d_j / d_i)^(1/2), d from T_ij d_j = T_ji d_i: in a
+  reciprocal scene it has no light at all.
 
 An entry of 0 may be noise: a path tracer leaves entries that no path met, a share exp(-L^2 / v) of
 those of mean light L. Blocks with more zeros have dead or clipped entries, and tell nothing.
@@ -37,6 +37,8 @@ MEDIAN_SQUARE = 0.4549
 MIN_VARIANCE = 1e-60
 # Part of the exponent L^2 / v that zeros may have, as both are estimates.
 ZEROS_EXPONENT = 0.5
+# Entries other than 0, at least: fewer may be anything.
+MIN_ENTRIES = 16
 # Pixels by which a blurred first bounce may reach beyond its own.
 BLUR_REACH = 2
 # Differences that count as one independent coefficient.
@@ -128,13 +130,16 @@ class BlockReader:
         self.distance = distances(camera, projector)
         self.variance = detail_variance(self.X, camera, projector)
         self.has_unexplained_zeros = has_unexplained_zeros(self.zeros, self.light, self.variance)
+        entries = self.X.shape[1] * self.X.shape[3]
+        self.has_unexplained_zeros |= (1.0 - self.zeros) * entries < min(MIN_ENTRIES, entries)
 
     def kinds(self) -> Iterator[Blocks]:
         """Blocks by each kind of detail."""
         yield self.smooth()
         yield self.flattened()
         if self.camera.grid == self.projector.grid:
-            yield self.reciprocal()
+            yield self.reciprocal(has_differences=True)
+            yield self.reciprocal(has_differences=False)
 
     def smooth(self) -> Blocks:
         """Blocks by detail along all axes."""
@@ -148,8 +153,8 @@ class BlockReader:
         weight = 1.0 / texture[:, :, None, None]
         return self._blocks_by_differences(self.X, weight)
 
-    def reciprocal(self) -> Blocks:
-        """Blocks by differences of Z - Z^T."""
+    def reciprocal(self, has_differences: bool) -> Blocks:
+        """Blocks by differences of Z - Z^T, or by Z - Z^T itself."""
         d = self._balance
         root = np.sqrt(d / d[:, :, None, None])
         Z = self.X * root
@@ -157,7 +162,11 @@ class BlockReader:
         # Dead pixels have no d.
         E[np.isnan(E)] = 0.0
         E[(self.X == 0.0) | (self.X == 0.0).transpose(2, 3, 0, 1)] = 0.0
-        blocks = self._blocks_by_differences(E, np.ones((1, 1, 1, 1)))
+        if has_differences:
+            blocks = self._blocks_by_differences(E, np.ones((1, 1, 1, 1)))
+        else:
+            values = E.transpose(0, 2, 1, 3).reshape(*self.light.shape, -1)
+            blocks = self._blocks_by_values(E, values)
         middle = np.ones(len(d))
         # A window of dead pixels has no difference, and needs no gauge.
         has_light = np.isfinite(d).any(axis=1)
@@ -192,14 +201,19 @@ class BlockReader:
         if differences.shape[2] == 0:
             # Windows of less than 3 pixels a side have none.
             differences = np.full((*self.light.shape, 1), np.nan)
-        coefficients = differences.shape[2] // DIFFERENCES_PER_COEFFICIENT
-        is_known = np.isfinite(differences).mean(axis=2) > 0.5
+        return self._blocks_by_values(X, differences)
+
+    def _blocks_by_values(self, X: np.ndarray, values: np.ndarray) -> Blocks:
+        """Blocks of entries X by values (a, b, k); 0 and NaN say nothing."""
+        values = np.where(values == 0.0, np.nan, values)
+        coefficients = values.shape[2] // DIFFERENCES_PER_COEFFICIENT
+        is_known = np.isfinite(values).mean(axis=2) > 0.5
         # Zeros that are noise must not be left out, as the others are then brighter.
         is_known &= (self.zeros == 0.0) | self.has_unexplained_zeros
         with warnings.catch_warnings():
             # A block without a difference has the median NaN.
             warnings.simplefilter("ignore", RuntimeWarning)
-            variance = np.nanmedian(differences**2, axis=2) / MEDIAN_SQUARE
+            variance = np.nanmedian(values**2, axis=2) / MEDIAN_SQUARE
         return self._blocks(X, variance, is_known, max(coefficients, 1))
 
     def _blocks(

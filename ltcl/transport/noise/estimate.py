@@ -61,6 +61,8 @@ MAX_TEXTURE_CORRELATION = 0.3
 MAX_WIDENING = 1.1
 
 
+# Entries near the largest float32 overflow, and make the estimate infinite.
+@np.errstate(over="ignore", invalid="ignore")
 def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[int, int]) -> Noise:
     """`Noise` of T (M, N) of 1 or 3 channels, without a further measurement.
 

@@ -172,6 +172,13 @@ DAMAGES = (
         advice="bring T onto it by 'ltcl align', or ltcl.align(T)",
     ),
     Damage(
+        name="blocks",
+        threshold=0.0,
+        compensation_limit=NOISE_ALONE,
+        cause="bounces need a T without blocks between colours",
+        advice="give the blocks on the diagonal alone, if others are dark",
+    ),
+    Damage(
         name="dark",
         threshold=0.0,
         compensation_limit=0.05,

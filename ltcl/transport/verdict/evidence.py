@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ltcl.errors import InputError
 from ltcl.transport import diagnostics
 from ltcl.transport.covariance import channel_matrices
 from ltcl.transport.diagnostics.choice import bounce_spread, solved_system
@@ -40,6 +42,8 @@ DEAD_SHARE = 0.02
 DEAD_RATIO = 2.0
 # Offsets of rows, in pictures, from which on they are told from gains of columns.
 OFFSET_SHARE = 0.002
+# Standard deviations of noise that negative light between parts of a picture does not exceed.
+NEGATIVE_SIGMAS = 2.0
 # Quantile of the pixels that tells the largest albedo: a few pixels may be damaged.
 ALBEDO_QUANTILE = 0.98
 MIN_LIGHT = 1e-300
@@ -58,7 +62,6 @@ class Evidence:
 
     def __init__(self, T: Transport) -> None:
         self.T = T
-        self.noise = T.noise
         self.matrices = []
         for matrix in T.matrices:
             # Rows of a store become a matrix in memory.
@@ -72,32 +75,56 @@ class Evidence:
                 self.is_dark = self.is_dark | _dead_pixels(matrix)
             for channel, matrix in enumerate(self.matrices):
                 self.systems.append(HostSystem(matrix, np.where(self.is_dark, 0.0, F[channel])))
-        self.errors = HostErrors(T, self.matrices, self.systems)
+
+    @cached_property
+    def errors(self) -> HostErrors:
+        """Errors by the noise of T; InputError if that is unknown."""
+        if self.T.noise.source == "unknown":
+            raise InputError("T does not show its noise: use ltcl analyze --noise")
+        return HostErrors(self.T, self.matrices, self.systems)
 
     def measures(self) -> Iterator[Measure]:
         """Numbers of the whole T, and of each channel."""
         T = self.T
-        yield Measure("no_bounces", not T.is_square)
+        yield Measure("no_bounces", T.camera_grid != T.grid)
+        yield Measure("blocks", T.blocks is not None)
         yield from self._measure_order()
         for channel in range(T.channels):
-            yield from self._measure_pictures(channel)
             yield from self._measure_range(channel)
-        yield from self.damages()
+        square = self
+        if not T.is_square:
+            nearest = nearest_system(T)
+            square = None if nearest is None else Evidence(nearest)
+        if square is not None:
+            yield from square.measure_ambient()
+        # From here on the noise of T is needed.
+        for channel in range(T.channels):
+            yield from self._measure_pictures(channel)
+        if square is not None:
+            yield from square.measure_damages()
         if T.is_square:
             yield from self._measure_bounces()
             place = describe_place(T.grid, np.flatnonzero(self.is_dark))
             yield Measure("dark", self.is_dark.mean(), place)
 
-    def damages(self) -> Iterator[Measure]:
-        """Numbers of damages of every channel, if the entries are read, and are enough."""
-        if not self.T.is_square:
-            nearest = nearest_system(self.T)
-            if nearest is not None:
-                yield from Evidence(nearest).damages()
-            return
+    def measure_ambient(self) -> Iterator[Measure]:
+        """Ambient light left in a square T."""
+        for channel in self._channels_with_entries():
+            share = diagnostics.ambient(self.systems[channel].solve, self.T.grid)
+            yield Measure("ambient", share)
+
+    def measure_damages(self) -> Iterator[Measure]:
+        """Numbers of damages of a square T beyond its noise."""
+        for channel in self._channels_with_entries():
+            yield from self._measure_damages(channel)
+
+    def _channels_with_entries(self) -> list[int]:
+        """The channels whose entries are read; none if there are few."""
+        channels = []
         for channel, matrix in enumerate(self.matrices):
             if isinstance(matrix, ENTRIES) and len(self.T.masked) >= MIN_PIXELS:
-                yield from self._measure_damages(channel)
+                channels.append(channel)
+        return channels
 
     def _measure_range(self, channel: int) -> Iterator[Measure]:
         """Entries at the upper end of the camera's range, and the steps of its codes."""
@@ -196,12 +223,11 @@ class Evidence:
     def _measure_damages(self, channel: int) -> Iterator[Measure]:
         grid = self.T.grid
         S = self.systems[channel]
-        yield Measure("ambient", diagnostics.ambient(S.solve, grid))
         detail = LightDetail(S, self.errors, channel, grid)
         offset = detail.row_offset()
         yield Measure("row_offset", offset)
         yield Measure("flicker", detail.column_gain(offset > OFFSET_SHARE))
-        yield from self._measure_energy(S)
+        yield from self._measure_energy(channel)
         sample = RowSample(self.T, S, channel)
         share, move = sample.shifted()
         yield Measure("shifted", share, move)
@@ -212,12 +238,19 @@ class Evidence:
         yield Measure("outliers", share, describe_place(grid, outliers))
         yield Measure("irreciprocal", self._irreciprocity(channel, sample))
 
-    def _measure_energy(self, S: HostSystem) -> Iterator[Measure]:
+    def _measure_energy(self, channel: int) -> Iterator[Measure]:
         """Share of light that a bounce takes away, and the largest one that a pixel returns."""
+        S = self.systems[channel]
         between = diagnostics.between_parts(S.solve, self.T.grid, diagnostics.PARTS_PER_SIDE)
+        # The errors of the bounce are about those of T F^-1.
+        parts = diagnostics.picture_parts(self.T.grid, diagnostics.PARTS_PER_SIDE)
+        squares = S.inverse_F[:, None] ** 2 * parts
+        variances = parts.T @ np.maximum(self.errors.variance(channel, squares), 0.0)
+        pixels = parts.sum(axis=0)
+        noise = np.sqrt(variances) / (pixels[:, None] * pixels)
         light = max(float(np.nansum(np.abs(between))), MIN_LIGHT)
-        negative = float(np.nansum(np.maximum(-between, 0.0)))
-        yield Measure("negative_bounce", negative / light)
+        negative = np.maximum(-between - NEGATIVE_SIGMAS * NOISE_MARGIN * noise, 0.0)
+        yield Measure("negative_bounce", float(np.nansum(negative)) / light)
         ones = np.ones((len(S.F), 1))
         returned = (ones - S.solve(ones))[S.F > 0]
         yield Measure("bounce_highest", float(np.quantile(returned, ALBEDO_QUANTILE)))
@@ -225,7 +258,7 @@ class Evidence:
     def _irreciprocity(self, channel: int, sample: RowSample) -> float:
         """The defect of reciprocity beyond that of noise, both of F^-1/2 R F^1/2."""
         S = self.systems[channel]
-        direct_deviation = self.noise.diagonal(self.T.first_bounce)[channel]
+        direct_deviation = self.T.noise.diagonal(self.T.first_bounce)[channel]
         variances = self.errors.variance(channel, S.inverse_F[:, None])[:, 0]
         direct = np.sum((direct_deviation * S.inverse_F) ** 2)
         share = len(sample.pixels) / len(S.F)

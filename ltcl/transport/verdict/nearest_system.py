@@ -21,6 +21,8 @@ from ltcl.transport.transport import Transport
 
 # Share of the pixels of T' that have direct light, at least.
 MIN_SEEN_SHARE = 0.5
+# Median entry of a row, to its brightest one, from which on the row sees all patterns alike.
+EVEN_SHARE = 0.5
 
 
 def nearest_system(T: Transport) -> Transport | None:
@@ -30,7 +32,7 @@ def nearest_system(T: Transport) -> Transport | None:
     M, N = T.shape
     if T.camera_grid == T.grid:
         return Transport(T.matrices, T.grid, noise=T.noise)
-    brightness = sum(T.matrices)
+    brightness = _without_even_rows(sum(T.matrices))
     if M >= N:
         group = _mean_rows(np.asarray(brightness.argmax(axis=1)).ravel(), N)
         matrices = [_dense(group @ matrix) for matrix in T.matrices]
@@ -45,6 +47,15 @@ def nearest_system(T: Transport) -> Transport | None:
     if is_seen.mean() < MIN_SEEN_SHARE:
         return None
     return Transport(matrices, grid, noise=noise)
+
+
+def _without_even_rows(brightness: Any) -> Any:
+    """The same, but 0 in rows that see all patterns alike, and so show no pixel."""
+    if not isinstance(brightness, np.ndarray):
+        # Most entries of a sparse row are 0.
+        return brightness
+    is_even = np.median(brightness, axis=1) > EVEN_SHARE * brightness.max(axis=1)
+    return np.where(is_even[:, None], 0.0, brightness)
 
 
 def _mean_rows(pixels: np.ndarray, N: int) -> scipy.sparse.csr_array:

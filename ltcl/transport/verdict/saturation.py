@@ -39,7 +39,11 @@ def saturated_entries(matrix: Any) -> tuple[int, np.ndarray]:
     if rows.size == 0:
         return 0, pixels
     counts = (rows == rows.max()).sum(axis=1)
-    if _different_share(rows) < MEASURED_SHARE:
+    compared = rows
+    if np.mean(rows == 0) > STUCK_SHARE:
+        # What is left of a sparse T may be different without noise: direct light alone tells.
+        compared = rows.max(axis=1)
+    if _different_share(compared) < MEASURED_SHARE:
         return 0, pixels[:0]
     return int(counts.sum()), pixels[counts > 0]
 

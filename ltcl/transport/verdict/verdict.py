@@ -103,22 +103,23 @@ def verdict(T: Transport, **known: float) -> Verdict:
     places: dict[str, str] = {}
     try:
         check_transport(T, square=False)
-        _check_noise_is_known(T)
+        _check_enough_pixels(T)
         for measure in Evidence(T).measures():
             _keep_worst(measure, numbers, places)
     except (InputError, np.linalg.LinAlgError) as error:
-        # For example compressed entries without noise.
-        return Verdict(f"Unknown: {error}.", numbers=numbers)
+        # For example compressed entries without noise. Some damages show without it.
+        judged = _judge(numbers, places)
+        if judged.compensation:
+            return Verdict(f"Unknown: {error}.", numbers=numbers)
+        return judged
     return _judge(numbers, places)
 
 
-def _check_noise_is_known(T: Transport) -> None:
+def _check_enough_pixels(T: Transport) -> None:
     if not T.noise.is_measured and min(T.shape) < MIN_PIXELS:
         raise InputError(
             f"fewer than {MIN_PIXELS} pixels do not tell their noise: use ltcl analyze --noise"
         )
-    if T.noise.source == "unknown":
-        raise InputError("T does not show its noise: use ltcl analyze --noise")
 
 
 def _keep_worst(measure: Measure, numbers: dict[str, float], places: dict[str, str]) -> None:

@@ -164,6 +164,16 @@ WRONG = [
 LISTS = [json.dumps({"format": "ltcl shooting list 1", "shots": shots}) for shots in WRONG]
 
 
+@pytest.mark.parametrize("damage", [b"", b"damaged", None])
+def test_a_damaged_pattern_is_written_again(tmp_path: Path, damage: bytes | None) -> None:
+    prepared(tmp_path)
+    pattern = tmp_path / "patterns/pattern_000001.png"
+    good = pattern.read_bytes()
+    pattern.write_bytes(good[:-20] if damage is None else damage)
+    prepared(tmp_path)
+    assert pattern.read_bytes() == good
+
+
 @pytest.mark.parametrize("content", BROKEN + LISTS)
 def test_a_damaged_list_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "shots.json").write_text(content, encoding="utf-8")
@@ -300,6 +310,12 @@ def test_raw_of_a_monochrome_camera_is_grey(tmp_path: Path, channels: int) -> No
     camera_files.write_dng(path, raw, 1 / 30, photometric=34892)
     codes = photograph(tmp_path, channels)
     np.testing.assert_allclose(codes, raw * (65535 / 4095), atol=1.5)
+
+
+def test_raw_in_a_folder_whose_name_is_not_utf_8(tmp_path: Path) -> None:
+    folder = tmp_path / b"caf\xe9".decode("utf-8", "surrogateescape")
+    camera_files.write_dng(place(folder, ".dng"), RAW, 1 / 30)
+    assert photograph(folder).shape == (32, 48, 3)
 
 
 def test_raw_without_rawpy_and_of_a_size_beyond_memory_is_refused(

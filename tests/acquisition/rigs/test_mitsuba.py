@@ -170,7 +170,7 @@ ELSEWHERE = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "hei
         (
             {"scene": {"type": "scene"}, "albedo": 0.5},
             InputError,
-            "albedo is of dihedral, trihedral, box",
+            "albedo is given.*dihedral, trihedral, box",
         ),
         ({"albedo": 1.0}, InputError, "albedo .* 1 to 1"),
         ({"baseline": -9.0}, InputError, "baseline is -9"),

@@ -254,3 +254,39 @@ def test_the_error_of_a_black_target_is_not_relative(device, largest, frames):
     expected = np.linalg.norm(errors.reshape(-1, 6), axis=1)
     np.testing.assert_allclose(c.frame_errors, expected, rtol=1e-4)
     assert 0 <= c.gap < 1e-3 * c.error
+
+
+def equal_columns(T: np.ndarray) -> np.ndarray:
+    T[:, 5] = T[:, 6]
+    return T
+
+
+def equal_rows(T: np.ndarray) -> np.ndarray:
+    T[5] = T[6]
+    return T
+
+
+def low_rank(T: np.ndarray) -> np.ndarray:
+    return T[:, :8] @ T[:8]
+
+
+@pytest.mark.parametrize("damage", [equal_columns, equal_rows, low_rank])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("throw", [True, False])
+def test_a_singular_T_has_a_best_pattern_within_the_bounds(device, damage, channels, throw):
+    matrix = damage(ltcl.scenes.dihedral(4, albedo=0.5).transport().to_numpy().astype(float))
+    matrices = [matrix, 0.5 * matrix, 0.3 * matrix][:channels]
+    T = ltcl.Transport(matrices, (4, 8), device=device)
+    shape = (4, 8) if channels == 1 else (4, 8, 3)
+    desired = np.random.default_rng(0).uniform(0.05, 0.2, shape)
+    c = ltcl.compensate(T, desired, throw=throw)
+    squares = 0.0
+    for M, d in zip(matrices, desired.reshape(32, channels).T, strict=True):
+        squares += 2.0 * lsq_linear(M, d, (0, 1)).cost
+    best = np.sqrt(squares) / np.linalg.norm(desired)
+    assert best * (1 - 1e-4) <= c.error <= best + c.rtol
+    assert c.error - c.gap <= best * (1 + 1e-4)
+    largest = ltcl.compensate(T, desired, gain="auto", loss=0.95)
+    assert largest.error <= 0.95 * (1 + 1e-4)
+    with pytest.raises(ConvergenceError):
+        ltcl.compensate(T, desired, clamp=True)
