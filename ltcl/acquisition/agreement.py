@@ -202,10 +202,13 @@ def _deviation_of_inverses(
             first.append(k)
     if len(first) < 3:
         return None
-    samples = [photograph.sample for photograph in group]
+    samples = []
+    for k in first:
+        samples += [group[k].sample, group[k + 1].sample]
     light = LinearLight.from_samples(samples, np.ones(len(samples)), camera)
-    second = [k + 1 for k in first]
-    sums = light.select(first).plus(light.select(second))
+    patterns = range(0, len(samples), 2)
+    inverses = range(1, len(samples), 2)
+    sums = light.select(patterns).plus(light.select(inverses))
     deviation = _deviation(sums, len(first))
     if deviation is None:
         return None
@@ -214,7 +217,7 @@ def _deviation_of_inverses(
         pairs = pairs[-1:]
     suspects = []
     for pair in pairs:
-        suspects += [first[pair], second[pair]]
+        suspects += [first[pair], first[pair] + 1]
     return Deviation(
         suspects=tuple(suspects),
         cause="deviates: a pattern and its inverse must add up to white, as the other ones do "
