@@ -38,9 +38,9 @@ RIG_ENTRY = "rig"
 SHOT_PREFIX = "shot_"
 
 # Pixels of a photograph that determine what is common to all, such as noise.
-MAX_SAMPLED_PIXELS = 1 << 14
+MAX_SAMPLED_PIXELS = 1 << 13
 # Values of all photographs that are merged at once.
-MERGED_VALUES = 1 << 21
+MERGED_VALUES = 1 << 20
 
 # Codes (h, w[, 3]) and seconds.
 Request = tuple[np.ndarray, float]
