@@ -63,13 +63,16 @@ def _squared_norms(matrix: Any, T: Transport) -> np.ndarray:
     if isinstance(matrix, scipy.sparse.csr_array):
         return _squared_norms_of_rows(matrix)
     if hasattr(matrix, "row_blocks"):
-        return sum(_squared_norms_of_rows(rows) for _, rows in matrix.row_blocks())
+        squares = np.zeros(matrix.shape[1])
+        for _, rows in matrix.row_blocks():
+            squares += _squared_norms_of_rows(rows)
+        return squares
     A = as_operator(matrix, T.device)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (A.shape[0], NORM_PROBES))
     return np.mean(np.square(A.T @ signs, dtype=np.float64), axis=1)
 
 
-def _squared_norms_of_rows(rows: scipy.sparse.csr_array) -> np.ndarray:
+def _squared_norms_of_rows(rows: Any) -> np.ndarray:
     squares = rows.data.astype(np.float64) ** 2
     return np.bincount(rows.indices, squares, minlength=rows.shape[1])
 
@@ -101,7 +104,9 @@ def _light_of_rows(T: Transport) -> tuple[np.ndarray, np.ndarray | None]:
     if T.blocks is not None:
         matrices = [block for row in T.blocks for block in row]
     pattern = np.ones(T.shape[1], np.float32)
-    white = np.sum([matrix @ pattern for matrix in matrices], axis=0, dtype=np.float64)
+    white = np.zeros(T.shape[0])
+    for matrix in matrices:
+        white += matrix @ pattern
     peaks = []
     for matrix in matrices:
         if hasattr(matrix, "row_blocks"):
