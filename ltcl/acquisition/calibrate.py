@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
+from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.metering import (
     MAX_EXPOSURE_RATIO,
     SATURATED_CODE,
@@ -43,7 +45,7 @@ from ltcl.acquisition.metering import (
     scan_exposures,
     unsaturated_exposure,
 )
-from ltcl.acquisition.radiometry import Radiance, Response
+from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
     CaptureSession,
@@ -267,7 +269,7 @@ def measure(
     # 4. Noise and offset of the camera; then photographs can be compared.
     of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
     consistency.check_black(session, of_white_exposure)
-    shown = {photograph.seconds: photograph.image for photograph in bright}
+    shown = {photograph.seconds: photograph.sampled for photograph in bright}
     check_full_scale(shots, list(shown), list(shown.values()))
     with session.naming_photographs():
         session.camera = _measure_camera(session, dark, bright)
@@ -275,15 +277,17 @@ def measure(
     progress("calibration", shots.count, shots.count)
 
     # 5. Light: ambient, white, of the projector's channels, and of the blocks.
+    projector, mixing = _measure_projector(session, effort, uniform, dark, bright)
     ambient = session.merge(dark)
-    lit = session.merge(bright)
-    white = lit - ambient
+    white = session.merge(bright) - ambient
     consistency.check_light(times.scan, white, view.resampling, session.camera)
-    projector, mixing = _measure_projector(session, effort, uniform, ambient, lit)
     blocks = session.merge([*before, *after])
     block_light = (blocks - ambient).value
-    consistency.check_map(session, view.resampling, view.stripes, block_light, white.value)
-    consistency.check_superposition(session, few[0], others[0], lit, ambient)
+    if view.light is not None:
+        consistency.check_map(
+            session, view.resampling, view.stripes, view.light, block_light, white.value
+        )
+    consistency.check_superposition(session, few[0], others[0], dark, bright)
     resampling = view.resampling.ascertained(white.value, white.valid)
     return Calibration(
         exposures=tuple(times.scan),
@@ -353,7 +357,7 @@ def _response_from_ramps(
     if times[0] * MIN_DARK_RATIO > white_exposure:
         ramps.append(np.zeros(shots.grid, np.float32))
     exposed = session.take([[(ramp, seconds) for ramp in ramps] for seconds in times])
-    hot = hot_pixels(np.minimum.reduce([photograph.image for photograph in exposed[0]]))
+    hot = hot_pixels(reduce(np.minimum, (photograph.image for photograph in exposed[0])))
     if shots.channels == 3:
         _expose_dark_colours(session, ramps, hot, times, exposed)
     images = [_side_by_side(group, hot) for group in exposed]
@@ -387,8 +391,14 @@ def _expose_dark_colours(
 
 
 def _side_by_side(photographs: Sequence[Photograph], hot: np.ndarray) -> np.ndarray:
-    """Photographs of one exposure as a single picture, without hot pixels."""
-    return np.hstack([fill_hot_pixels(photograph.image, hot) for photograph in photographs])
+    """Photographs of one exposure as a single picture of sampled pixels, without hot ones."""
+    return np.hstack([_without_hot_pixels(photograph, hot) for photograph in photographs])
+
+
+def _without_hot_pixels(photograph: Photograph, hot: np.ndarray) -> np.ndarray:
+    """Sampled pixels of a photograph; hot ones are those before them."""
+    step = photograph.step
+    return fill_hot_pixels(photograph.sampled, hot[::step, ::step])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -398,6 +408,7 @@ class _View:
     resampling: Resampling
     sharpness: Sharpness | None = None
     stripes: Sequence[Photograph] = ()
+    light: PhotographFile | None = None
 
     @property
     def camera_pixels(self) -> float:
@@ -417,19 +428,22 @@ def _measure_geometry(
     if geometry == "aligned":
         return _View(resampling=Resampling.aligned(shots.grid))
     stripes: list[Photograph] = []
-    light: list[np.ndarray] = []
+    light = None
     if isinstance(geometry, str):
         patterns = GrayCode(shots.grid).patterns()
         [stripes] = session.take([[(codes, seconds) for codes in patterns]])
         # Linear in light: a pixel that is half lit shows half of it.
-        light = [session.linear(photograph) for photograph in stripes]
+        light = PhotographFile(session.file)
+        for photograph in stripes:
+            light.append(session.linear(photograph))
         with acquisition_error("the geometry"):
             geometry = decode(light, shots.grid, levels=shots.levels)
     resampling = Resampling.of(geometry)
     return _View(
         resampling=resampling,
-        sharpness=Sharpness.of(geometry, resampling, light),
+        sharpness=Sharpness.of(geometry, resampling, light or ()),
         stripes=stripes,
+        light=light,
     )
 
 
@@ -450,7 +464,7 @@ def _measure_camera(
     if min(times) == max(times):
         offset = np.zeros(session.shots.channels)
         return CameraModel(response=response, noise=noise, offset=offset)
-    images = [photograph.image for photograph in dark]
+    images = [photograph.sampled for photograph in dark]
     with acquisition_error("black"):
         offset = radiometry.black_level(images, times, response, noise, levels=levels)
     return CameraModel(response=response, noise=noise, offset=offset)
@@ -460,7 +474,7 @@ def _bursts(photographs: Sequence[Photograph], hot: np.ndarray) -> list[list[np.
     """Images of one pattern by exposure, if there is more than one."""
     by_exposure: dict[float, list[np.ndarray]] = {}
     for photograph in photographs:
-        image = fill_hot_pixels(photograph.image, hot)
+        image = _without_hot_pixels(photograph, hot)
         by_exposure.setdefault(photograph.seconds, []).append(image)
     bursts = [by_exposure[seconds] for seconds in sorted(by_exposure)]
     return [images for images in bursts if len(images) > 1]
@@ -470,16 +484,19 @@ def _measure_projector(
     session: CaptureSession,
     effort: Effort,
     uniform: Sequence[Sequence[Photograph]],
-    ambient: Radiance,
-    lit: Radiance,
+    dark: Sequence[Photograph],
+    bright: Sequence[Photograph],
 ) -> tuple[Response, np.ndarray | None]:
     """Response of the projector, and how its colours mix; None with one channel.
 
-    `uniform` are photographs of uniform codes for each channel, `lit` that of white.
+    `uniform` are photographs of uniform codes for each channel, `dark` and `bright` those of black
+    and of white.
     """
+    ambient = session.merge_sampled(dark)
+    lit = session.merge_sampled(bright)
     pictures = []
     for photographs in uniform:
-        pictures.append([session.merge([photograph]) for photograph in photographs])
+        pictures.append([session.merge_sampled([photograph]) for photograph in photographs])
     is_grey = session.shots.channels == 1
     if is_grey:
         pictures[0].append(lit)

@@ -25,6 +25,7 @@ import numpy as np
 from ltcl.acquisition import agreement, anchor
 from ltcl.acquisition.agreement import ADVICE, CameraModel
 from ltcl.acquisition.geometry import Correspondence, Resampling, decode
+from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.radiometry import Radiance
 from ltcl.acquisition.radiometry.exposures import NO_LIGHT
 from ltcl.acquisition.rig import Shots
@@ -80,8 +81,8 @@ def check_black(session: CaptureSession, photographs: Sequence[Photograph]) -> N
 
     Compared pixel by pixel with that one, all others would deviate.
     """
-    pictures = map(session.linear, photographs)
-    light = np.stack([picture.ravel() for picture in pictures])
+    response = session.camera.response
+    light = np.stack([response.linear(shot.sampled).ravel() for shot in photographs])
     level = light.mean(axis=1)
     deviation = light - light.mean(axis=0) - level[:, None]
     noise_of_level = float(np.std(deviation)) / math.sqrt(light.shape[1])
@@ -154,17 +155,18 @@ def check_superposition(
     session: CaptureSession,
     few: Photograph,
     others: Photograph,
-    white: Radiance,
-    black: Radiance,
+    dark: Sequence[Photograph],
+    bright: Sequence[Photograph],
 ) -> None:
     """Refuse a projector whose light depends on the picture, as by dynamic contrast.
 
     Few pixels and all others must add up to the same part of white where the few are, in a dark
     picture, and elsewhere, in a bright one. A lamp that fades changes both.
     """
-    light = white - black
-    few_light = session.merge([few]) - black
-    other_light = session.merge([others]) - black
+    black = session.merge_sampled(dark)
+    light = session.merge_sampled(bright) - black
+    few_light = session.merge_sampled([few]) - black
+    other_light = session.merge_sampled([others]) - black
     total = few_light.value + other_light.value
     variance = few_light.variance + other_light.variance
     is_valid = light.valid & few_light.valid & other_light.valid & (light.value > 0)
@@ -259,7 +261,7 @@ def check_uniform(
     for photograph, picture in zip(photographs, darker_pictures, strict=False):
         name = session.name(photograph)
         share, share_noise = reference.share_of_white(picture)
-        sampled = agreement.sample(photograph.image, reference.pixels)
+        sampled = agreement.sample(photograph.sampled, reference.pixels)
         deviation = agreement.find_deviation(
             [sampled], [photograph.seconds], session.camera, reference.expected(share)
         )
@@ -284,25 +286,21 @@ def check_map(
     session: CaptureSession,
     resampling: Resampling,
     stripes: Sequence[Photograph],
+    light: PhotographFile,
     blocks: np.ndarray,
     white: np.ndarray,
 ) -> None:
     """Refuse Gray code in which a pattern was exchanged with its inverse.
 
     Its map is mirrored in part. The picture of blocks (H, W[, c]) tells: it is more like their
-    pattern in the map that exchanging them back gives. `white` is a picture too; both are without
-    ambient light.
+    pattern in the map that exchanging them back gives. `light` is linear, of the stripes; `white`
+    is a picture too, and both are without ambient light.
     """
-    if not stripes:
-        return
     likeness = _block_correlation(resampling, blocks, white)
     if likeness > MIN_MAP_CORRELATION:
         return
-    light = [session.linear(photograph) for photograph in stripes]
     for k in range(0, len(stripes) - 2, 2):
-        exchanged = light.copy()
-        exchanged[k] = light[k + 1]
-        exchanged[k + 1] = light[k]
+        exchanged = light.exchanged(k, k + 1)
         with contextlib.suppress(InputError):
             mapping = decode(exchanged, resampling.grid, levels=session.shots.levels)
             corrected = Resampling.of(mapping)

@@ -118,10 +118,18 @@ def fill_hot_pixels(image: np.ndarray, hot: np.ndarray) -> np.ndarray:
     """Replace each hot pixel of a photograph by the last good pixel before it."""
     if not hot.any():
         return image
-    good = np.flatnonzero(~hot)
-    position = np.searchsorted(good, np.arange(hot.size), "right") - 1
-    donor = good[np.maximum(position, 0)]
-    return image.reshape(hot.size, -1)[donor].reshape(image.shape)
+    flat_hot = hot.ravel()
+    places = np.flatnonzero(flat_hot)
+    # Runs of hot pixels have one donor: the pixel before them, or at the start of the picture the
+    # first good one.
+    starts = np.diff(places, prepend=-1) > 1
+    starts[0] = True
+    donors = np.maximum.accumulate(np.where(starts, places - 1, -1))
+    donors[donors < 0] = int(np.argmin(flat_hot))
+    filled = image.copy()
+    pixels = filled.reshape(hot.size, -1)
+    pixels[places] = pixels[donors]
+    return filled
 
 
 def brightness(image: np.ndarray, hot: np.ndarray) -> float:

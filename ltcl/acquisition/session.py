@@ -12,17 +12,20 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ltcl.acquisition.agreement import AgreementRecord, CameraModel
 from ltcl.acquisition.radiometry import Radiance, Response, merge
-from ltcl.acquisition.rig import RigError, Shots, shot_key
+from ltcl.acquisition.rig import RigError, Shots, shot_key, to_unit
+from ltcl.acquisition.scratch import ImageFile, StoredImage
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
 from ltcl.files import locked, sweep
 from ltcl.store import ArrayLog
@@ -34,6 +37,11 @@ VOLATILE_KEYS = frozenset(("survey", "seed", "mitsuba", "source", "backend", "in
 RIG_ENTRY = "rig"
 SHOT_PREFIX = "shot_"
 
+# Pixels of a photograph that determine what is common to all, such as noise.
+MAX_SAMPLED_PIXELS = 1 << 15
+# Values of all photographs that are merged at once.
+MERGED_VALUES = 1 << 22
+
 # Codes (h, w[, 3]) and seconds.
 Request = tuple[np.ndarray, float]
 # Called with a step, how much of it is done, and of how much.
@@ -44,12 +52,34 @@ def ignore_progress(step: str, done: int, total: int) -> None:
     """Progress that nobody asked for."""
 
 
-class Photograph(NamedTuple):
-    """Image (H, W[, 3]) in [0, 1] of full scale, its seconds, and its number."""
+@dataclass(frozen=True, kw_only=True)
+class Photograph:
+    """A photograph of a rig, in a temporary file, with its seconds and its number."""
 
-    image: np.ndarray
+    stored: StoredImage
+    rig: Any
     seconds: float
     number: int
+
+    @property
+    def image(self) -> np.ndarray:
+        """(H, W[, 3]) in [0, 1] of full scale."""
+        return self.read(slice(None))
+
+    @property
+    def step(self) -> int:
+        """Distance of sampled pixels along both sides: about `MAX_SAMPLED_PIXELS` at most."""
+        height, width = self.stored.shape[:2]
+        return math.ceil(math.sqrt(height * width / MAX_SAMPLED_PIXELS))
+
+    @property
+    def sampled(self) -> np.ndarray:
+        """The image at sampled pixels."""
+        return self.read(slice(None, None, self.step))[:, :: self.step]
+
+    def read(self, rows: slice) -> np.ndarray:
+        """Some rows of the image."""
+        return to_unit(f"photograph {self.number}", self.stored.read(rows), self.rig)
 
 
 class CaptureSession:
@@ -65,6 +95,8 @@ class CaptureSession:
         Defective pixels (H, W).
     record : AgreementRecord
         All photographs, to be compared when the noise is known.
+    file : ImageFile
+        The photographs.
     """
 
     def __init__(self, shots: Shots, log: ArrayLog | None, progress: Callable[[int], None]) -> None:
@@ -72,6 +104,7 @@ class CaptureSession:
         self.camera = CameraModel(response=Response.identity())
         self.hot = np.zeros((1, 1), bool)
         self.record = AgreementRecord()
+        self.file = ImageFile(None if log is None else log.path)
         self._log = log
         self._progress = progress
         self._uniform: dict[str, Photograph] = {}
@@ -115,10 +148,33 @@ class CaptureSession:
 
         AcquisitionError if they determine none.
         """
+        shape = photographs[0].stored.shape
+        merged = Radiance(
+            value=np.empty(shape, np.float32),
+            variance=np.empty(shape, np.float32),
+            valid=np.empty(shape, bool),
+        )
+        step = max(MERGED_VALUES // (len(photographs) * math.prod(shape[1:])), 1)
+        for top in range(0, shape[0], step):
+            rows = slice(top, min(top + step, shape[0]))
+            images = [photograph.read(rows) for photograph in photographs]
+            strip = self._merge(images, photographs)
+            merged.value[rows] = strip.value
+            merged.variance[rows] = strip.variance
+            merged.valid[rows] = strip.valid
+        return merged
+
+    def merge_sampled(self, photographs: Sequence[Photograph]) -> Radiance:
+        """The radiance at the pixels of `Photograph.sampled`."""
+        images = [photograph.sampled for photograph in photographs]
+        return self._merge(images, photographs)
+
+    def _merge(self, images: list[np.ndarray], photographs: Sequence[Photograph]) -> Radiance:
+        """Images, which are parts of photographs, as radiance."""
         numbers = [photograph.number for photograph in photographs]
         with acquisition_error(f"photographs {min(numbers)} to {max(numbers)}"):
             return merge(
-                [photograph.image for photograph in photographs],
+                images,
                 [photograph.seconds for photograph in photographs],
                 self.camera.response,
                 self.camera.noise,
@@ -147,7 +203,12 @@ class CaptureSession:
         image = self.shots.photograph(codes, seconds, stored)
         if self._log is not None and stored is None:
             self._log.put(name, image=self.shots.image)
-        photograph = Photograph(image, seconds, self.shots.number)
+        photograph = Photograph(
+            stored=self.file.append(self.shots.image),
+            rig=self.shots.rig,
+            seconds=seconds,
+            number=self.shots.number,
+        )
         self.record.add(codes, seconds, image, photograph.number)
         if codes.min() == codes.max():
             self._uniform[name] = photograph

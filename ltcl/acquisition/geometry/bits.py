@@ -31,6 +31,7 @@ as in a closed white room, has no coordinate.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from ltcl.acquisition.geometry.axis import (
@@ -60,6 +61,11 @@ MIN_FAINT_NOISE = 0.05
 # Standard deviations of a difference that the direct light of a faint pixel exceeds: 32 fine
 # photographs of noise alone differ by up to 3.
 MIN_FAINT_DEVIATIONS = 3.0
+
+# Least light of a faint pixel, as a part of the brightest within its 7 x 7 pixels: lens
+# blur shifts the stripes that darker ones show.
+MIN_FAINT_SHARE = 0.3
+NEAR_WINDOW = 7
 
 # Noise of a pixel, by few photographs, that counts at least, as a part of the median.
 MIN_NOISE_SHARE = 0.5
@@ -157,6 +163,8 @@ class StripDecoder:
         is_lit = direct > threshold
         is_noisy = ~is_dim & (threshold > MIN_FAINT_NOISE * direct)
         is_noisy &= (direct > MIN_FAINT_DEVIATIONS * noise) & (white > threshold)
+        brightest = cv2.dilate(white, np.ones((NEAR_WINDOW, NEAR_WINDOW)))
+        is_noisy &= white > MIN_FAINT_SHARE * brightest
 
         h, w = self.grid
         column_bits = self.bits[0]

@@ -153,9 +153,12 @@ def decode(
             "photographs: no pixel is decoded; patterns must be in view, sharp, above the noise"
         )
     h, w = code.grid
-    if subpixel:
-        return Correspondence(refine(x, valid, w), refine(y, valid, h), valid, code.grid)
-    return Correspondence(x.value, y.value, valid, code.grid)
+    if not subpixel:
+        return Correspondence(x.value, y.value, valid, code.grid)
+    fine_x = refine(x, valid, w)
+    fine_y = refine(y, valid, h)
+    valid &= np.isfinite(fine_x) & np.isfinite(fine_y)
+    return Correspondence(fine_x, fine_y, valid, code.grid)
 
 
 def _confirm(x: Axis, y: Axis) -> np.ndarray:

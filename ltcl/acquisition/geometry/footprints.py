@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.geometry.correspondence import Correspondence
+from ltcl.acquisition.radiometry.strips import in_strips
 
 # A difference that is so many times the opposite one crosses the border of an object (perspective:
 # below 1.1).
@@ -25,8 +26,14 @@ MAX_SPAN_RATIO = 6.0
 # and an exact map, measured: 4: 1.2 %, 8: 0.9 %, 16: 0.6 % in four times the time).
 POINTS_PER_SIDE = 8
 
+# Corners (u, v) of a camera pixel: if all lie in one projector pixel, so does the footprint.
+CORNERS = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
+
+# Camera pixels of a strip of rows whose differences are taken at once.
+STRIP_PIXELS = 1 << 16
+
 # Camera pixels whose points are placed at once.
-PIXELS_AT_ONCE = 1 << 12
+PIXELS_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class Footprints:
     ----------
     mapping : Correspondence
         Places of their middles.
-    J : (H, W, 2, 2) float64
+    J : (H, W, 2, 2) float32
         d(x, y) / d(u, v), whose columns span the parallelogram.
     known : (H, W) bool
         Whether J is known.
@@ -94,34 +101,38 @@ class Footprints:
         camera pixels count as squares. Those that would span six times the median have no
         footprint.
         """
-        places = np.stack([mapping.x, mapping.y], axis=-1).astype(np.float64)  # NaN if not valid
-        du, has_both_u = _differences(places, 1)
-        dv, has_both_v = _differences(places, 0)
-        J = np.stack([du, dv], axis=-1)
-        h, w = mapping.grid
-        if w == 1:
-            J[:, :, 0] = np.nan
-        if h == 1:
-            J[:, :, 1] = np.nan
-        # Missing derivatives of a square, by Cauchy and Riemann's equations.
-        of_square = J[..., ::-1, ::-1] * [[1, -1], [-1, 1]]
-        J = np.nan_to_num(np.where(np.isnan(J), of_square, J))
+        H, W = mapping.camera_grid
+        J = np.empty((H, W, 2, 2), np.float32)
+        has_both = np.empty((H, W), bool)
 
-        is_known = np.linalg.det(J) != 0
+        def measure_rows(rows: slice) -> None:
+            # One row more on each side has the differences along columns.
+            top = max(rows.start - 1, 0)
+            window = slice(top, rows.stop + 1)
+            inside = slice(rows.start - top, rows.stop - top)
+            strip_J, strip_both = _jacobians(mapping, window)
+            J[rows] = strip_J[inside]
+            has_both[rows] = strip_both[inside]
+
+        in_strips(H, STRIP_PIXELS // W, measure_rows)
+        is_known = _determinants(J) != 0
         span = np.abs(J).max(axis=(2, 3))
         if is_known.any():
             is_known &= span <= MAX_SPAN_RATIO * np.median(span[is_known])
-        is_straddling = is_known & ~(has_both_u & has_both_v)
-        return cls(mapping=mapping, J=J, known=is_known, straddling=is_straddling)
+        return cls(mapping=mapping, J=J, known=is_known, straddling=is_known & ~has_both)
 
     @property
     def width(self) -> float:
         """Length of the median footprint, in projector pixels."""
-        return float(np.median(np.linalg.norm(self.J[self.known], 2, axis=(1, 2))))
+        # Squares of the largest singular values of 2 x 2 matrices.
+        J = self.J[self.known]
+        half = np.sum(J**2, axis=(1, 2)) / 2
+        largest = half + np.sqrt(np.maximum(half**2 - _determinants(J) ** 2, 0.0))
+        return float(np.sqrt(np.median(largest)))
 
     def areas(self) -> np.ndarray:
         """Area of each footprint in projector pixels, (M,)."""
-        return np.abs(np.linalg.det(self.J)).ravel()
+        return np.abs(_determinants(self.J)).ravel()
 
     def shares(self, padded: PaddedGrid, *, tent: bool = False) -> scipy.sparse.csr_array:
         """Part of each footprint in each pixel of the padded grid, (M, pixels).
@@ -129,7 +140,7 @@ class Footprints:
         With `tent`, parts of twice the footprint, with less weight towards its border, as bilinear
         interpolation weighs.
         """
-        du, dv = _footprint_points(tent)
+        points = _footprint_points(tent)
         known = self.known.ravel()
         x = np.where(self.known, self.mapping.x, 0.0).ravel()
         y = np.where(self.known, self.mapping.y, 0.0).ravel()
@@ -137,15 +148,46 @@ class Footprints:
         chunks = []
         for start in range(0, known.size, PIXELS_AT_ONCE):
             chunk = slice(start, start + PIXELS_AT_ONCE)
-            xu, xv, yu, yv = J[chunk].T[..., None]
-            points_x = x[chunk, None] + xu * du + xv * dv
-            points_y = y[chunk, None] + yu * du + yv * dv
-            numbers = padded.numbers(points_x, points_y)
-            chunks.append(_count_points(numbers, known[chunk], padded.size))
+            numbers = padded.numbers(*_places(x[chunk], y[chunk], J[chunk], CORNERS * (1 + tent)))
+            is_split = known[chunk] & (numbers != numbers[:, :1]).any(axis=1)
+            split = np.flatnonzero(is_split) + start
+            places = _places(x[split], y[split], J[split], points)
+            parts = _count_points(padded.numbers(*places), padded.size)
+            chunks.append(_insert_whole(parts, is_split, known[chunk], numbers[:, 0]))
         return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
 
 
-def _footprint_points(tent: bool) -> tuple[np.ndarray, np.ndarray]:
+def _jacobians(mapping: Correspondence, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    """J of some rows, 0 where it is not known, and whether all four neighbours count."""
+    places = np.stack([mapping.x[rows], mapping.y[rows]], axis=-1)  # NaN if not valid
+    du, has_both_u = _differences(places.astype(np.float64), 1)
+    dv, has_both_v = _differences(places.astype(np.float64), 0)
+    J = np.stack([du, dv], axis=-1)
+    h, w = mapping.grid
+    if w == 1:
+        J[:, :, 0] = np.nan
+    if h == 1:
+        J[:, :, 1] = np.nan
+    # Missing derivatives of a square, by Cauchy and Riemann's equations.
+    of_square = J[..., ::-1, ::-1] * [[1, -1], [-1, 1]]
+    return np.nan_to_num(np.where(np.isnan(J), of_square, J)), has_both_u & has_both_v
+
+
+def _determinants(J: np.ndarray) -> np.ndarray:
+    """Determinants of matrices (..., 2, 2)."""
+    return J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+
+
+def _places(
+    x: np.ndarray, y: np.ndarray, J: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places x and y, (camera pixels, points), of points (2, points) of each camera pixel."""
+    du, dv = points
+    xu, xv, yu, yv = J.T[..., None]
+    return x[:, None] + xu * du + xv * dv, y[:, None] + yu * du + yv * dv
+
+
+def _footprint_points(tent: bool) -> np.ndarray:
     """Points (u, v) of a camera pixel, in pixels from its middle.
 
     They are sheared: no two points lie on one line along a side, which a border may be, too.
@@ -156,9 +198,8 @@ def _footprint_points(tent: bool) -> tuple[np.ndarray, np.ndarray]:
     column = np.tile(number, points)
     u = (row + (column + 0.5) / points) / points - 0.5
     v = (column + (row + 0.5) / points) / points - 0.5
-    if tent:
-        return _spread_as_tent(u), _spread_as_tent(v)
-    return u, v
+    even = np.stack([u, v])
+    return _spread_as_tent(even) if tent else even
 
 
 def _spread_as_tent(even: np.ndarray) -> np.ndarray:
@@ -166,15 +207,33 @@ def _spread_as_tent(even: np.ndarray) -> np.ndarray:
     return np.copysign(1.0 - np.sqrt(1.0 - 2.0 * np.abs(even)), even)
 
 
-def _count_points(numbers: np.ndarray, known: np.ndarray, pixels: int) -> scipy.sparse.csr_array:
-    """Part of the points (camera pixels, points) of known camera pixels in each projector pixel."""
-    points = numbers.shape[1]
-    columns = numbers[known].ravel()
-    indptr = np.append(0, np.cumsum(known, dtype=np.int32) * points)
-    values = np.full(columns.size, 1.0 / points)
-    shares = scipy.sparse.csr_array((values, columns, indptr), (len(numbers), pixels))
+def _count_points(numbers: np.ndarray, pixels: int) -> scipy.sparse.csr_array:
+    """Part of the points (camera pixels, points) in each projector pixel."""
+    count, points = numbers.shape
+    indptr = np.arange(count + 1, dtype=np.int32) * points
+    values = np.full(numbers.size, 1.0 / points)
+    shares = scipy.sparse.csr_array((values, numbers.ravel(), indptr), (count, pixels))
     shares.sum_duplicates()
     return shares
+
+
+def _insert_whole(
+    parts: scipy.sparse.csr_array, is_split: np.ndarray, known: np.ndarray, numbers: np.ndarray
+) -> scipy.sparse.csr_array:
+    """Rows of all camera pixels: `parts` of split ones, others whole in the projector's `numbers`.
+
+    Rows of unknown ones are empty.
+    """
+    lengths = known.astype(np.int32)
+    lengths[is_split] = np.diff(parts.indptr)
+    indptr = np.append(0, np.cumsum(lengths, dtype=np.int32))
+    is_part = np.repeat(is_split, lengths)
+    values = np.ones(len(is_part))
+    values[is_part] = parts.data
+    columns = np.empty(len(is_part), np.int32)
+    columns[is_part] = parts.indices
+    columns[~is_part] = numbers[known & ~is_split]
+    return scipy.sparse.csr_array((values, columns, indptr), (len(known), parts.shape[1]))
 
 
 def _differences(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

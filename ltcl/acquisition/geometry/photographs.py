@@ -7,9 +7,6 @@ to a file when it is taken, and decodes some rows of all of them at once.
 
 from __future__ import annotations
 
-import os
-import tempfile
-import threading
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -17,6 +14,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import check_photographs
+from ltcl.acquisition.scratch import ImageFile, StoredImage
 
 # Steps of a linear value in a file.
 STEPS = np.iinfo(np.uint16).max
@@ -81,33 +79,35 @@ class PhotographFile:
 
     Parameters
     ----------
-    folder : path, optional
-        Folder of the file, by default that of the system for temporary files.
+    file : ImageFile, optional
+        The file, by default a new one.
 
     Examples
     --------
-    >>> with PhotographFile() as photographs:
-    ...     photographs.append(np.full((2, 3), 0.5))
-    ...     photographs[0].round(4).tolist()
+    >>> photographs = PhotographFile()
+    >>> photographs.append(np.full((2, 3), 0.5))
+    >>> photographs[0].round(4).tolist()
     [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
     """
 
-    def __init__(self, folder: str | os.PathLike[str] | None = None) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder, prefix="ltcl-")  # noqa: SIM115
-        self._lock = threading.Lock()
-        self.count = 0
-        self.shape = (0, 0)
-        self.code_step = 0.0
+    code_step = 0.0
 
-    def __enter__(self) -> PhotographFile:
-        return self
+    def __init__(self, file: ImageFile | None = None) -> None:
+        if file is None:
+            file = ImageFile()
+        self._file = file
+        self._images: list[StoredImage] = []
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    @property
+    def count(self) -> int:
+        """Number of photographs."""
+        return len(self._images)
 
-    def close(self) -> None:
-        """Remove the file."""
-        self._file.close()
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        H, W = self._images[0].shape
+        return H, W
 
     def __len__(self) -> int:
         return self.count
@@ -117,33 +117,26 @@ class PhotographFile:
 
     def append(self, image: np.ndarray) -> None:
         """Append a photograph (H, W) or (H, W, 3); all must have one shape."""
-        if self.count == 0:
-            self.shape = (image.shape[0], image.shape[1])
-        checks.shape(f"photographs[{self.count}]", image, self.shape, (*self.shape, 3))
-        self._file.seek(0, os.SEEK_END)
-        for top in range(0, self.shape[0], ROWS_AT_ONCE):
-            grey = _as_grey(image[top : top + ROWS_AT_ONCE])
-            steps = np.rint(STEPS * np.clip(grey, 0.0, 1.0))
-            self._file.write(steps.astype(np.uint16))
-        self.count += 1
+        if self._images:
+            checks.shape(f"photographs[{self.count}]", image, self.shape, (*self.shape, 3))
+        steps = np.empty(image.shape[:2], np.uint16)
+        for top in range(0, len(steps), ROWS_AT_ONCE):
+            rows = slice(top, top + ROWS_AT_ONCE)
+            grey = np.clip(_as_grey(image[rows]), 0.0, 1.0)
+            np.rint(STEPS * grey, out=steps[rows], casting="unsafe")
+        self._images.append(self._file.append(steps))
 
     def read(self, number: int, rows: slice) -> np.ndarray:
         """Rows of one photograph, float32; negative numbers count from the last."""
-        H, W = self.shape
-        numbers = range(H)[rows]
-        steps = np.empty((len(numbers), W), np.uint16)
-        first = (number % self.count) * H
-        with self._lock:
-            if numbers.step == 1:
-                self._read_into(steps, first + numbers.start)
-            else:
-                for row, place in zip(steps, numbers, strict=True):
-                    self._read_into(row, first + place)
-        return steps * np.float32(1.0 / STEPS)
+        return self._images[number].read(rows) * np.float32(1.0 / STEPS)
 
-    def _read_into(self, steps: np.ndarray, row: int) -> None:
-        self._file.seek(row * self.shape[1] * steps.itemsize)
-        self._file.readinto(steps)
+    def exchanged(self, first: int, second: int) -> PhotographFile:
+        """The same photographs, two of which have changed places."""
+        photographs = PhotographFile(self._file)
+        photographs._images = self._images.copy()
+        photographs._images[first] = self._images[second]
+        photographs._images[second] = self._images[first]
+        return photographs
 
 
 def _as_grey(image: np.ndarray) -> np.ndarray:

@@ -67,6 +67,9 @@ RIM = REACH + 1
 # Least weight, of the largest of a row (0: 0.9 %, 0.01: 1.2 %).
 MIN_WEIGHT = 0.001
 
+# Least entry of an inverse, of the one of the pixel itself.
+MIN_ENTRY = 0.1 * MIN_WEIGHT
+
 # Part of the answer of least squares that is a pixel's own light; with less it is not seen.
 MIN_RESOLUTION = 0.9
 
@@ -227,7 +230,8 @@ def _separate_pixels(
     for start in range(0, len(pixels), PIXELS_AT_ONCE):
         windows = pixels[start : start + PIXELS_AT_ONCE, None] + window
         rows = _inverse_rows(normal, windows) @ weighted
-        chunks.append(_normalise_rows(_drop_small_weights(rows)))
+        normalised = _normalise_rows(_drop_small_weights(rows))
+        chunks.append(normalised.astype(np.float32))
     return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
 
 
@@ -253,14 +257,19 @@ def _inverse_rows(normal: Any, windows: np.ndarray) -> scipy.sparse.csr_array:
     Z = np.linalg.solve(local + identity, identity[:, [middle]])[..., 0]
     # (G + I)^-1 G has the diagonal 1 - Z_nn.
     Z *= 1.0 - Z[:, [middle]] >= MIN_RESOLUTION
+    # Entries that give no weight above the least one.
+    Z[np.abs(Z) < MIN_ENTRY * np.abs(Z[:, [middle]])] = 0.0
     indptr = np.arange(0, Z.size + 1, n)
-    return scipy.sparse.csr_array((Z.ravel(), windows.ravel(), indptr), (len(Z), normal.shape[0]))
+    rows = scipy.sparse.csr_array((Z.ravel(), windows.ravel(), indptr), (len(Z), normal.shape[0]))
+    rows.eliminate_zeros()
+    return rows
 
 
 def _drop_small_weights(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
     largest = np.asarray(abs(rows).max(axis=1).todense()).ravel()
     threshold = np.repeat(MIN_WEIGHT * largest, np.diff(rows.indptr))
     rows.data[np.abs(rows.data) < threshold] = 0.0
+    rows.eliminate_zeros()
     return rows
 
 

@@ -31,6 +31,7 @@ from ltcl.acquisition.geometry.bits import FINE_BITS
 from ltcl.acquisition.geometry.correspondence import Correspondence
 from ltcl.acquisition.geometry.footprints import Footprints
 from ltcl.acquisition.geometry.graycode import GrayCode
+from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.geometry.resample import SEPARABLE_WIDTH, Resampling
 from ltcl.errors import AcquisitionError
 
@@ -78,7 +79,10 @@ class Sharpness:
 
     @classmethod
     def of(
-        cls, mapping: Correspondence, R: Resampling, light: Sequence[np.ndarray] = ()
+        cls,
+        mapping: Correspondence,
+        R: Resampling,
+        light: Sequence[np.ndarray] | PhotographFile = (),
     ) -> Sharpness:
         """Sharpness of a camera.
 
@@ -88,7 +92,7 @@ class Sharpness:
             Map from the camera to the projector.
         R : Resampling
             Resampling of photographs by this map.
-        light : sequence of (H, W) or (H, W, c) arrays
+        light : sequence of (H, W) or (H, W, c) arrays, or PhotographFile
             Photographs of Gray code, linear in light. Without them, and on small grids, the size of
             camera pixels decides.
 
@@ -162,7 +166,9 @@ class Sharpness:
         return advice
 
 
-def _measure_leak(R: Resampling, light: Sequence[np.ndarray], axis: int) -> float | None:
+def _measure_leak(
+    R: Resampling, light: Sequence[np.ndarray] | PhotographFile, axis: int
+) -> float | None:
     """q along y (axis 0) or x, in [0, 1], at pixels with two neighbours.
 
     None for too few patterns or no light.

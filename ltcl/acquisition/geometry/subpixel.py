@@ -175,7 +175,7 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> np.ndarray:
     """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel.
 
     `size` is the number of projector pixels along the axis. Camera pixels that see a part of the
-    outermost of these may lie beyond them.
+    outermost of these may lie beyond them. Faint pixels that lie on no plane are NaN.
     """
     H, W = valid.shape
     reach = _window_reach(axis, valid)
@@ -213,7 +213,8 @@ def _refine_strip(axis: Axis, valid: np.ndarray, size: int, rows: slice, reach: 
         reach = max(reach // 2, MIN_REACH)
         planes = Planes.fit(axis, valid, around, reach)
     is_in_cell = (cell[0] <= value) & (value <= cell[1])
-    return np.where(valid[rows] & is_in_cell, value, strip.value)
+    whole = np.where(strip.known, strip.value, np.float32(np.nan))
+    return np.where(valid[rows] & is_in_cell, value, whole)
 
 
 def _cells(axis: Axis, size: int) -> np.ndarray:

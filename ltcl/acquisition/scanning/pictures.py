@@ -28,6 +28,7 @@ from ltcl.acquisition.calibration import Calibration, Setup
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
+from ltcl.acquisition.scratch import ImageFile, StoredImage
 from ltcl.acquisition.session import acquisition_error
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
@@ -165,6 +166,8 @@ class _ExposedPattern:
     images: Sequence[np.ndarray]
     seconds: Sequence[float]
     numbers: Sequence[int]
+    # The radiance, by `anchor.compact`.
+    light: StoredImage | None = None
 
 
 class ScanCamera(ScanGrid):
@@ -200,13 +203,15 @@ class ScanCamera(ScanGrid):
         times = self.calibration.exposures
         pictures: list[Picture] = []
         exposed: list[_ExposedPattern] = []
+        self._compact = ImageFile()
         for k, codes in enumerate(batch):
             photographs = self._photograph(codes, times)
             if self._deviation(photographs) is not None:
                 self._refuse(photographs, batch[k + 1 : k + 2])
             light = self._merge(photographs)
             pictures.append(self._without_ambient(self.picture(light)))
-            exposed.append(replace(photographs, images=[anchor.compact(light)]))
+            stored = self._compact.append(anchor.compact(light))
+            exposed.append(replace(photographs, images=[], light=stored))
             progress(1)
         self._check_patterns(patterns, pictures, exposed)
         blocks = self._photograph(anchor.marked(batch), times[:1])
@@ -312,12 +317,12 @@ class ScanCamera(ScanGrid):
         gain = known.anchor.lamp_gain(*shot)
         if known.anchor.deviation(*shot, gain) is None:
             return gain
-        light = anchor.compact(self._merge(blocks))
-        series = [*exposed, replace(blocks, images=[light])]
+        light = self._compact.append(anchor.compact(self._merge(blocks)))
+        series = [*exposed, replace(blocks, images=[], light=light)]
         setup = known.white, known.ambient, known.resampling
         shifts = []
         for photographs in series:
-            [picture] = photographs.images
+            picture = photographs.light.read()
             shifts.append(anchor.shift_of(photographs.codes, picture, *setup))
         *earlier, moved = shifts
         first = anchor.first_moved(earlier, moved)

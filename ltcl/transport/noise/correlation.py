@@ -17,11 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ltcl.transport.noise.blocks import Blocks, detail_variance
+from ltcl.transport.noise.blocks import MIN_VARIANCE, Blocks, detail_variance
 from ltcl.transport.noise.windows import Windows
 
 # Gain from which on errors are shared.
 MIN_GAIN = 1.4
+# Power of the gain without the mean of a window, at most, that errors shared by few pixels have
+# with it; texture has far more.
+MAX_POWER = 6
 # Flatness up to which the finest detail is noise.
 MAX_FLATNESS = 1.4
 
@@ -66,9 +69,12 @@ def _gain(X: np.ndarray, projector: Windows, camera: Windows, is_noise: np.ndarr
     finest = projector.finest()
     independent = typical(camera, finest)
     # Texture is the same for all pixels of a window, and has no detail even of the first degree.
-    if typical(camera.with_order(1), finest) < MIN_GAIN * independent:
+    gain_of_gradients = typical(camera.with_order(1), finest) / max(independent, MIN_VARIANCE)
+    if gain_of_gradients < MIN_GAIN:
         return 1.0
     shared = typical(None, finest)
+    if shared > gain_of_gradients**MAX_POWER * independent:
+        return 1.0
     if typical(None, projector) > MAX_FLATNESS * shared:
         return np.nan
-    return shared / independent
+    return shared / max(independent, MIN_VARIANCE)

@@ -133,10 +133,10 @@ def test_photographs_in_a_file_are_decoded_as_those_in_memory(shape: tuple[int, 
         patterns = [np.repeat(pattern[..., None], 3, axis=2) for pattern in patterns]
     images = [0.1 + 0.7 * pattern for pattern in patterns]
     expected = decode(images, GRID)
-    with PhotographFile() as file:
-        for image in images:
-            file.append(image)
-        mapping = decode(file, GRID)
+    file = PhotographFile()
+    for image in images:
+        file.append(image)
+    mapping = decode(file, GRID)
     np.testing.assert_array_equal(mapping.valid, expected.valid)
     np.testing.assert_allclose(mapping.x, expected.x, atol=1e-2)
     np.testing.assert_allclose(mapping.y, expected.y, atol=1e-2)
