@@ -44,10 +44,16 @@ ARGUMENTS = {
 }
 
 
+def numbers_in_name(path: Path) -> list[int]:
+    """Numbers in the name of a file, in their order."""
+    return [int(digits) for digits in re.findall(r"\d+", path.stem)]
+
+
 def read_photographs(folder: Path) -> list[np.ndarray]:
     """Photographs of a folder, by the numbers in their names."""
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".tif")]
-    paths.sort(key=lambda path: [int(digits) for digits in re.findall(r"\d+", path.stem)])
+    suffixes = {".png", ".jpg", ".tif"}
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
+    paths.sort(key=numbers_in_name)
     return [np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) for path in paths]
 
 
@@ -60,10 +66,12 @@ def simulate_photographs(grid: tuple[int, int], seed: int = 0) -> list[np.ndarra
     v, u = np.mgrid[:H, :W].astype(np.float32)
     x = 0.45 * u + 1.5 * np.sin(v / 40)
     y = 0.45 * v + 0.02 * u
-    albedo = cv2.resize(rng.uniform(0.2, 1.0, (H // 8, W // 8)).astype(np.float32), (W, H))
+    patches = rng.uniform(0.2, 1.0, (H // 8, W // 8)).astype(np.float32)
+    albedo = cv2.resize(patches, (W, H))
     photographs = []
     for pattern in GrayCode(grid).patterns():
-        light = cv2.GaussianBlur(cv2.remap(pattern, x, y, cv2.INTER_LINEAR), (0, 0), 2.0)
+        sharp = cv2.remap(pattern, x, y, cv2.INTER_LINEAR)
+        light = cv2.GaussianBlur(sharp, (0, 0), 2.0)
         flicker = rng.uniform(0.85, 1.15)
         codes = 20 + 120 * (flicker * albedo * light) ** (1 / 2.2)
         codes += rng.normal(0.0, 4.0, (H, W))
@@ -149,7 +157,8 @@ def main() -> None:
         photographs = simulate_photographs(grid)
     else:
         photographs = read_photographs(options.arguments.photographs)
-    *_, white, black = [as_grey(photograph).astype(np.float32) for photograph in photographs]
+    white = as_grey(photographs[-2]).astype(np.float32)
+    black = as_grey(photographs[-1]).astype(np.float32)
     is_lit = white - black > LIT_CODES
     maps = {
         "ltcl": decode_by_ltcl(photographs, grid),

@@ -42,10 +42,15 @@ def main() -> None:
     sums = total(surveys)
     facts: dict[str, Any] = dict(sums)
     for name, result in surveys.items():
-        facts[name] = f"{result.distinct} different states of {len(works[name].operations)} steps"
-    facts["examples"] = [text for result in surveys.values() for text in result.examples[:1]]
+        steps = len(works[name].operations)
+        facts[name] = f"{result.distinct} different states of {steps} steps"
+    examples = []
+    for result in surveys.values():
+        examples.extend(result.examples[:1])
+    facts["examples"] = examples
     claims = []
-    for kind, text in (("lost", "states that lost something"), ("wrong", "states read wrongly")):
+    questions = {"lost": "states that lost something", "wrong": "states read wrongly"}
+    for kind, text in questions.items():
         claim = Claim(
             text=text,
             measured=f"{sums[kind]} of {sums['states']}",
@@ -61,7 +66,8 @@ def draw(surveys: dict[str, Survey]) -> Figure:
     figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
     axes = figure.subplots()
     heights = range(len(surveys))
-    axes.barh(heights, [result.distinct for result in surveys.values()], color="#3b6ea5")
+    distinct_states = [result.distinct for result in surveys.values()]
+    axes.barh(heights, distinct_states, color="#3b6ea5")
     axes.set_yticks(heights, list(surveys))
     axes.set_xlabel("different states of the disk")
     return figure
