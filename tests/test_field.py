@@ -193,6 +193,7 @@ def test_a_broken_command_fails_alone(modules, scenes, tmp_path, monkeypatch, ca
         ("dense", "coloured", 0.01),
         ("threshold", "coloured", 0.3),
         ("ltcl", "corner", 0.01),
+        ("ltcl compressed", "corner", 0.02),
     ],
 )
 def test_baselines_compensate_and_separate(modules, scenes, name, scene, most) -> None:
@@ -201,7 +202,8 @@ def test_baselines_compensate_and_separate(modules, scenes, name, scene, most) -
     assert "failed" not in scores, scores
     assert max(scores["compensation"]) < most
     assert max(scores["bounce 0"]) < most + 0.02  # the diagonal holds light that came back
-    assert ("bounces within std" in scores) == name.startswith("ltcl")
+    # ltcl states deviations where T of so few pixels shows its noise.
+    assert name.startswith("ltcl") or "bounces within std" not in scores
 
 
 def test_the_iteration_says_that_it_does_not_converge(modules) -> None:

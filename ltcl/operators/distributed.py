@@ -45,6 +45,9 @@ class RankDevice(Device):
     def __init__(self, comm: Any, device: Device) -> None:
         # The same device with another way to split rows: one queue, memory pool, set of kernels.
         super().__init__(device.description, device.session)
+        # Limits that were lowered on the device hold here, too.
+        self.memory = device.memory
+        self.max_allocation = device.max_allocation
         self.comm = comm
         # The devices of the other ranks are alike.
         self.others = (device,) * (comm.size - 1)

@@ -29,11 +29,14 @@ KINDS = {
     "field": ("real", "double", "integer", "unsigned-integer"),
     "symmetry": ("general", "symmetric"),
 }
-# The first line, comments, and the line of sizes.
-HEAD = rb"([^\n]*+\n(?:\s*+%[^\n]*+\n)*+\s*+[^\n]*+\n\s*+)"
+# The first line, comments, and the line of sizes. No group here or below is repeated possessively:
+# Python before 3.11.5 goes on at a wrong place where the last repetition fails half-way.
+HEAD = re.compile(rb"[^\n]*+\n(?:\s*+%[^\n]*+\n)*\s*+[^\n]*+\n\s*+")
+# A group that is repeated keeps a place for each repetition.
+LINES_AT_ONCE = 1000
 GRID = re.compile(rb"^%+\s*ltcl grid (\d+) x (\d+)(?:, camera grid (\d+) x (\d+))?\s*$", re.M)
 INTEGER = rb"-?\d++"
-REAL = rb"-?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+"
+REAL = rb"-?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?"
 PLACE = rb"\d++[ \t]++\d++[ \t]++"
 
 
@@ -117,18 +120,35 @@ def _check_kinds(line: bytes) -> None:
 
 def _check_lines(header: Header, data: bytes) -> bytes:
     """Refuse lines that are not as declared; returns the first lines."""
-    text: Any = re.match(rb"%b((?:%b)*+)\s*+" % (HEAD, header.line), data)
-    end = text.end()
+    head: Any = HEAD.match(data)
+    last = _end_of_lines(header.line, data, head.end())
+    end = _end_of(re.compile(rb"\s*+"), data, last)
     if end < len(data):
         wrong = data[end : end + 60].split(b"\n")[0]
         number = data.count(b"\n", 0, end) + 1
         place = "" if header.is_dense else "row, column, "
         raise FileError(f"line {number} is {wrong!r}; it must be {place}{header.field}")
-    lines = data.count(b"\n", *text.span(2))
+    lines = data.count(b"\n", head.end(), last)
     if lines != header.lines or not header.is_possible:
         size = f"{header.rows} x {header.columns}, {header.symmetry}"
         raise FileError(f"declares {size}, of {header.lines} lines, but has {lines}")
-    return text[1]
+    return head[0]
+
+
+def _end_of(pattern: re.Pattern[bytes], data: bytes, start: int) -> int:
+    """Where what a pattern matches from `start` on ends, or `start`."""
+    match = pattern.match(data, start)
+    return start if match is None else match.end()
+
+
+def _end_of_lines(line: bytes, data: bytes, start: int) -> int:
+    """Where the lines that are as declared end."""
+    lines = re.compile(rb"(?:%b){1,%d}" % (line, LINES_AT_ONCE))
+    while True:
+        end = _end_of(lines, data, start)
+        if end == start:
+            return end
+        start = end
 
 
 def _grids(head: bytes) -> tuple[Any, Any]:

@@ -358,7 +358,9 @@ def test_a_small_archive_cannot_declare_terabytes(tmp_path: Path, claims: tuple[
         archive.writestr(info, array)
         for name in claims:  # goes into the directory on closing
             setattr(info, name, len(array) + 4 * 3000000**2)
-    assert "TiB" in refusal(tmp_path / "T.npz", FileError)
+    reason = refusal(tmp_path / "T.npz", FileError)
+    # Newer releases of Python refuse the third by themselves.
+    assert "TiB" in reason or "Overlapped entries" in reason
 
 
 # .npy stays on the disk.

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse
 
-from ltcl.errors import ConvergenceError
+from ltcl.errors import ConvergenceError, MemoryLimitError
 from ltcl.operators import IdentityPlus
 from ltcl.solvers import solve
 
@@ -45,7 +45,7 @@ class SolvedSystem(NamedTuple):
 
 
 def bounce_spread_of_system(T: Any, F: np.ndarray, S: IdentityPlus) -> np.ndarray:
-    """`bounce_spread` of T (N, N) with first bounce F and its S on the device; NaN if unsolved."""
+    """`bounce_spread` of T (N, N) with first bounce F and its S on the device; NaN if unknown."""
     system = S.as_it_stands()
 
     def inverse(light: np.ndarray) -> np.ndarray:
@@ -53,7 +53,7 @@ def bounce_spread_of_system(T: Any, F: np.ndarray, S: IdentityPlus) -> np.ndarra
 
     try:
         return bounce_spread(solved_system(T, F, system.matmat, inverse), F)
-    except ConvergenceError:
+    except (ConvergenceError, MemoryLimitError):
         return np.full(BOUNCES, np.nan)
 
 
