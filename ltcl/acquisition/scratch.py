@@ -40,14 +40,14 @@ class ImageFile:
         """Write a picture (H, W[, c]) to the end of the file."""
         with self._lock:
             offset = self._file.seek(0, os.SEEK_END)
-            self._file.write(memoryview(np.ascontiguousarray(image)).cast("B"))
+            self._file.write(np.ascontiguousarray(image).data.cast("B"))
         return StoredImage(file=self, offset=offset, shape=image.shape, dtype=image.dtype)
 
     def read_into(self, array: np.ndarray, offset: int) -> None:
         """Fill a contiguous array with the bytes from `offset` on."""
         with self._lock:
             self._file.seek(offset)
-            self._file.readinto(memoryview(array).cast("B"))
+            self._file.readinto(array.data.cast("B"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -184,7 +184,7 @@ def compensation_std(
         is_inside = (bounds[0] < light) & (light < bounds[1])
         is_free.append(is_inside & ~T.masked[:, None])
     picture_variances = _picture_variances(errors, columns)
-    appearance = shape.pack(np.sqrt(picture_variances), T.camera_grid)
+    appearance = shape.pack(list(np.sqrt(picture_variances)), T.camera_grid)
     if systems:
         free = is_free
         if len(systems) < T.channels:

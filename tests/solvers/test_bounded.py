@@ -255,7 +255,8 @@ def test_a_column_that_float32_has_lost_is_not_certified(device, seed):
 def test_a_step_is_six_launches(shaped: Device, form: Any, k: int) -> None:
     """In the shapes of CPUs and GPUs; dense transposes of many rows are one launch, too."""
     n = 300
-    G = scipy.sparse.diags_array([0.45, 0.45], offsets=[-1, 1], shape=(n, n)).tocsr()
+    G: Any = 0.45 * (scipy.sparse.eye_array(n, k=-1) + scipy.sparse.eye_array(n, k=1))
+    G = G.tocsr()
     S = IdentityPlus(form(shaped, G.toarray() if form is Dense else G))
     b = random.random((n, k))
     counts = []

@@ -198,9 +198,9 @@ class StripDecoder:
     ) -> np.ndarray:
         """Photographs less black, over their gains."""
         stack = np.empty((len(numbers), *black.shape), np.float32)
-        for image, number, gain in zip(stack, numbers, gains, strict=True):
-            np.subtract(self.pictures.read(number, rows), black, out=image)
-            image /= gain
+        for i, number in enumerate(numbers):
+            np.subtract(self.pictures.read(number, rows), black, out=stack[i])
+            stack[i] /= gains[i]
         return stack
 
     def _fine_light(

@@ -19,6 +19,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition.geometry.axis import UNKNOWN, Axis
 from ltcl.acquisition.geometry.graycode import GrayCode
+from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.geometry.subpixel import refine
 from ltcl.acquisition.radiometry.strips import in_strips
 from ltcl.errors import InputError
@@ -107,7 +108,7 @@ class Correspondence:
 
 
 def decode(
-    images: Sequence[Any],
+    images: Sequence[Any] | PhotographFile,
     grid: tuple[int, int],
     *,
     subpixel: bool = True,
@@ -192,7 +193,8 @@ def _compare(
         both = test(x.rows(window).value, near) & test(y.rows(window).value, near)
         passed[rows] = both[inside]
 
-    in_strips(len(passed), STRIP_PIXELS // passed.shape[1], compare_rows)
+    height, width = neighbours.shape
+    in_strips(height, STRIP_PIXELS // width, compare_rows)
     return passed
 
 

@@ -8,6 +8,7 @@ share in each projector pixel is counted with points spread evenly over it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -218,7 +219,7 @@ def _count_points(numbers: np.ndarray, pixels: int) -> scipy.sparse.csr_array:
 
 
 def _insert_whole(
-    parts: scipy.sparse.csr_array, is_split: np.ndarray, known: np.ndarray, numbers: np.ndarray
+    parts: Any, is_split: np.ndarray, known: np.ndarray, numbers: np.ndarray
 ) -> scipy.sparse.csr_array:
     """Rows of all camera pixels: `parts` of split ones, others whole in the projector's `numbers`.
 

@@ -92,7 +92,11 @@ class GrayCode:
         return patterns
 
     def decode(
-        self, images: Sequence[Any], *, levels: int | None = None, edges: bool = True
+        self,
+        images: Sequence[Any] | PhotographFile,
+        *,
+        levels: int | None = None,
+        edges: bool = True,
     ) -> tuple[Axis, Axis]:
         """Decode photographs into the projector coordinates x and y of every camera pixel.
 
@@ -122,8 +126,10 @@ class GrayCode:
                 f"photographs are {count}; they must be {self.count}, one for each pattern, "
                 f"or {without_inverses} without the inverses"
             )
-        pictures = images
-        if not isinstance(pictures, PhotographFile):
+        pictures: Photographs
+        if isinstance(images, PhotographFile):
+            pictures = images
+        else:
             pictures = PhotographList(images)
         min_difference = _min_difference(pictures, levels)
         decoder = StripDecoder(self.grid, self.bits, pictures, min_difference, edges)

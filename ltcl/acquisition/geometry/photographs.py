@@ -8,7 +8,7 @@ to a file when it is taken, and decodes some rows of all of them at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, final
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class PhotographList:
         return _as_grey(self.images[number][rows])
 
 
+@final
 class PhotographFile:
     """Grey photographs of linear values in [0, 1], appended one at a time to a temporary file.
 

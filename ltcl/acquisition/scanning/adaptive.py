@@ -442,7 +442,7 @@ def transport_arrays(
     noise = np.stack([_diagonal_of_product(V, cells) for V in core.variances()])
     remainders = []
     for C in matrices:
-        row = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr))
+        row = np.repeat(np.arange(len(C.indptr) - 1), np.diff(C.indptr))
         # A pixel's own cell has its number.
         values = C.data - (C.indices == row)
         remainders.append(scipy.sparse.csr_array((values, C.indices, C.indptr), shape=C.shape))

@@ -430,7 +430,8 @@ def balance(
     ([[0.56, 0.12]], [1.2, 0.8])
     """
     lengths = np.diff(matrix.indptr)
-    rows, N = matrix.shape
+    shape: Any = matrix.shape
+    rows, N = shape
     places = matrix.indices, matrix.indptr
     V: Any = scipy.sparse.csr_array((variance, *places), shape=matrix.shape)
     median = np.zeros(rows)

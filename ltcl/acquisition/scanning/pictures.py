@@ -28,7 +28,7 @@ from ltcl.acquisition.calibration import Calibration, Setup
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scratch import ImageFile, StoredImage
+from ltcl.acquisition.scratch import ImageFile
 from ltcl.acquisition.session import acquisition_error
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
@@ -166,8 +166,8 @@ class _ExposedPattern:
     images: Sequence[np.ndarray]
     seconds: Sequence[float]
     numbers: Sequence[int]
-    # The radiance, by `anchor.compact`.
-    light: StoredImage | None = None
+    # The radiance, by `anchor.compact`: a StoredImage once it is merged.
+    light: Any = None
 
 
 class ScanCamera(ScanGrid):

@@ -92,7 +92,8 @@ class DenoisingProblem:
             return without_reciprocity
 
         pairs = X
-        for _ in range(PAIR_PASSES):
+        passes = 0
+        while True:
             log_d = fit_log_factors(pairs, variance, light, grid)
             if np.ptp(log_d) > MAX_LOG_FACTOR:
                 return without_reciprocity
@@ -102,7 +103,8 @@ class DenoisingProblem:
             photon = _photon_light(noise, channel) * gauge
             pair_deviation = np.sqrt(Z_variance + Z_variance.T) + photon + photon.T
             is_unlike = np.abs(Z - Z.T) > OUTSTANDING * pair_deviation
-            if not is_unlike.any():
+            passes += 1
+            if passes == PAIR_PASSES or not is_unlike.any():
                 break
             # Such pairs say nothing of d.
             pairs = np.where(is_unlike, (Z + Z.T) / 2 / gauge, X)

@@ -113,7 +113,7 @@ class Blocks:
         """True if so many are known, a third as many of which hold no blurred first bounce."""
         known = np.count_nonzero(self.is_known)
         far = np.count_nonzero(self.is_known & ~self.is_near)
-        return known >= least and 3 * far >= least
+        return bool(known >= least and 3 * far >= least)
 
 
 class BlockReader:
@@ -130,7 +130,7 @@ class BlockReader:
         self.distance = distances(camera, projector)
         self.variance = detail_variance(self.X, camera, projector)
         self.has_unexplained_zeros = has_unexplained_zeros(self.zeros, self.light, self.variance)
-        entries = self.X.shape[1] * self.X.shape[3]
+        entries = camera.pixels.shape[1] * projector.pixels.shape[1]
         self.has_unexplained_zeros |= (1.0 - self.zeros) * entries < min(MIN_ENTRIES, entries)
 
     def kinds(self) -> Iterator[Blocks]:

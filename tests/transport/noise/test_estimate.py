@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,8 +94,9 @@ def test_few_paths_an_entry_are_photon_noise(scene: str, paths: float) -> None:
     assert np.mean(np.abs(np.log(ratio)) < np.log(CLOSE)) > 0.9
 
 
+WINDOW: Any = (2, 2, 1)
 SHARED = {
-    "mean of 2 x 2 pixels": lambda e: 2.0 * scipy.ndimage.uniform_filter(e, (2, 2, 1)),
+    "mean of 2 x 2 pixels": lambda e: 2.0 * scipy.ndimage.uniform_filter(e, WINDOW),
     "blurred": lambda e: scipy.ndimage.gaussian_filter(e, (0.7, 0.7, 0.0)) * 2.49,
 }
 
