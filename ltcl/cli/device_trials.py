@@ -130,7 +130,7 @@ def _both_products(A: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _visibility(device: Device) -> np.ndarray:
-    """What two opposite walls see of each other past a screen."""
+    """Light that two opposite walls exchange past a screen."""
     walls = scenes.box(1, sides=6).walls
     screen = [[(0.4, -1, -1), (0.6, 2, 2)]]
     return visibility(scenes.cut((walls[1], walls[5]), 1), screen, device)

@@ -234,7 +234,7 @@ def _try_kernels(device: Device) -> Iterator[Check]:
 
 @dataclass(frozen=True, kw_only=True)
 class Child:
-    """What a child process printed, and how it ended; that is empty if it did its work."""
+    """Output of a child process, and how it ended; that is empty if it did its work."""
 
     output: str
     last_words: str
@@ -271,7 +271,7 @@ def _run_child(arguments: list[str], **variables: str) -> Child:
 
 
 def _name_ending(code: int) -> str:
-    """How a process ended that has this exit code; empty if it did its work."""
+    """The end of a process by its exit code, in words; empty if it did its work."""
     if code == 0:
         return ""
     if code == 1:

@@ -274,7 +274,7 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
 
     @property
     def has_cheap_float64_product(self) -> bool:
-        """Whether a float64 product on the host takes no longer than a few waits."""
+        """True if a float64 product on the host takes no longer than a few waits."""
         return self.nbytes + self.bytes_read() <= CHEAP_PRODUCT_BYTES
 
     def product_float64(self) -> Product | None:

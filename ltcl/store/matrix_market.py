@@ -136,13 +136,13 @@ def _check_lines(header: Header, data: bytes) -> bytes:
 
 
 def _end_of(pattern: re.Pattern[bytes], data: bytes, start: int) -> int:
-    """Where what a pattern matches from `start` on ends, or `start`."""
+    """End of the match of a pattern at `start`; `start` if there is none."""
     match = pattern.match(data, start)
     return start if match is None else match.end()
 
 
 def _end_of_lines(line: bytes, data: bytes, start: int) -> int:
-    """Where the lines that are as declared end."""
+    """End of the lines that are as declared."""
     lines = re.compile(rb"(?:%b){1,%d}" % (line, LINES_AT_ONCE))
     while True:
         end = _end_of(lines, data, start)

@@ -95,7 +95,7 @@ def _worst_pixels(T: Transport, picture: np.ndarray, direct: np.ndarray) -> str:
 
 
 def bounce_limits(T: Transport) -> str:
-    """What T leaves unknown of its bounces, and what their standard deviations are."""
+    """Limits of bounces by T, and the meaning of their standard deviations, in words."""
     text = (
         "bounces hold as far as light between matt surfaces that the projector lights explains T, "
         "which does not show unlit surfaces, gloss, or light that returns to its own pixel"

@@ -157,7 +157,7 @@ class Sharpness:
         logger.warning("%s", text)
 
     def _advice(self) -> str:
-        """What may help, by the width of camera pixels: finer ones do not sharpen a blur."""
+        """Advice by the width of camera pixels: finer ones do not sharpen a blur."""
         advice = ""
         if self.width > FINE_WIDTH:
             advice += "move the camera closer or use a longer lens, "

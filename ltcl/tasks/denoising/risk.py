@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Whether pictures of a denoised T are nearer to the truth than those of the measured one.
+"""Decision whether pictures of a denoised T are nearer to the truth than those of the measured one.
 
 With measured entries Y, denoised D, and independent errors of Y of known variance, Stein's unbiased
 estimate of the squared error of a picture D p, over that of Y p, is

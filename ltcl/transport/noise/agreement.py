@@ -83,7 +83,7 @@ def find_agreement(
 
 
 class _Scan:
-    """How many blocks agree for each q of `ratios`."""
+    """Numbers of blocks that agree for each q of `ratios`."""
 
     def __init__(self, blocks: Blocks, has_factors: bool) -> None:
         self.blocks = blocks
