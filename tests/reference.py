@@ -513,3 +513,20 @@ def pyramid_gather(x: np.ndarray) -> np.ndarray:
 def pyramid_spread(grid: tuple[int, int]) -> np.ndarray:
     """W^T (N, cells): pictures of cells, the transpose of pyramid_gather."""
     return pyramid_gather(np.eye(grid[0] * grid[1]).reshape(*grid, -1)).T
+
+
+def hats_gather(grid: tuple[int, int]) -> np.ndarray:
+    """W (nodes, N): the bilinear hats of all levels, from their formula."""
+    h, w = grid
+    rows, columns = np.indices(grid, float)
+    hats = []
+    height, width, scale = h, w, 1
+    while True:
+        for i in range(height):
+            for j in range(width):
+                vertical = np.maximum(1.0 - np.abs(rows / scale - i), 0.0)
+                horizontal = np.maximum(1.0 - np.abs(columns / scale - j), 0.0)
+                hats.append((vertical * horizontal).ravel())
+        if max(height, width) <= 2:
+            return np.array(hats)
+        height, width, scale = height // 2 + 1, width // 2 + 1, 2 * scale

@@ -27,6 +27,7 @@ from ltcl.operators import (
     CSR,
     Compressed,
     Dense,
+    Hats,
     IdentityPlus,
     Operator,
     Pyramid,
@@ -35,6 +36,7 @@ from ltcl.operators import (
     Tiles,
     Wavelet,
 )
+from ltcl.operators.pyramid import hat_levels
 from ltcl.scenes.visibility import visibility
 from ltcl.solvers.bounded import minimise
 from ltcl.solvers.solve import METHODS, SAMPLED, solve
@@ -101,6 +103,7 @@ def _operators(device: Device, scene: Any, S: np.ndarray) -> dict[str, tuple[Ope
         "sparse": (CSR(device, R), R.toarray()),
         "dense": (Dense(device, S), S),
         "pyramid": (Pyramid(device, scene.grid), _cells(*scene.grid)),
+        "hats": (Hats(device, scene.grid), _hats(scene.grid)),
         "scaled columns": (ScaledColumns(CSR(device, R), scale, 1.0), R * scale - np.eye(len(S))),
         "subset": (SubsetBasis(device, scene.grid, order), np.eye(len(S))[order]),
     }
@@ -122,6 +125,19 @@ def _cells(height: int, width: int) -> np.ndarray:
         columns = np.kron(np.eye(max(width // size, 1)), np.ones(min(size, width)))
         levels.append(np.kron(rows, columns))
         size *= 2
+    return np.vstack(levels)
+
+
+def _hats(grid: tuple[int, int]) -> np.ndarray:
+    """The matrix of `Hats`."""
+    levels = []
+    for level, (height, width) in enumerate(hat_levels(grid)):
+        scale = 2.0**level
+        sides = []
+        for pixels, nodes in zip(grid, (height, width), strict=True):
+            distances = np.abs(np.arange(pixels) / scale - np.arange(nodes)[:, None])
+            sides.append(np.maximum(1.0 - distances, 0.0))
+        levels.append(np.kron(*sides))
     return np.vstack(levels)
 
 

@@ -23,7 +23,7 @@ from ltcl.operators.knowledge import Norms
 from ltcl.operators.multi_device import MultiDevice
 from ltcl.operators.out_of_core import Streamed
 from ltcl.operators.parts import Parts
-from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.pyramid import Hats, Pyramid
 from ltcl.operators.scaled_columns import ScaledColumns
 from ltcl.operators.scipy_operator import Host
 from ltcl.operators.tiles import Tiles, smallest
@@ -37,6 +37,7 @@ __all__ = [
     "Dense",
     "Distributed",
     "Epilogue",
+    "Hats",
     "Host",
     "IdentityPlus",
     "MultiDevice",

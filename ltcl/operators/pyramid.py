@@ -1,18 +1,98 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A quad-tree of sums over the cells of all levels (`kernels/pyramid.cl`)."""
+"""Sums of pixels at all scales: over cells of a quad-tree, or under hat functions.
+
+Kernels: `kernels/pyramid.cl`, `kernels/hats.cl`, which take the same arguments.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
 
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.operators.bases import Basis, launch_grid, launch_group
 
-# Cells of a level up to which one launch does all the levels from it on.
 PYRAMID = "pyramid"
+HATS = "hats"
+# Sums of a level up to which one launch does all the levels from it on.
 SMALL_LEVEL_PIXELS = 4096
 
 
-class Pyramid(Basis):
+class MultiscaleSums(Basis):
+    """Sums of pixels at all scales, (M, N), the finest first; level 0 is the pixels.
+
+    Subclasses set `file`, whose kernels make them.
+
+    Attributes
+    ----------
+    levels : tuple of (rows, columns)
+        Sums of each level, row-major, one level behind the other.
+    """
+
+    file: ClassVar[str]
+    orthonormal = False
+    isometric = False
+
+    def __init__(
+        self, device: Device, grid: tuple[int, int], levels: Sequence[tuple[int, int]]
+    ) -> None:
+        self.levels = tuple(levels)
+        self._sizes = [rows * columns for rows, columns in levels]
+        super().__init__(device, grid, self.file, sum(self._sizes))
+
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
+        if transpose:
+            self._spread(x, out, a, b, y)
+        else:
+            self._gather(x, out, a, b, y)
+
+    def _spread(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
+        """Queue the transpose: at each pixel, the functions of all levels added up."""
+        kernel, pieces = self._kernel(self.file, "spread", x.columns)
+        height, width = self.grid
+        launch_grid(
+            kernel,
+            pieces,
+            self.grid,
+            height=height,
+            width=width,
+            levels=len(self.levels),
+            k=x.columns,
+            a=a,
+            b=b,
+            x=x,
+            y=y,
+            out=out,
+        )
+
+    def _gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
+        """Queue the sums: large levels one by one, then the others in one launch."""
+        kernel, pieces = self._kernel(self.file, "gather", x.columns)
+        height, width = self.grid
+        count = len(self.levels)
+        arguments = {
+            "height": height,
+            "width": width,
+            "k": x.columns,
+            "a": a,
+            "b": b,
+            "x": x,
+            # Wide loads reach a spare sum behind each level.
+            "sums": self.device.empty((self.shape[0] + count) * x.columns),
+            "y": y,
+            "out": out,
+        }
+        large = sum(size > SMALL_LEVEL_PIXELS for size in self._sizes)
+        for level in range(large):
+            size = self.levels[level]
+            launch_grid(kernel, pieces, size, first_level=level, end_level=level + 1, **arguments)
+        launch_group(kernel, pieces, first_level=large, end_level=count, **arguments)
+
+
+class Pyramid(MultiscaleSums):
     """A quad-tree: sums over the cells of all levels, (M, N), the finest first.
 
     Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the
@@ -26,8 +106,8 @@ class Pyramid(Basis):
 
     Attributes
     ----------
-    cells : tuple of (rows, columns)
-        Of each level, whose cells are row-major one behind the other.
+    levels : tuple of (rows, columns)
+        Cells of each level, row-major, one level behind the other.
 
     Examples
     --------
@@ -40,66 +120,64 @@ class Pyramid(Basis):
     [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0, 7.0, 15.0]
     """
 
-    orthonormal = False
-    isometric = False
+    file = PYRAMID
 
     def __init__(self, device: Device, grid: tuple[int, int]) -> None:
         h, w = checks.grid("grid", grid)
-        levels = (max(h, w) - 1).bit_length() + 1
         cells = []
-        for level in range(levels):
+        for level in range((max(h, w) - 1).bit_length() + 1):
             size = 2**level
             cells.append((-(-h // size), -(-w // size)))
-        self.cells = tuple(cells)
-        self._sizes = [rows * columns for rows, columns in cells]
-        super().__init__(device, grid, PYRAMID, sum(self._sizes))
+        super().__init__(device, (h, w), cells)
 
-    def _transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
-        if transpose:
-            self._spread(x, out, a, b, y)
-        else:
-            self._gather(x, out, a, b, y)
 
-    def _spread(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
-        """Queue the transpose: of each pixel, the sum of the cells that it lies in."""
-        kernel, pieces = self._kernel("pyramid", "spread", x.columns)
-        height, width = self.grid
-        launch_grid(
-            kernel,
-            pieces,
-            self.grid,
-            height=height,
-            width=width,
-            levels=len(self.cells),
-            k=x.columns,
-            a=a,
-            b=b,
-            x=x,
-            y=y,
-            out=out,
-        )
+class Hats(MultiscaleSums):
+    """Sums under the hat functions of all levels, (M, N), the finest first.
 
-    def _gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
-        """Queue the sums of all cells: large levels one by one, then the others in one launch."""
-        kernel, pieces = self._kernel("pyramid", "gather", x.columns)
-        height, width = self.grid
-        levels = len(self.cells)
-        arguments = {
-            "height": height,
-            "width": width,
-            "k": x.columns,
-            "a": a,
-            "b": b,
-            "x": x,
-            # Wide loads reach a spare cell behind each level.
-            "sums": self.device.empty((self.shape[0] + levels) * x.columns),
-            "y": y,
-            "out": out,
-        }
-        large = sum(size > SMALL_LEVEL_PIXELS for size in self._sizes)
-        for level in range(large):
-            cells = self.cells[level]
-            launch_grid(kernel, pieces, cells, first_level=level, end_level=level + 1, **arguments)
-        launch_group(kernel, pieces, first_level=large, end_level=levels, **arguments)
+    Node (i, j) of level l stands at pixel (i s, j s), s = 2^l, and its hat is bilinear:
+    max(0, 1 - |row / s - i|) max(0, 1 - |column / s - j|). Level 0 is the pixels; on the last, no
+    side has more than two nodes. Sums of hats of one level are all pictures that are bilinear
+    between its nodes: the basis of transports that are estimated from pictures (`ltcl.fit`). Not
+    orthonormal.
+
+    Parameters
+    ----------
+    device : Device
+    grid : (h, w)
+
+    Attributes
+    ----------
+    levels : tuple of (rows, columns)
+        Nodes of each level, row-major, one level behind the other.
+
+    Examples
+    --------
+    Pixels, then hats of width 2 at pixel 0, with half of pixel 1, and at pixel 2:
+
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Hats
+    >>> W = Hats(ltcl.open_device(), (1, 3))
+    >>> (W @ numpy.array([1.0, 4.0, 10.0])).tolist()
+    [1.0, 4.0, 10.0, 3.0, 12.0]
+    """
+
+    file = HATS
+
+    def __init__(self, device: Device, grid: tuple[int, int]) -> None:
+        h, w = checks.grid("grid", grid)
+        super().__init__(device, (h, w), hat_levels((h, w)))
+
+
+def hat_levels(grid: tuple[int, int]) -> list[tuple[int, int]]:
+    """Nodes (rows, columns) of the hats of each level over a grid.
+
+    >>> hat_levels((4, 9))
+    [(4, 9), (3, 5), (2, 3), (2, 2)]
+    """
+    h, w = grid
+    levels = [(h, w)]
+    while max(h, w) > 2:
+        h = h // 2 + 1
+        w = w // 2 + 1
+        levels.append((h, w))
+    return levels

@@ -18,7 +18,7 @@ from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.errors import InputError
 from ltcl.operators.bases import PIXELS, Basis, launch_grid, launch_group
-from ltcl.operators.pyramid import PYRAMID, Pyramid
+from ltcl.operators.pyramid import HATS, PYRAMID, Hats, Pyramid
 
 # Wavelets that are compared where no basis is named, the best one first.
 COMPARED_WAVELETS = ("db2", "haar", "db4")
@@ -171,8 +171,8 @@ def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
     device : Device
     grid : (h, w)
     name : str
-        "pixels" (None: no basis is needed), "pyramid", or an orthonormal wavelet of PyWavelets:
-        "haar", "db2", "db4", ...; InputError for others.
+        "pixels" (None: no basis is needed), "pyramid", "hats", or an orthonormal wavelet of
+        PyWavelets: "haar", "db2", "db4", ...; InputError for others.
 
     Examples
     --------
@@ -185,4 +185,6 @@ def basis(device: Device, grid: tuple[int, int], name: str) -> Basis | None:
         return None
     if name == PYRAMID:
         return Pyramid(device, grid)
+    if name == HATS:
+        return Hats(device, grid)
     return Wavelet(device, grid, name)

@@ -25,6 +25,7 @@ from ltcl.operators import (
     Coupled,
     Dense,
     Epilogue,
+    Hats,
     Host,
     IdentityPlus,
     Operator,
@@ -102,6 +103,7 @@ def bases_and_compressed(device: Device) -> dict[str, Pair]:
         "wavelet": (wavelet, W),
         "order": (permutation, P),
         "pyramid": (pyramid, Q),
+        "hats": (Hats(device, GRID), reference.hats_gather(GRID)),
         "wavelet and order": (SubsetBasis(device, GRID, order, of=wavelet), W[order]),
         "both sides": (Compressed(middle, wavelet, wavelet), W.T @ C @ W),
         "rows": (Compressed(middle, None, wavelet), C @ W),
@@ -128,8 +130,9 @@ def coupled_operators(device: Device) -> dict[str, Pair]:
 
 NAMES = (
     "dense, csr, transposed dense, transposed csr, host, scaled columns, I + R, I - A, shifted, "
-    "shifted where lit, I + transposed, I + (A - I), wavelet, order, pyramid, wavelet and order, "
-    "both sides, rows, columns, two bases, more than pixels, fewer than pixels, coupled, mixed"
+    "shifted where lit, I + transposed, I + (A - I), wavelet, order, pyramid, hats, "
+    "wavelet and order, both sides, rows, columns, two bases, more than pixels, fewer than pixels, "
+    "coupled, mixed"
 )
 
 

@@ -15,6 +15,7 @@ import scipy.sparse
 from ltcl.operators import (
     CSR,
     Compressed,
+    Hats,
     Pyramid,
     SubsetBasis,
     Wavelet,
@@ -38,7 +39,7 @@ def some(n: int, share: int = 3) -> np.ndarray:
 @pytest.mark.parametrize(
     "small", [0, 12, 4096], ids=["a launch each", "small ones together", "all in one"]
 )
-@pytest.mark.parametrize("name", ["haar", "db4", "pyramid"])
+@pytest.mark.parametrize("name", ["haar", "db4", "pyramid", "hats"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
     monkeypatch.setattr(pyramid, "SMALL_LEVEL_PIXELS", small)
@@ -49,6 +50,10 @@ def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
         W = Pyramid(shaped, grid)
         matrix = reference.pyramid_gather(np.eye(W.shape[1]).reshape(*grid, -1))
         transposed = reference.pyramid_spread(grid)
+    elif name == "hats":
+        W = Hats(shaped, grid)
+        matrix = reference.hats_gather(grid)
+        transposed = matrix.T
     else:
         W = Wavelet(shaped, grid, name)
         filters = wavelets.filters(name)
@@ -103,7 +108,7 @@ def test_wavelets_are_orthonormal_and_keep_constants_compact(device, grid, name)
     np.testing.assert_allclose(product, constant, rtol=0, atol=error * constant[0])
 
 
-@pytest.mark.parametrize("kind", [Wavelet, Pyramid])
+@pytest.mark.parametrize("kind", [Wavelet, Pyramid, Hats])
 def test_a_picture_takes_four_launches(device, kind):
     W = kind(device, (256, 512))
     for A in (W, W.T):

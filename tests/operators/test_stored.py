@@ -16,6 +16,7 @@ from ltcl.operators import (
     Basis,
     Compressed,
     Dense,
+    Hats,
     IdentityPlus,
     Pyramid,
     ScaledColumns,
@@ -30,7 +31,18 @@ GRID = (5, 7)
 N = 35
 NNZ = gallery.sparse(N, N).nnz
 
-SYSTEMS = ("core", "rows", "two-sided", "chained", "subset", "nested", "pixels", "pyramid", "two")
+SYSTEMS = (
+    "core",
+    "rows",
+    "two-sided",
+    "chained",
+    "subset",
+    "nested",
+    "pixels",
+    "pyramid",
+    "hats",
+    "two",
+)
 
 
 def core_between(device: Device, form: str, out: Any, into: Any, **options: Any) -> Compressed:
@@ -68,8 +80,8 @@ def make_system(device: Device, name: str, form: str = "csr") -> IdentityPlus:
     if name == "pixels":
         some = SubsetBasis(device, GRID, order[:11])
         return IdentityPlus(between(some, some, error=0.1))
-    if name == "pyramid":
-        P = Pyramid(device, GRID)
+    if name in ("pyramid", "hats"):
+        P = Pyramid(device, GRID) if name == "pyramid" else Hats(device, GRID)
         return IdentityPlus(between(P, P, error=0.1, diagonal=np.arange(N)))
     return IdentityPlus(between(W, C), solution_error=np.inf)
 
