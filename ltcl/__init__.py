@@ -42,7 +42,7 @@ from ltcl.transport.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
-    from ltcl.acquisition import acquire, align
+    from ltcl.acquisition import acquire, align, fit
     from ltcl.viewer import view
 
 __version__ = "0.1.0"
@@ -65,6 +65,7 @@ __all__ = [
     "compress",
     "denoise",
     "errors",
+    "fit",
     "images",
     "invert",
     "list_devices",
@@ -94,7 +95,12 @@ _PUBLIC_PATHS = {
 sys.modules.update(_PUBLIC_PATHS)
 
 _LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
-_FUNCTIONS = {"acquire": "acquisition", "align": "acquisition", "view": "viewer"}
+_FUNCTIONS = {
+    "acquire": "acquisition",
+    "align": "acquisition",
+    "fit": "acquisition",
+    "view": "viewer",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -6,6 +6,7 @@
     calibrate     facts that are measured once (`metering`, `session`, radiometry/, geometry/), and
                   their checks (`consistency`); its record, `calibration`
     scanning/     patterns in order, and T from the pictures; a plan before, a report after
+    estimation/   T from any pairs of pictures and photographs
     agreement     photographs that deviate from the others are refused by number; `anchor`: did
                   anything move?
     project       an acquisition as a folder with an acquisition.toml
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 from ltcl.acquisition.alignment import Alignment, align
 from ltcl.acquisition.calibration import Calibration, Setup
+from ltcl.acquisition.estimation.fit import Fit, fit
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.project import Project
 from ltcl.acquisition.rig import Rig, Shots
@@ -39,6 +41,7 @@ __all__ = [
     "Calibration",
     "Correspondence",
     "Display",
+    "Fit",
     "FolderRig",
     "GPhoto2Camera",
     "LiveRig",
@@ -55,4 +58,5 @@ __all__ = [
     "align",
     "camera_map",
     "finalize",
+    "fit",
 ]

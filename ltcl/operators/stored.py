@@ -32,7 +32,6 @@ from ltcl.operators.compressed import Compressed
 from ltcl.operators.csr import CSR, Pattern, plain_arrays
 from ltcl.operators.dense import Dense
 from ltcl.operators.identity_plus import IdentityPlus
-from ltcl.operators.pyramid import PYRAMID
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet, basis
 
@@ -61,14 +60,19 @@ def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
     return arrays
 
 
-def pyramid_arrays(
-    grid: tuple[int, int], cores: Sequence[scipy.sparse.csr_array], diagonals: np.ndarray
+def multiscale_arrays(
+    sums: str,
+    grid: tuple[int, int],
+    cores: Sequence[scipy.sparse.csr_array],
+    diagonals: np.ndarray,
 ) -> Arrays:
-    """The arrays of S = I + R, R = C W in the pyramid W of `grid`, made without a device.
+    """The arrays of S = I + R, R = C W, made without a device.
 
-    `cores` are C, (N, coefficients), and `diagonals`, (channels, N), are those of R.
+    `sums` names W, the sums at all scales of a `grid`: "pyramid" or "hats".
+
+    `cores` are C, (N, sums), and `diagonals`, (channels, N), are those of R.
     """
-    arrays = {"basis_0.name": np.array(PYRAMID), "basis_0.grid": np.array(grid)}
+    arrays = {"basis_0.name": np.array(sums), "basis_0.grid": np.array(grid)}
     for number, (C, diagonal) in enumerate(zip(cores, diagonals, strict=True)):
         R = {
             "kind": np.array("compressed"),

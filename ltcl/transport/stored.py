@@ -22,6 +22,7 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import ScaledColumns
 from ltcl.operators import stored as stored_operators
 from ltcl.operators.interreflection import underlying_system
+from ltcl.operators.pyramid import PYRAMID
 
 if TYPE_CHECKING:
     from ltcl.transport.transport import Transport
@@ -57,17 +58,19 @@ def arrays_of_scan(
     diagonals: np.ndarray,
     first_bounce: np.ndarray,
     mixing: np.ndarray | None = None,
+    sums: str = PYRAMID,
 ) -> dict[str, np.ndarray]:
-    """The arrays of T = I + C W of each channel, C (N, cells) between pixels and the pyramid W.
+    """The arrays of T = I + C W of each channel, C (N, sums) between pixels and the sums W.
 
-    `diagonals` are those of C W, (channels, N); `first_bounce` is like them.
+    `diagonals` are those of C W, (channels, N); `first_bounce` is like them. `sums` is
+    the name of W: "pyramid" or "hats".
     """
     arrays = {"grid": np.array(grid), "first_bounce": first_bounce}
     if mixing is not None:
         arrays["mixing"] = np.asarray(mixing)
     for channel in range(len(cores)):
         arrays[f"columns_{channel}"] = np.ones(diagonals.shape[1])
-    return arrays | stored_operators.pyramid_arrays(grid, cores, diagonals)
+    return arrays | stored_operators.multiscale_arrays(sums, grid, cores, diagonals)
 
 
 def matrices_from_arrays(

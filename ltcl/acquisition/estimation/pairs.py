@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pairs of a pattern and its photograph, and what can be wrong with them.
+
+order        the photographs of a film begin a few frames late, or two of them are swapped
+saturation   pixels at the largest value say only that there was more light
+drift        the lamp, or the exposure, changes from pair to pair
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.acquisition.geometry import Resampling
+from ltcl.errors import AcquisitionError, InputError
+
+# Pairs from which a transport can be judged.
+LEAST_PAIRS = 10
+# Shifts between patterns and photographs that are tried, and by how much the correlation of another
+# shift must be larger.
+MAX_SHIFT = 5
+CLEAR_CORRELATION = 0.1
+# Pixels at which pairs are compared.
+COMPARED_PIXELS = 2000
+# Share of all values that may be the largest: of a saturated camera, it is larger.
+MAX_SATURATED_SHARE = 1e-3
+# A photograph is of another pattern if that explains it with so much less error.
+SWAPPED_ERROR_RATIO = 0.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pairs:
+    """Patterns and photographs in linear light, (frames, N or M, channels).
+
+    `grid` is that of the patterns, `camera_grid` that of the photographs.
+    """
+
+    grid: tuple[int, int]
+    camera_grid: tuple[int, int]
+    patterns: np.ndarray
+    photographs: np.ndarray
+
+    @classmethod
+    def of(cls, patterns: Any, photographs: Any) -> Self:
+        """Check arrays (frames, h, w) or (frames, h, w, 3); a grey pattern lights all channels."""
+        shown = _frames("patterns", patterns)
+        seen = _frames("photographs", photographs)
+        if len(seen) != len(shown):
+            raise InputError(
+                f"photographs has {len(seen)} frames, patterns {len(shown)}; each pattern must "
+                "have one photograph"
+            )
+        if shown.shape[3] == 3 and seen.shape[3] == 1:
+            raise InputError(
+                "patterns has colours, photographs has none; give grey patterns, or photographs "
+                "(frames, h, w, 3)"
+            )
+        if shown.shape[3] < seen.shape[3]:
+            shown = np.repeat(shown, 3, axis=3)
+        frames, height, width, channels = seen.shape
+        grid = (shown.shape[1], shown.shape[2])
+        pairs = cls(
+            grid=grid,
+            camera_grid=(height, width),
+            patterns=shown.reshape(frames, -1, channels),
+            photographs=seen.reshape(frames, -1, channels),
+        )
+        pairs._check_values()
+        return pairs
+
+    def __len__(self) -> int:
+        return len(self.patterns)
+
+    @property
+    def channels(self) -> int:
+        """1 or 3."""
+        return self.photographs.shape[2]
+
+    def select(self, chosen: np.ndarray) -> Self:
+        """Some of the pairs."""
+        return replace(self, patterns=self.patterns[chosen], photographs=self.photographs[chosen])
+
+    def resampled(self, resampling: Resampling) -> Self:
+        """The pairs with photographs on the pixels of the projector."""
+        photographs = np.empty_like(self.patterns)
+        for number, picture in enumerate(self.photographs):
+            image = picture.reshape(*self.camera_grid, -1)
+            photographs[number] = resampling.apply(image).reshape(-1, self.channels)
+        return replace(self, camera_grid=self.grid, photographs=photographs)
+
+    def joined(self, others: Self) -> Self:
+        """These pairs and others of the same sizes."""
+        is_alike = others.grid == self.grid and others.camera_grid == self.camera_grid
+        if not is_alike or others.channels != self.channels:
+            raise InputError(
+                f"photographs is of {others.camera_grid} pixels and {others.channels} channel(s), "
+                f"patterns of {others.grid}; those before are of {self.camera_grid}, "
+                f"{self.channels} and {self.grid}"
+            )
+        return replace(
+            self,
+            patterns=np.concatenate([self.patterns, others.patterns]),
+            photographs=np.concatenate([self.photographs, others.photographs]),
+        )
+
+    def _check_values(self) -> None:
+        if not np.any(self.photographs):
+            raise InputError("photographs is black; it must show light")
+        if np.all(self.patterns == self.patterns[:1]):
+            raise InputError("patterns are all the same; they must differ")
+        largest = self.photographs.max()
+        share = np.mean(self.photographs == largest)
+        if share > MAX_SATURATED_SHARE:
+            raise InputError(
+                f"photographs has {share:.1%} of its values at {largest:g}, the largest; the "
+                "camera is saturated: expose less"
+            )
+
+    def check_order(self) -> None:
+        """Refuse photographs that follow other patterns than their own, a few frames later."""
+        pixels = self._compared_pixels()
+        shown = standardised(self.patterns[:, pixels].mean(axis=2))
+        seen = standardised(self.photographs[:, pixels].mean(axis=2))
+        most = min(MAX_SHIFT, len(self) // 4)
+        correlations = {}
+        for shift in range(-most, most + 1):
+            late = seen[max(shift, 0) : len(seen) + min(shift, 0)]
+            early = shown[max(-shift, 0) : len(shown) + min(-shift, 0)]
+            correlations[shift] = float(np.mean(late * early))
+        best = max(correlations, key=correlations.__getitem__)
+        if best and correlations[best] > correlations[0] + CLEAR_CORRELATION:
+            when = "late" if best > 0 else "early"
+            raise AcquisitionError(
+                f"photographs come {abs(best)} frame(s) {when}: photograph {max(best, 0) + 1} "
+                f"shows pattern {max(-best, 0) + 1}; leave out the frames that have no partner"
+            )
+
+    def check_partners(self, explained: np.ndarray) -> None:
+        """Refuse a photograph that another pattern explains far better than its own.
+
+        `explained` is T p of all patterns, like `photographs`.
+        """
+        pixels = self._compared_pixels()
+        expected = explained[:, pixels].reshape(len(self), -1)
+        seen = self.photographs[:, pixels].reshape(len(self), -1)
+        # |seen - expected|^2 of all photographs and patterns.
+        error = (
+            (seen**2).sum(axis=1)[:, None]
+            - 2.0 * seen @ expected.T
+            + (expected**2).sum(axis=1)[None, :]
+        )
+        own = np.diagonal(error)
+        partner = error.argmin(axis=1)
+        least = error.min(axis=1)
+        swapped = np.flatnonzero(
+            (partner != np.arange(len(self))) & (least < SWAPPED_ERROR_RATIO**2 * own)
+        )
+        if len(swapped):
+            first = int(swapped[0])
+            raise AcquisitionError(
+                f"photograph {first + 1} shows pattern {int(partner[first]) + 1}, and so on at "
+                f"{len(swapped)} of {len(self)}; each must show its own"
+            )
+
+    def _compared_pixels(self) -> np.ndarray:
+        pixels = self.patterns.shape[1]
+        return np.linspace(0, pixels - 1, min(pixels, COMPARED_PIXELS)).astype(int)
+
+
+def gains(photographs: np.ndarray, explained: np.ndarray) -> np.ndarray:
+    """Brightness of each photograph relative to what T explains, (frames,), 1 on average."""
+    ratio = (photographs * explained).sum(axis=(1, 2)) / (explained**2).sum(axis=(1, 2))
+    return ratio / ratio.mean()
+
+
+def _frames(name: str, value: Any) -> np.ndarray:
+    """An array (frames, h, w, 1 or 3) of finite light."""
+    array = checks.real(name, value)
+    is_colour = array.ndim == 4 and array.shape[3] == 3
+    if array.ndim != 3 and not is_colour:
+        raise InputError(
+            f"{name} has shape {array.shape}; it must be (frames, h, w) or (frames, h, w, 3)"
+        )
+    if len(array) < LEAST_PAIRS:
+        raise InputError(f"{name} has {len(array)} frames; it must have at least {LEAST_PAIRS}")
+    checks.finite(name, array)
+    light = array.astype(np.float64)
+    return light if is_colour else light[..., None]
+
+
+def standardised(values: np.ndarray) -> np.ndarray:
+    """Values (frames, pixels) less their mean over frames, in units of its deviation."""
+    centred = values - values.mean(axis=0)
+    deviation = centred.std(axis=0)
+    return centred / np.where(deviation > 0, deviation, 1.0)
