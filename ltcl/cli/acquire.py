@@ -15,6 +15,7 @@ import typer
 from ltcl import checks, store
 from ltcl.cli import options
 from ltcl.cli.command import WAITING, Answer, Context, command
+from ltcl.cli.fit import fit
 from ltcl.cli.options import file_option, option
 from ltcl.cli.reports.acquisition import (
     NextPhotograph,
@@ -227,6 +228,9 @@ def _advice(project: Any, error: BaseException) -> str:
         return again
     count = calibration_photographs(project.store)
     return f"{count} photographs of the calibration are kept; {again}"
+
+
+app.command("fit")(fit)
 
 
 @app.command("report")

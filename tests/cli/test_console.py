@@ -50,6 +50,7 @@ COMMANDS = [
     "show",
     "acquire plan",
     "acquire run",
+    "acquire fit",
     "acquire report",
 ]
 CODES = [

@@ -12,6 +12,7 @@ Some pairs are held out, the error of T is that of their photographs; then they 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -269,6 +270,7 @@ class _Estimator:
 
     def learn(self, pairs: Pairs) -> None:
         """Learn the priors, and the mixing of the colours if it is asked for; solve the rows."""
+        self.finds_mixing = self.finds_mixing and _shows_colours(pairs)
         if self.finds_mixing:
             self.mixing = _first_mixing(pairs)
         self.priors = []
@@ -317,8 +319,9 @@ class _Estimator:
         own = np.arange(len(self.windows.nodes))
         for channel in range(self.channels):
             C = self._core(channel)
-            diagonals.append(C.multiply(self.W.T).sum(axis=1) - 1.0)
-            identity = scipy.sparse.eye_array(*C.shape, format="csr")
+            products: Any = C.multiply(self.W.T)
+            diagonals.append(products.sum(axis=1) - 1.0)
+            identity = scipy.sparse.eye_array(len(own), self.windows.absent, format="csr")
             cores.append(scipy.sparse.csr_array(C - identity))
             is_own = self.windows.nodes == own[:, None]
             rows = self.rows[channel]
@@ -378,7 +381,7 @@ def _light(patterns: np.ndarray, photographs: np.ndarray) -> np.ndarray:
 
 def _held_out(count: int, share: float) -> np.ndarray:
     """Numbers of the pairs that are held out: stretches, evenly spread."""
-    length = max(round(count * share / HELD_OUT_STRETCHES), 1)
+    length = math.ceil(count * share / HELD_OUT_STRETCHES)
     middles = (np.arange(HELD_OUT_STRETCHES) + 0.5) * count / HELD_OUT_STRETCHES
     first = (middles - length / 2).astype(int)
     numbers = first[:, None] + np.arange(length)
@@ -392,17 +395,23 @@ def _trend(numbers: np.ndarray, gain: np.ndarray, count: int) -> np.ndarray:
 
 
 def _first_mixing(pairs: Pairs) -> np.ndarray:
-    """The mixing that the changes of each pixel show, from its own light alone, (3, 3).
-
-    The identity where patterns do not tell colours apart.
-    """
-    changes = pairs.patterns - pairs.patterns.mean(axis=0)
-    products = np.einsum("fic,fid->cd", changes, changes)
-    if np.linalg.cond(products) > MAX_COLOUR_CONDITION:
-        return np.eye(3)
+    """The mixing that the changes of each pixel show, from its own light alone, (3, 3)."""
+    changes, products = _products_of_colours(pairs)
     answers = np.einsum("fic,fid->cd", pairs.photographs, changes)
     shares = np.linalg.solve(products, answers.T).T
     return shares / shares.sum(axis=1, keepdims=True)
+
+
+def _shows_colours(pairs: Pairs) -> bool:
+    """Return True if the patterns tell colours apart; grey ones do not."""
+    _, products = _products_of_colours(pairs)
+    return bool(np.linalg.cond(products) < MAX_COLOUR_CONDITION)
+
+
+def _products_of_colours(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns less their means, (frames, N, 3), and the products of their colours, (3, 3)."""
+    changes = pairs.patterns - pairs.patterns.mean(axis=0)
+    return changes, np.einsum("fic,fid->cd", changes, changes)
 
 
 def _norms(pictures: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ MAX_SHIFT = 5
 CLEAR_CORRELATION = 0.1
 # Pixels at which pairs are compared.
 COMPARED_PIXELS = 2000
-# Share of all values that may be the largest: of a saturated camera, it is larger.
+# Values, and share of all, that may be the largest: of a saturated camera, more are.
+MAX_LARGEST_VALUES = 10
 MAX_SATURATED_SHARE = 1e-3
 # A photograph is of another pattern if that explains it with so much less error.
 SWAPPED_ERROR_RATIO = 0.5
@@ -112,8 +113,9 @@ class Pairs:
         if np.all(self.patterns == self.patterns[:1]):
             raise InputError("patterns are all the same; they must differ")
         largest = self.photographs.max()
-        share = np.mean(self.photographs == largest)
-        if share > MAX_SATURATED_SHARE:
+        count = np.count_nonzero(self.photographs == largest)
+        share = count / self.photographs.size
+        if count > MAX_LARGEST_VALUES and share > MAX_SATURATED_SHARE:
             raise InputError(
                 f"photographs has {share:.1%} of its values at {largest:g}, the largest; the "
                 "camera is saturated: expose less"

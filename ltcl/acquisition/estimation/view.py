@@ -4,7 +4,9 @@
 A camera pixel sees the projector pixel whose light changes from pattern to pattern as its own does.
 Pictures are smooth, and light from elsewhere too: both sides are compared by what stands out of
 their surroundings. The correlation of a pixel is largest at the one that it sees, and a parabola
-through its neighbours tells where between them.
+through its neighbours tells where between them. Neighbouring camera pixels see one surface: the map
+is that of planes through them, which also reach to the rim of the picture, where the parabola lacks
+a side.
 """
 
 from __future__ import annotations
@@ -24,6 +26,11 @@ LEAST_CORRELATION = 0.5
 LEAST_KNOWN_SHARE = 0.5
 # A camera pixel sees the projector if its light changes by so much of the largest change.
 SEEING_SHARE = 0.1
+# Standard deviation of the neighbours that a plane goes through, in projector pixels, the share of
+# them that must be known, and by how much a pixel may be off the plane.
+PLANE_WIDTH = 1.5
+LEAST_PLANE_SHARE = 0.2
+MAX_OFF_PLANE = 1.0
 # Correlations at once.
 CHUNK_NUMBERS = 1 << 25
 
@@ -48,7 +55,10 @@ def find_view(pairs: Pairs) -> Correspondence:
         part = pixels[start : start + step]
         correlation = shown.T @ seen[:, start : start + step] / len(pairs)
         x[part], y[part] = _peaks(correlation.reshape(*pairs.grid, -1))
-    valid = np.isfinite(x)
+    x, y = _on_planes(x, y, pairs.camera_grid, PLANE_WIDTH * side)
+    height, width = pairs.grid
+    is_inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
+    valid = np.isfinite(x) & np.where(np.isfinite(x), is_inside, False)
     known = np.count_nonzero(valid) / max(len(pixels), 1)
     if known < LEAST_KNOWN_SHARE:
         raise AcquisitionError(
@@ -57,8 +67,8 @@ def find_view(pairs: Pairs) -> Correspondence:
         )
     shape = pairs.camera_grid
     return Correspondence(
-        x=np.where(valid, x, 0.0).reshape(shape),
-        y=np.where(valid, y, 0.0).reshape(shape),
+        x=x.reshape(shape),
+        y=y.reshape(shape),
         valid=valid.reshape(shape),
         grid=pairs.grid,
     )
@@ -89,6 +99,44 @@ def _peaks(correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     left = correlation[row, np.maximum(column - 1, 0), number]
     right = correlation[row, np.minimum(column + 1, w - 1), number]
     is_clear = peak > LEAST_CORRELATION
-    x = np.where(is_clear, column + offset(left, right), np.nan)
-    y = np.where(is_clear, row + offset(above, below), np.nan)
+    has_sides = (row > 0) & (row < h - 1) & (column > 0) & (column < w - 1)
+    is_known = is_clear & has_sides
+    x = np.where(is_known, column + offset(left, right), np.nan)
+    y = np.where(is_known, row + offset(above, below), np.nan)
     return x, y
+
+
+def _on_planes(
+    x: np.ndarray, y: np.ndarray, grid: tuple[int, int], sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The map on planes through the known pixels nearby; NaN where there are too few of them.
+
+    Pixels that are off their plane keep what they have: there is an edge.
+    """
+    known = np.isfinite(x).reshape(grid)
+    row, column = np.indices(grid).astype(np.float64)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        weighted = np.where(known, values, 0.0)
+        return scipy.ndimage.gaussian_filter(weighted, sigma, mode="constant")
+
+    weight = mean(np.ones(grid))
+    is_supported = weight > LEAST_PLANE_SHARE
+    weight = np.where(is_supported, weight, 1.0)
+    middle_row = mean(row) / weight
+    middle_column = mean(column) / weight
+    rr = mean(row**2) / weight - middle_row**2
+    cc = mean(column**2) / weight - middle_column**2
+    rc = mean(row * column) / weight - middle_row * middle_column
+    determinant = np.maximum(rr * cc - rc**2, 1e-9)
+    planes = []
+    for values in (x.reshape(grid), y.reshape(grid)):
+        middle = mean(values) / weight
+        down = mean(row * values) / weight - middle_row * middle
+        across = mean(column * values) / weight - middle_column * middle
+        per_row = (cc * down - rc * across) / determinant
+        per_column = (rr * across - rc * down) / determinant
+        plane = middle + per_row * (row - middle_row) + per_column * (column - middle_column)
+        is_off = known & (np.abs(plane - values) > MAX_OFF_PLANE)
+        planes.append(np.where(is_off, values, np.where(is_supported, plane, np.nan)).ravel())
+    return planes[0], planes[1]

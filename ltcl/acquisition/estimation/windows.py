@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -162,7 +163,7 @@ def _nearest(pixel: np.ndarray, level: int) -> np.ndarray:
     return (pixel + half) >> level
 
 
-def sums_under_hats(W: scipy.sparse.csr_array, patterns: Sequence[np.ndarray]) -> np.ndarray:
+def sums_under_hats(W: Any, patterns: Sequence[np.ndarray]) -> np.ndarray:
     """Sums of patterns (N,) under all hats, (nodes + 1, patterns), the last of them 0: `absent`."""
     sums = np.zeros((W.shape[0] + 1, len(patterns)))
     sums[:-1] = W @ np.stack(patterns, axis=1)

@@ -135,3 +135,18 @@ class PhotographMissing(FolderReport):
     next: Annotated[NextPhotograph, "The photograph to take."]
     missing: Annotated[list[int], "Numbers of all missing photographs."]
     exit_code: Annotated[Literal[3], "3."] = 3
+
+
+@dataclass(kw_only=True)
+class FitReport(FolderReport):
+    """`ltcl acquire fit`: the attributes of `ltcl.acquisition.Fit`."""
+
+    out: Annotated[Path, "File of the transport."]
+    grid: ProjectorGrid
+    channels: Channels
+    pairs: Annotated[int, "Number of pairs."]
+    held_out: Annotated[int, "Number of pairs that judged the fit."]
+    error: Annotated[float, "Relative error of T p for these, root mean square."]
+    worst: Annotated[float, "The largest of their errors."]
+    drift: Annotated[float, "Change of brightness over all pairs, which was corrected."]
+    noise: Annotated[float, "What T leaves of a photograph, relative to the light of a pixel."]

@@ -54,6 +54,7 @@ COMMANDS: dict[str, Any] = {
         acquisition.ScanReport | acquisition.PhotographMissing,
         "`ltcl acquire run`: the report of the finished scan, or the next photograph.",
     ],
+    "acquire-fit": acquisition.FitReport,
     "acquire-report": acquisition.ScanReport,
 }
 PARTS: dict[str, type[Report]] = {

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl acquire fit`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl import images, scenes
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def T(device):
+    return scenes.dihedral(8, albedo=0.6).transport(device=device)
+
+
+@pytest.fixture(scope="module")
+def pairs(T, tmp_path_factory) -> Path:
+    """Folder of patterns and photographs, with ambient light, and a photograph of black."""
+    folder = tmp_path_factory.mktemp("pairs")
+    random = np.random.default_rng(0)
+    for number in range(1, FRAMES + 1):
+        pattern = random.random((4, 8)).repeat(2, axis=0).repeat(2, axis=1)
+        images.write(folder / "patterns" / f"p{number}.exr", pattern)
+        images.write(folder / "photographs" / f"c{number}.exr", T @ pattern + 0.05)
+    images.write(folder / "black.exr", np.full(T.grid, 0.05))
+    return folder
+
+
+def test_a_folder_of_pairs_gives_T(program, pairs, T, tmp_path):
+    out = tmp_path / "T.npz"
+    arguments = ["acquire", "fit", pairs, "--black", pairs / "black.exr", "--out", out]
+    report = program(*arguments, "--json").json
+    assert report["pairs"] == FRAMES
+    assert report["error"] < 0.01
+    fitted = ltcl.load(out)
+    pattern = np.ones(T.grid)
+    np.testing.assert_allclose(fitted @ pattern, T @ pattern, rtol=0.02)
+
+
+def test_films_and_another_grid(program, pairs, T, tmp_path):
+    folder = tmp_path / "films"
+    folder.mkdir()
+    shown = []
+    seen = []
+    for number in range(1, FRAMES + 1):
+        pattern = images.read(pairs / "patterns" / f"p{number}.exr")
+        shown.append(pattern)
+        seen.append(T @ pattern)
+    images.frames.write_video(folder / "patterns.mkv", shown)
+    images.frames.write_video(folder / "photographs.mkv", seen)
+    outcome = program("acquire", "fit", folder, "--grid", "4x8")
+    assert "4 x 8 pixels, from 60 pairs" in outcome.out, outcome.err
+    assert ltcl.load(folder / "transport.npz").grid == (4, 8)
+
+
+def test_what_is_missing_is_named(program, pairs, tmp_path):
+    program("acquire", "fit", tmp_path).refused(str(tmp_path), "no patterns")
+    bad = tmp_path / "T.xyz"
+    program("acquire", "fit", pairs, "--out", bad).refused("T.xyz")
+    assert not bad.exists()
