@@ -16,7 +16,14 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
 from ltcl.tasks.denoising.multiwavelets import Grid
 from ltcl.tasks.denoising.problem import DenoisingProblem
-from ltcl.tasks.denoising.risk import NOISE_MARGIN, NoiseProbe, max_risk, noise_to_add, picture_risk
+from ltcl.tasks.denoising.risk import (
+    NOISE_MARGIN,
+    NoiseProbe,
+    max_risk,
+    noise_to_add,
+    picture_risk,
+    probe_count,
+)
 from ltcl.tasks.denoising.shrinkage import NoteShare, first_estimate, refine
 from ltcl.tasks.requirements import check_progress
 from ltcl.transport.noise import Noise
@@ -24,8 +31,6 @@ from ltcl.transport.transport import Transport, check_transport
 
 log = logging.getLogger(__name__)
 
-# Times that a channel is denoised, at most: with and without reciprocity, each with added noise.
-MAX_RUNS = 4
 # Arrays of float32 of the size of T that are in memory at once.
 ARRAYS_AT_ONCE = 20
 
@@ -162,6 +167,7 @@ class _Trials:
         self.camera_grid, self.grid = grids
         self.note = note
         self.runs = 0
+        self.probe_count = probe_count(len(Y))
 
     def run(self, Y: np.ndarray, may_be_reciprocal: bool) -> _Run:
         """Denoise these entries, (M, N)."""
@@ -182,16 +188,18 @@ class _Trials:
         )
 
     def risk(self, run: _Run, may_be_reciprocal: bool) -> float:
-        """`picture_risk` of the denoised entries, by a further run with more noise."""
-        variance = self._variance(run.entries)
-        added = noise_to_add(variance, self.noise, self.grid, self.channel)
-        del variance
-        noisier = self.run(self.Y + added, may_be_reciprocal)
-        probe = NoiseProbe(added=added, change=noisier.entries - run.entries)
+        """`picture_risk` of the denoised entries, by further runs with more noise."""
+        probes = []
+        for seed in range(self.probe_count):
+            variance = self._variance(run.entries)
+            added = noise_to_add(variance, self.noise, self.grid, self.channel, seed)
+            del variance
+            noisier = self.run(self.Y + added, may_be_reciprocal)
+            probes.append(NoiseProbe(added=added, change=noisier.entries - run.entries))
         variance = self._variance(run.entries)
         filtered = partial(self.noise.filtered, grid=self.grid, channel=self.channel)
         margin = 1.0 if self.noise.is_measured else NOISE_MARGIN
-        return picture_risk(self.Y, run.entries, variance, probe, filtered, self.grid, margin)
+        return picture_risk(self.Y, run.entries, variance, probes, filtered, self.grid, margin)
 
     def _variance(self, entries: np.ndarray) -> np.ndarray:
         """The variance of entries, (M, N), that may change: the first bounce stays."""
@@ -201,7 +209,9 @@ class _Trials:
         return variance
 
     def _note(self, share: float) -> None:
-        self.note((self.runs + share) / MAX_RUNS)
+        # With and without reciprocity, and once more for each probe.
+        most = 2 * (1 + self.probe_count)
+        self.note((self.runs + share) / most)
 
 
 def _variance_share(left: np.ndarray, variance: float) -> float:

@@ -18,7 +18,7 @@ D. That counts in the place of the noise model, within NOISE_MARGIN.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,9 +29,11 @@ from ltcl.transport.noise import Noise
 # Factor within which an estimated noise is right.
 NOISE_MARGIN = 1.25
 # Standard deviations of the estimated risk that the gain must exceed.
-GAIN_SIGMAS = 1.5
+GAIN_SIGMAS = 2.5
 # Standard deviation of added noise, in those of the noise of T: less meets too few thresholds.
 ADDED_NOISE = 0.5
+# Camera pixels times probes, at least: fewer leave the share of noise that stays to chance.
+PROBED_PIXELS = 256
 # Share of the noise of entries that is removed, at least.
 MIN_REMOVED_SHARE = 0.05
 # Random patterns of each kind.
@@ -49,27 +51,37 @@ class NoiseProbe:
     added: np.ndarray
     change: np.ndarray
 
-    def share_in_pictures(self, patterns: np.ndarray) -> float:
-        """The share C / V of noise that stays in pictures under patterns (N, k)."""
-        return self._share(self.added @ patterns, self.change @ patterns)
 
-    @property
-    def share_in_entries(self) -> float:
-        """The share of noise that stays in entries."""
-        return self._share(self.added, self.change)
-
-    def _share(self, added: np.ndarray, change: np.ndarray) -> float:
-        power = float(np.vdot(added, added))
-        if power == 0.0:
-            return 0.0
-        return float(np.vdot(added, change)) / power
+def probe_count(rows: int) -> int:
+    """Number of probes that tell how much noise stays, for pictures of so many rows of T."""
+    return max(1, -(-PROBED_PIXELS // rows))
 
 
-def noise_to_add(variance: np.ndarray, noise: Noise, grid: Grid, channel: int) -> np.ndarray:
+def noise_to_add(
+    variance: np.ndarray, noise: Noise, grid: Grid, channel: int, seed: int
+) -> np.ndarray:
     """Random noise (M, N) float32 like that of entries with this variance, but smaller."""
-    normal = np.random.default_rng(0).standard_normal(variance.shape, np.float32)
+    normal = np.random.default_rng(seed).standard_normal(variance.shape, np.float32)
     normal = noise.filtered(np.ascontiguousarray(normal.T), grid, channel).T
     return (ADDED_NOISE * np.sqrt(variance) * normal).astype(np.float32)
+
+
+def _share_in_pictures(probes: Sequence[NoiseProbe], patterns: np.ndarray) -> float:
+    """The share C / V of noise that stays in pictures under patterns (N, k)."""
+    stays = 0.0
+    power = 0.0
+    for probe in probes:
+        added = probe.added @ patterns
+        stays += float(np.vdot(added, probe.change @ patterns))
+        power += float(np.vdot(added, added))
+    return stays / power if power > 0.0 else 0.0
+
+
+def _share_in_entries(probes: Sequence[NoiseProbe]) -> float:
+    """The share of noise that stays in entries."""
+    stays = sum(float(np.vdot(probe.added, probe.change)) for probe in probes)
+    power = sum(float(np.vdot(probe.added, probe.added)) for probe in probes)
+    return stays / power if power > 0.0 else 0.0
 
 
 def max_risk(rows: int) -> float:
@@ -81,7 +93,7 @@ def picture_risk(
     Y: np.ndarray,
     D: np.ndarray,
     variance: np.ndarray,
-    probe: NoiseProbe,
+    probes: Sequence[NoiseProbe],
     filtered: Callable[[np.ndarray], np.ndarray],
     grid: Grid,
     noise_margin: float,
@@ -91,7 +103,7 @@ def picture_risk(
     `variance` is that of Y within a factor `noise_margin` of deviations; all (M, N). `filtered`
     gives patterns (N, k) as independent errors see them. 0 if T has no noise.
     """
-    removed_share = max(1.0 - probe.share_in_entries, MIN_REMOVED_SHARE)
+    removed_share = max(1.0 - _share_in_entries(probes), MIN_REMOVED_SHARE)
     moved = Y.astype(np.float64) - D
     largest = 0.0
     for patterns in _patterns(grid):
@@ -102,7 +114,7 @@ def picture_risk(
         shown = float(np.sum(moved**2 @ squares)) / removed_share
         V = np.clip(shown, stated / noise_margin**2, stated * noise_margin**2)
         change = np.sum((moved @ patterns) ** 2) / V
-        risk = change - 1.0 + 2.0 * probe.share_in_pictures(patterns)
+        risk = change - 1.0 + 2.0 * _share_in_pictures(probes, patterns)
         largest = max(largest, float(risk))
     return largest
 
