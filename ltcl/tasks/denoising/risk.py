@@ -29,7 +29,7 @@ from ltcl.transport.noise import Noise
 # Factor within which an estimated noise is right.
 NOISE_MARGIN = 1.25
 # Standard deviations of the estimated risk that the gain must exceed.
-GAIN_SIGMAS = 2.5
+GAIN_SIGMAS = 3.0
 # Standard deviation of added noise, in those of the noise of T: less meets too few thresholds.
 ADDED_NOISE = 0.5
 # Camera pixels times probes, at least: fewer leave the share of noise that stays to chance.
