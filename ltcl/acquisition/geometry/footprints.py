@@ -126,9 +126,7 @@ class Footprints:
             is_known &= span <= MAX_SPAN_RATIO * np.median(span[is_known])
             del span
             width = float(np.sqrt(np.median(length[is_known])))
-        return cls(
-            mapping=mapping, known=is_known, straddling=is_known & ~has_both, width=width
-        )
+        return cls(mapping=mapping, known=is_known, straddling=is_known & ~has_both, width=width)
 
     def strips(self) -> list[slice]:
         """Rows of camera pixels whose shares are in memory at once."""

@@ -256,14 +256,14 @@ def _separated_pixels(
         weighted = _inverse_variance_shares(shares, footprints.straddling[rows])
         normal = normal + weighted @ shares
         strips.append(weighted)
-    weighted = _join_columns(strips)  # C^T V^-1
-    return area[padded.inner], _solve_pixels(scipy.sparse.csr_array(normal), weighted, padded)
+    return area[padded.inner], _solve_pixels(scipy.sparse.csr_array(normal), strips, padded)
 
 
 def _solve_pixels(
-    normal: scipy.sparse.csr_array, weighted: scipy.sparse.csr_array, padded: PaddedGrid
+    normal: scipy.sparse.csr_array, strips: list[scipy.sparse.csr_array], padded: PaddedGrid
 ) -> scipy.sparse.csr_array:
-    """Weights (N, M) of least squares, by C^T V^-1 C and C^T V^-1."""
+    """Weights (N, M) of least squares, by C^T V^-1 C and strips of C^T V^-1, which are used up."""
+    weighted = _join_columns(strips)
     normal.sort_indices()  # entries are then found three times as fast
     steps = np.arange(-REACH, REACH + 1)
     window = np.add.outer(steps * padded.width, steps).ravel().astype(np.int32)
@@ -271,7 +271,6 @@ def _solve_pixels(
     # A row may have the entries of all pixels of a window, most of which are then dropped.
     most = weighted.nnz // len(pixels) * len(window)
     step = int(np.clip(ENTRIES_AT_ONCE // max(most, 1), 1, PIXELS_AT_ONCE))
-    index_type = np.int32 if weighted.shape[1] <= np.iinfo(np.int32).max else np.int64
     chunks = []
     for start in range(0, len(pixels), step):
         windows = pixels[start : start + step, None] + window
@@ -279,7 +278,7 @@ def _solve_pixels(
         normalised = _normalise_rows(_drop_small_weights(rows))
         entries = (
             normalised.data.astype(np.float32),
-            normalised.indices.astype(index_type),
+            _short(normalised.indices),
             normalised.indptr,
         )
         chunks.append(scipy.sparse.csr_array(entries, normalised.shape))
@@ -291,29 +290,23 @@ def _join_columns(strips: list[scipy.sparse.csr_array]) -> scipy.sparse.csr_arra
     """Matrices side by side; the list is emptied meanwhile, as both do not fit into the memory."""
     if len(strips) == 1:
         return strips.pop()
-    height = strips[0].shape[0]
-    counts = np.zeros(height, np.int64)
-    for strip in strips:
-        counts += np.diff(strip.indptr)
+    lengths = [np.diff(np.asarray(strip.indptr)) for strip in strips]
+    counts = np.sum(lengths, axis=0)
     ends = np.cumsum(counts)
     indptr = np.append(0, ends)
     data = np.empty(ends[-1], strips[0].dtype)
     indices = np.empty(ends[-1], np.int32)
     next_place = indptr[:-1].copy()
     width = 0
-    strips.reverse()
-    while strips:
-        strip = strips.pop()
-        lengths = np.diff(strip.indptr)
-        first = np.repeat(next_place - strip.indptr[:-1], lengths)
+    for length in lengths:
+        strip = strips.pop(0)
+        first = np.repeat(next_place - np.asarray(strip.indptr)[:-1], length)
         places = first + np.arange(strip.nnz)
         data[places] = strip.data
         indices[places] = strip.indices + width
-        next_place += lengths
-        width += strip.shape[1]
-    if indptr[-1] <= np.iinfo(np.int32).max:
-        indptr = indptr.astype(np.int32)
-    return scipy.sparse.csr_array((data, indices, indptr), (height, width))
+        next_place += length
+        width += int(strip.shape[1])
+    return scipy.sparse.csr_array((data, indices, _short(indptr)), (len(counts), width))
 
 
 def _inverse_variance_shares(
@@ -360,9 +353,22 @@ def _normalise_rows(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
     return scipy.sparse.diags_array(1.0 / np.where(total > 0, total, 1.0)) @ rows
 
 
-def _keep_rows(weights: scipy.sparse.csr_array, is_kept: np.ndarray) -> scipy.sparse.csr_array:
+def _keep_rows(weights: Any, is_kept: np.ndarray) -> scipy.sparse.csr_array:
     """Weights in float32, with empty rows for pixels that are not kept."""
-    mask = scipy.sparse.diags_array(is_kept.astype(np.float32))
-    rows = scipy.sparse.csr_array(mask @ weights, dtype=np.float32)
+    matrix = scipy.sparse.csr_array(weights)
+    lengths = np.diff(np.asarray(matrix.indptr))
+    is_kept_entry = np.repeat(is_kept, lengths)
+    kept = (
+        matrix.data[is_kept_entry].astype(np.float32),
+        _short(matrix.indices[is_kept_entry]),
+        _short(np.append(0, np.cumsum(lengths * is_kept))),
+    )
+    rows = scipy.sparse.csr_array(kept, matrix.shape)
     rows.eliminate_zeros()
     return rows
+
+
+def _short(indices: np.ndarray) -> np.ndarray:
+    """Indices in 32 bits, if that is enough."""
+    is_short = len(indices) == 0 or indices.max() <= np.iinfo(np.int32).max
+    return indices.astype(np.int32 if is_short else np.int64, copy=False)

@@ -28,6 +28,7 @@ import numpy as np
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry.blocks import Blocks
+from ltcl.acquisition.radiance import valid_values
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import adaptive, columns
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
@@ -261,8 +262,8 @@ def _relative_error(variance: float, light: Light) -> float:
 
 def measured(calibration: Calibration) -> Light:
     """Light of a measured scene; a quarter of it is taken as indirect."""
-    white = calibration.white.value[calibration.white.valid]
-    dark = calibration.ambient.value[calibration.ambient.valid]
+    white = valid_values(calibration.white)
+    dark = valid_values(calibration.ambient)
     lit = Light.direct
     if white.size:
         is_lit = white > LIT_SHARE * white.max(initial=0.0)
