@@ -30,11 +30,13 @@ from ltcl.images import from_srgb, to_srgb
 GRID = (68, 120)
 # Pixels of a block of the scan along each side: it has (2, 4).
 BLOCK = 34
+# Photographs of black and of white that are averaged: they take time, not memory.
+FRAMES = 4
 # Largest memory of 45 megapixels, in bytes.
 LIMIT = 2e9
 LARGEST_CAMERA = 45e6
 # Resident memory that threads and small arrays may take at any size.
-FIXED_BYTES = 200e6
+FIXED_BYTES = 350e6
 # Largest relative error of the transport.
 MAX_ERROR = 0.01
 # Light of a projector pixel at its own place, from everywhere, and without the projector.
@@ -49,7 +51,7 @@ BLACK = 0.004
 # Part of each side of a photograph around the projector's picture.
 MARGIN = 0.04
 # Rows of a photograph that are computed at once, and values of noise that are used again.
-ROWS_AT_ONCE = 64
+ROWS_AT_ONCE = 8
 NOISE_VALUES = 1 << 22
 ARGUMENTS = {
     "megapixels": {"type": float, "default": 3.0, "help": "pixels of the camera, in millions"}
@@ -59,7 +61,7 @@ ARGUMENTS = {
 class PlaneRig:
     """A projector and a colour camera of any size, whose photographs are made row by row."""
 
-    projector_grid = GRID
+    projector_grid: tuple[int, int] = GRID
     channels = 3
 
     def __init__(self, camera_grid: tuple[int, int]) -> None:
@@ -67,7 +69,8 @@ class PlaneRig:
         self.count = 0
         self.seconds = 0.0
         self.random = np.random.default_rng(0)
-        self.noise = self.random.standard_normal(NOISE_VALUES, np.float32)
+        values = NOISE_VALUES + ROWS_AT_ONCE * camera_grid[1] * 3
+        self.noise = self.random.standard_normal(values, np.float32)
         self.places = []
         for camera_side, side in zip(camera_grid, GRID, strict=True):
             place = (np.arange(camera_side) + 0.5) / camera_side
@@ -86,17 +89,18 @@ class PlaneRig:
         H, W = self.camera_grid
         image = np.empty((H, W, 3), np.uint8)
         rows, columns = self.places
-        for top in range(0, H, ROWS_AT_ONCE):
-            strip = image[top : top + ROWS_AT_ONCE]
-            lines = rows[top : top + ROWS_AT_ONCE]
-            values = mean[lines][:, columns]
-            spread = deviation[lines][:, columns]
-            first = self.random.integers(NOISE_VALUES // 2)
-            noise = np.resize(self.noise[first:], spread.size).reshape(spread.shape)
-            spread *= noise
-            values += spread
-            np.clip(np.rint(values, out=values), 0.0, 255.0, out=values)
-            strip[:] = values
+        for line in range(GRID[0] + 2):
+            first, last = np.searchsorted(rows, [line, line + 1])
+            line_mean = mean[line, columns].ravel()
+            line_deviation = deviation[line, columns].ravel()
+            for top in range(first, last, ROWS_AT_ONCE):
+                strip = image[top : min(top + ROWS_AT_ONCE, last)].reshape(-1, 3 * W)
+                start_of_noise = self.random.integers(len(self.noise) - strip.size)
+                noise = self.noise[start_of_noise : start_of_noise + strip.size]
+                values = noise.reshape(strip.shape) * line_deviation
+                values += line_mean
+                np.clip(values, 0.0, 255.0, out=values)
+                strip[:] = values
         self.count += 1
         self.seconds += time.perf_counter() - start
         return image
@@ -113,7 +117,8 @@ class PlaneRig:
         slope = (to_srgb(value) - to_srgb(np.maximum(value - step, 0.0))) / step
         deviation = slope * np.sqrt(value / ELECTRONS + READ_NOISE**2)
         mean = BLACK + (1.0 - BLACK) * to_srgb(value)
-        return (255.0 * mean).astype(np.float32), (255.0 * deviation).astype(np.float32)
+        # Codes are cut off to whole ones: half a code more rounds them.
+        return (255.0 * mean + 0.5).astype(np.float32), (255.0 * deviation).astype(np.float32)
 
 
 class PeakMemory:
@@ -194,6 +199,7 @@ def main() -> None:
             rig,
             strategy="block",
             block=BLOCK,
+            frames=FRAMES,
             store=f"{folder}/T.zarr",
             progress=memory.progress,
         )

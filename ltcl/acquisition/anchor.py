@@ -85,7 +85,7 @@ class Anchor:
     @classmethod
     def of(cls, picture: RadiancePicture, resampling: Resampling) -> Self:
         """The anchor of a picture (H, W[, c]) of the pattern."""
-        seen = np.unique(resampling.weights.indices)
+        seen = resampling.camera_pixels()
         is_valid = values_at(picture, seen, "valid").all(axis=1)
         pixels = spread(seen[is_valid])
         return cls(
@@ -202,9 +202,10 @@ def _gradient(p: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives along rows and columns of some rows of a picture, as of the whole one."""
     top = max(rows.start - 1, 0)
     window = p[top : rows.stop + 1].astype(np.float64)
-    dy, dx = np.gradient(window)
     inside = slice(rows.start - top, rows.stop - top)
-    return dy[inside], dx[inside]
+    down = np.asarray(np.gradient(window, axis=0))
+    right = np.asarray(np.gradient(window, axis=1))
+    return down[inside], right[inside]
 
 
 def _sum_of_channels(picture: np.ndarray) -> np.ndarray:

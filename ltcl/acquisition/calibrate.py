@@ -352,7 +352,7 @@ def _response_from_ramps(
     shortest = white_exposure / RESPONSE_SPAN
     longest = white_exposure * RESPONSE_SPAN
     times = [*offered_exposures(shots, bracket(shortest, longest, effort.exposures))]
-    height, width = shots.image.shape[:2]
+    height, width = shots.camera_grid or (0, 0)
     ramps = effort.ramps(shots.grid, height * width)
     if times[0] * MIN_DARK_RATIO > white_exposure:
         ramps.append(np.zeros(shots.grid, np.float32))
@@ -413,7 +413,7 @@ class _View:
     @property
     def camera_pixels(self) -> float:
         """Camera pixels for one of the projector's."""
-        used = np.unique(self.resampling.weights.indices)
+        used = self.resampling.camera_pixels()
         return len(used) / max(np.count_nonzero(self.resampling.seen), 1)
 
 

@@ -195,18 +195,19 @@ def _small_arrays(store: BlockStore, names: Iterable[str]) -> dict[str, np.ndarr
             continue
         first = np.array(store.extra(parts[0]))
         if len(parts) > 1:
-            first = _joined(store, parts, first.dtype)
+            first = _joined(store, parts)
         arrays[name] = first
     return arrays
 
 
-def _joined(store: BlockStore, parts: list[str], dtype: np.dtype) -> np.ndarray:
+def _joined(store: BlockStore, parts: list[str]) -> np.ndarray:
     """One array of several, which are never in memory together."""
     file = ImageFile()
     stored = []
     for part in parts:
         stored.append(file.append(np.array(store.extra(part))))
-    joined = np.empty(sum(part.shape[0] for part in stored), dtype)
+    length = sum(part.shape[0] for part in stored)
+    joined = np.empty((length, *stored[0].shape[1:]), stored[0].dtype)
     top = 0
     for part in stored:
         joined[top : top + part.shape[0]] = part.read()

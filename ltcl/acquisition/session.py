@@ -284,6 +284,8 @@ class CaptureSession:
         photograph = Photograph.of(self.shots, seconds, self.file)
         pixels = scale_codes(sample(self.shots.image), self.shots.rig)
         self.record.add_sample(codes, seconds, pixels, photograph.number)
+        # It is in the file now.
+        self.shots.image = np.zeros((0, 0))
         if codes.min() == codes.max():
             self._uniform[name] = photograph
         self._progress(self.shots.count)

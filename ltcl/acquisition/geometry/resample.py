@@ -27,6 +27,7 @@ within a projector pixel, the value is that at a place 0.03 pixels from its cent
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -199,6 +200,15 @@ class Resampling:
             doubtful=is_doubtful,
         )
 
+    def camera_pixels(self, projector_pixels: np.ndarray | None = None) -> np.ndarray:
+        """Numbers of the camera pixels that see the projector, or some of its pixels, ascending."""
+        weights = self.weights
+        if projector_pixels is not None:
+            weights = weights[projector_pixels]
+        is_used = np.zeros(math.prod(self.camera_grid), bool)
+        is_used[weights.indices] = True
+        return np.flatnonzero(is_used)
+
     @property
     def seen(self) -> np.ndarray:
         """Projector pixels that some camera pixel sees, (h, w) bool."""
@@ -286,11 +296,11 @@ def _solve_pixels(
     return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
 
 
-def _join_columns(strips: list[scipy.sparse.csr_array]) -> scipy.sparse.csr_array:
+def _join_columns(strips: list[Any]) -> scipy.sparse.csr_array:
     """Matrices side by side; the list is emptied meanwhile, as both do not fit into the memory."""
     if len(strips) == 1:
         return strips.pop()
-    lengths = [np.diff(np.asarray(strip.indptr)) for strip in strips]
+    lengths: list[np.ndarray] = [np.diff(strip.indptr) for strip in strips]
     counts = np.sum(lengths, axis=0)
     ends = np.cumsum(counts)
     indptr = np.append(0, ends)

@@ -179,7 +179,7 @@ class ScanCamera(ScanGrid):
         super().__init__(calibration, side)
         self.shots = shots
         # Photographs are compared at some of the pixels that see the projector.
-        seeing = np.unique(calibration.resampling.weights.indices)
+        seeing = calibration.resampling.camera_pixels()
         self._pixels = spread(seeing)
         # Ambient light at the pixels of the anchor.
         self._room = np.zeros(0)
@@ -254,9 +254,8 @@ class ScanCamera(ScanGrid):
         if len(photographs.images) < 2:
             return None
         is_lit = photographs.codes.reshape(*self.shots.grid, -1).any(axis=2)
-        weights = self.calibration.resampling.weights
         camera = self.calibration.camera
-        seeing_lit = np.unique(weights[np.flatnonzero(is_lit)].indices)
+        seeing_lit = self.calibration.resampling.camera_pixels(np.flatnonzero(is_lit))
         for pixels in (self._pixels, spread(seeing_lit)):
             samples = [photograph.at(pixels) for photograph in photographs.images]
             deviation = find_deviation(samples, photographs.seconds, camera)

@@ -81,6 +81,8 @@ class Plan:
         Bytes on the disk, at most.
     error : float
         Relative error of T p by noise, 1 at most.
+    computing : float, optional
+        Time of computing besides, in seconds; None if the size of the camera is not known.
     """
 
     strategy: str
@@ -91,6 +93,7 @@ class Plan:
     seconds: float
     disk: int
     error: float
+    computing: float | None = None
 
     def __repr__(self) -> str:
         h, w = self.grid
@@ -123,6 +126,8 @@ def plans(
     threshold: float = ScanSettings.threshold,
     overhead: float = 0.0,
     calibration: int | None = None,
+    megapixels: float | None = None,
+    pace: float | None = None,
 ) -> dict[str, Plan]:
     """Plan a scan with every strategy.
 
@@ -143,6 +148,10 @@ def plans(
         Seconds of each photograph besides its exposure.
     calibration : int, optional
         Photographs of the calibration; None: as many as expected.
+    megapixels : float, optional
+        Pixels of the camera in millions; None: not known.
+    pace : float, optional
+        Seconds of computing for each photograph and megapixel (`scanning.pace`); None: not known.
 
     Examples
     --------
@@ -172,6 +181,9 @@ def plans(
         # The calibration's exposures are about the geometric mean of those of the scan.
         calibration_seconds = calibration * math.sqrt(times[0] * times[-1])
         scan_seconds = outlook.patterns * times.sum()
+        computing = None
+        if megapixels is not None and pace is not None:
+            computing = photographs * megapixels * pace
         seconds = calibration_seconds + scan_seconds + outlook.batches * times[0]
         result[strategy] = Plan(
             strategy=strategy,
@@ -182,6 +194,7 @@ def plans(
             seconds=float(seconds + photographs * overhead),
             disk=channels * ENTRY_BYTES * outlook.entries,
             error=_relative_error(outlook.variance, light),
+            computing=computing,
         )
     return result
 
