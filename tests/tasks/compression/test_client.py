@@ -83,6 +83,7 @@ HOLDERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holder", HOLDERS)
 def test_rows_from_elsewhere_give_the_same_bits(holder, client, matrix, tmp_path):
     rows = HOLDERS[holder](matrix, tmp_path / "T.zarr")
