@@ -36,6 +36,7 @@ formats = pytest.mark.parametrize(
 kernels = pytest.mark.parametrize("make", helpers.FORMATS.values(), ids=list(helpers.FORMATS))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({*gallery.SPARSE} - {"129x129"}))
 @kernels
 @pytest.mark.parametrize("launch", helpers.LAUNCHES)

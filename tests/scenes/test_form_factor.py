@@ -46,6 +46,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_products_meet_their_twin(shaped, name):
     patches, blocks = SCENES[name]
