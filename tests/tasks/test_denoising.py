@@ -73,6 +73,7 @@ def test_entries_pictures_and_bounces_come_nearer_to_the_truth(
     assert D is T or D.to_numpy().min() >= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("c", "most", "share"), [(0.6, 0.6, 1.2), (0.9, 1.15, 0.85)])
 def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(
     c: float, most: float, share: float

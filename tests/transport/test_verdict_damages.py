@@ -30,6 +30,7 @@ def judge(name: str, matrix: np.ndarray) -> Verdict:
     return verdict(ltcl.Transport(matrix, SCENES[name].grid))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("cut", [0.99, 0.8, 0.5])
 def test_a_T_that_saturates_at_every_pixel_saturates(name, cut):
@@ -94,6 +95,7 @@ CAMERAS: list[tuple[str, Callable[[np.ndarray], np.ndarray], tuple[int, int]]] =
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "resample", "camera_grid"), CAMERAS)
 @pytest.mark.parametrize("ambient", [0.0, 1e-3, 1e-2])
 def test_ambient_light_is_named_whatever_the_camera(
@@ -115,6 +117,7 @@ def test_ambient_light_is_named_whatever_the_camera(
         assert entry["verdict"]["text"] == judged.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera_grid", [(24, 24), (24, 72)])
 def test_a_camera_of_other_pixels_saturates_and_drifts_too(camera_grid):
     rows, columns = camera_grid
