@@ -80,6 +80,7 @@ def test_every_public_name_has_an_example() -> None:
     assert without == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("device")
 def test_the_examples_on_the_page_run() -> None:
     examples = doctest.DocTestParser().get_doctest(EXAMPLES, {}, "python.md", "python.md", 0)

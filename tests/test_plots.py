@@ -128,6 +128,7 @@ def test_unknown_extension_and_failure_leave_the_old_file(tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["folder.png"]
 
 
+@pytest.mark.slow
 def test_no_pyplot_and_no_matplotlib_before_the_first_plot() -> None:
     code = (
         "import sys; from ltcl import plots; assert 'matplotlib' not in sys.modules\n"

@@ -127,6 +127,7 @@ for method_name in METHODS:
     CALLS[f"solve by {method_name}"] = (partial(residual, method=method_name), 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shaped", ["gpu"], indirect=True)
 @pytest.mark.parametrize("name", CALLS)
 def test_calls_work_in_the_launch_shape_of_a_gpu(

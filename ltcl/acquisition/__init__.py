@@ -4,7 +4,8 @@
     task          acquire and finalize, with the `settings` of a scan, by a `rig`: virtual,
                   rendered, photographed by a person, on a cable (rigs/)
     calibrate     facts that are measured once (`metering`, `session`, radiometry/, geometry/), and
-                  their checks (`consistency`); its record, `calibration`
+                  their checks (`consistency`); its record, `calibration`; pictures of the
+                  camera's full resolution wait in a file (`scratch`, `radiance`)
     scanning/     patterns in order, and T from the pictures; a plan before, a report after
     estimation/   T from any pairs of pictures and photographs
     agreement     photographs that deviate from the others are refused by number; `anchor`: did

@@ -162,9 +162,13 @@ class AgreementRecord:
 
     def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
         """Record one photograph, (H, W) or (H, W, c) in [0, 1]."""
-        photograph = _RecordedPhotograph(
-            codes=codes, seconds=seconds, sample=sample(image), number=number
-        )
+        self.add_sample(codes, seconds, sample(image), number)
+
+    def add_sample(
+        self, codes: np.ndarray, seconds: float, sample: np.ndarray, number: int
+    ) -> None:
+        """Record one photograph by its values (n, c) at the pixels of `sample`."""
+        photograph = _RecordedPhotograph(codes=codes, seconds=seconds, sample=sample, number=number)
         self._by_pattern[codes.tobytes()].append(photograph)
         self._by_exposure[seconds].append(photograph)
 

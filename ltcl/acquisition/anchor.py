@@ -18,15 +18,17 @@ the contrast hardly where another light is on.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from ltcl.acquisition.agreement import CameraModel, Deviation, find_deviation, sample, spread
+from ltcl.acquisition.agreement import CameraModel, Deviation, find_deviation, spread
 from ltcl.acquisition.geometry import Resampling
-from ltcl.acquisition.radiometry import Radiance
+from ltcl.acquisition.radiance import RadiancePicture, planes, values_at
+from ltcl.acquisition.scratch import ImageFile, StoredImage, row_strips
 
 # Share of the median of white below which pixels are left out.
 MIN_WHITE_SHARE = 0.1
@@ -81,46 +83,46 @@ class Anchor:
     variance: np.ndarray
 
     @classmethod
-    def of(cls, picture: Radiance, resampling: Resampling) -> Self:
+    def of(cls, picture: RadiancePicture, resampling: Resampling) -> Self:
         """The anchor of a picture (H, W[, c]) of the pattern."""
-        seen = np.unique(resampling.weights.indices)
-        is_valid = sample(picture.valid, seen).all(axis=1)
+        seen = resampling.camera_pixels()
+        is_valid = values_at(picture, seen, "valid").all(axis=1)
         pixels = spread(seen[is_valid])
         return cls(
             pixels=pixels,
-            value=sample(picture.value, pixels),
-            variance=sample(picture.variance, pixels),
+            value=values_at(picture, pixels, "value"),
+            variance=values_at(picture, pixels, "variance"),
         )
 
     def deviation(
         self,
-        image: np.ndarray,
+        codes: np.ndarray,
         seconds: float,
         camera: CameraModel,
-        ambient: Radiance,
+        room: np.ndarray,
         gain: float = 1.0,
     ) -> Deviation | None:
-        """Compare a photograph (H, W[, c]) of the pattern with that of the calibration.
+        """Compare a photograph of the pattern with that of the calibration.
 
-        `gain` is that of the lamp since then.
+        `codes` and the ambient light `room` are those at `pixels`, (n, c); `gain` is that of the
+        lamp since then.
         """
-        room = sample(ambient.value, self.pixels)
         value = self.value if gain == 1.0 else room + gain * (self.value - room)
         known = value, self.variance
-        return find_deviation([sample(image, self.pixels)], [seconds], camera, known)
+        return find_deviation([codes], [seconds], camera, known)
 
     def lamp_gain(
-        self, image: np.ndarray, seconds: float, camera: CameraModel, ambient: Radiance
+        self, codes: np.ndarray, seconds: float, camera: CameraModel, room: np.ndarray
     ) -> float:
-        """Gain of the lamp since the calibration, by a photograph (H, W[, c]) of the pattern.
+        """Gain of the lamp since the calibration, by a photograph of the pattern.
 
-        It is 1 if there is no change, or another one than that of the lamp.
+        `codes` and the ambient light `room` are those at `pixels`, (n, c). It is 1 if there is no
+        change, or another one than that of the lamp.
         """
-        codes = sample(image, self.pixels)
         curve = codes if codes.shape[1] > 1 else codes[:, 0]
         linear = camera.response.linear(curve).reshape(codes.shape)
         is_clear = (linear < camera.noise.saturation).all(axis=1)
-        room = sample(ambient.value, self.pixels)[is_clear]
+        room = room[is_clear]
         x = (self.value[is_clear] - room).sum(axis=1, dtype=np.float64)
         y = ((linear - camera.offset)[is_clear] / seconds - room).sum(axis=1, dtype=np.float64)
         if len(x) < 2 or x.sum() <= 0 or x.var() < MIN_CONTRAST * x.mean() ** 2:
@@ -138,37 +140,72 @@ class Anchor:
         return 1.0
 
 
-def compact(picture: Radiance) -> np.ndarray:
-    """A picture in as little memory as `shift_of` needs.
+def compact(picture: RadiancePicture, file: ImageFile) -> StoredImage:
+    """A picture in a file, in as little room as `shift_of` needs.
 
     (H, W[, c]) float16, NaN where it is not valid.
     """
-    return np.where(picture.valid, picture.value, np.nan).astype(np.float16)
+    stored = file.reserve(picture.shape, np.float16)
+    for rows in row_strips(picture.shape):
+        strip = picture.rows(rows)
+        values = np.where(strip.valid, strip.value, np.nan).astype(np.float16)
+        stored.write(rows.start, values)
+    return stored
 
 
 def shift_of(
     codes: np.ndarray,
-    picture: np.ndarray,
-    white: Radiance,
-    ambient: Radiance,
+    picture: StoredImage,
+    white: RadiancePicture,
+    ambient: RadiancePicture,
     resampling: Resampling,
 ) -> np.ndarray:
     """Movement d along x and y, in camera pixels, of a `compact` picture under some codes."""
     grey = codes if codes.ndim == 2 else codes.mean(axis=2)
     P = grey.ravel()
-    weights = abs(resampling.weights).T
-    total = weights @ np.ones(len(P))
-    p = (weights @ P / np.maximum(total, 1e-9)).reshape(resampling.camera_grid)
-    dy, dx = np.gradient(p)
-    y = _sum_of_channels(picture - ambient.value)
-    w = _sum_of_channels(white.value)
-    is_lit = w > MIN_WHITE_SHARE * np.median(w[w > 0])
-    edge = ((dx != 0) | (dy != 0)) & np.isfinite(y) & is_lit
-    columns = np.stack([dx[edge], dy[edge], p[edge]], axis=1)
-    A = columns * p[edge, None]
-    solution, *_ = np.linalg.lstsq(A, p[edge] * y[edge] / w[edge])
-    scale = solution[2]
+    p = _pattern_on_camera(P, resampling)
+    w = np.zeros(resampling.camera_grid, np.float32)
+    for light in planes(white, "value"):
+        w += light
+    least_light = MIN_WHITE_SHARE * np.median(w[w > 0])
+    # Normal equations, A^T A x = A^T b, so that rows add up.
+    normal = np.zeros((3, 3))
+    right = np.zeros(3)
+    for rows in row_strips(picture.shape):
+        dy, dx = _gradient(p, rows)
+        y = _sum_of_channels(picture.read(rows) - ambient.rows(rows).value)
+        edge = ((dx != 0) | (dy != 0)) & np.isfinite(y) & (w[rows] > least_light)
+        p_of_edge = p[rows][edge].astype(np.float64)
+        columns = np.stack([dx[edge], dy[edge], p_of_edge], axis=1)
+        A = columns * p_of_edge[:, None]
+        normal += A.T @ A
+        right += A.T @ (p_of_edge * y[edge] / w[rows][edge])
+    solution = np.linalg.pinv(normal) @ right
+    scale = float(solution[2])
     return solution[:2] / max(scale, MIN_SCALE)
+
+
+def _pattern_on_camera(P: np.ndarray, resampling: Resampling) -> np.ndarray:
+    """Codes (N,) of the projector's pixels on those of the camera, (H, W) float32."""
+    weights = resampling.weights
+    lengths = np.diff(np.asarray(weights.indptr))
+    total = np.zeros(math.prod(resampling.camera_grid), np.float32)
+    p = np.zeros_like(total)
+    magnitudes = np.abs(weights.data)
+    np.add.at(total, weights.indices, magnitudes)
+    np.add.at(p, weights.indices, magnitudes * np.repeat(P.astype(np.float32), lengths))
+    p /= np.maximum(total, np.float32(1e-9))
+    return p.reshape(resampling.camera_grid)
+
+
+def _gradient(p: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives along rows and columns of some rows of a picture, as of the whole one."""
+    top = max(rows.start - 1, 0)
+    window = p[top : rows.stop + 1].astype(np.float64)
+    inside = slice(rows.start - top, rows.stop - top)
+    down = np.asarray(np.gradient(window, axis=0))
+    right = np.asarray(np.gradient(window, axis=1))
+    return down[inside], right[inside]
 
 
 def _sum_of_channels(picture: np.ndarray) -> np.ndarray:

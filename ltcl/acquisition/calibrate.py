@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +44,7 @@ from ltcl.acquisition.metering import (
     scan_exposures,
     unsaturated_exposure,
 )
+from ltcl.acquisition.radiance import difference, planes
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.session import (
@@ -279,16 +279,16 @@ def measure(
     # 5. Light: ambient, white, of the projector's channels, and of the blocks.
     projector, mixing = _measure_projector(session, effort, uniform, dark, bright)
     ambient = session.merge(dark)
-    white = session.merge(bright) - ambient
+    white = difference(session.merge(bright), ambient, session.file)
     consistency.check_light(times.scan, white, view.resampling, session.camera)
     blocks = session.merge([*before, *after])
-    block_light = (blocks - ambient).value
     if view.light is not None:
+        block_light = difference(blocks, ambient, session.file)
         consistency.check_map(
-            session, view.resampling, view.stripes, view.light, block_light, white.value
+            session, view.resampling, view.stripes, view.light, block_light, white
         )
     consistency.check_superposition(session, few[0], others[0], dark, bright)
-    resampling = view.resampling.ascertained(white.value, white.valid)
+    resampling = view.resampling.ascertained_by(planes(white, "value"))
     return Calibration(
         exposures=tuple(times.scan),
         response=session.camera.response,
@@ -333,9 +333,9 @@ def _measure_response(
     if response is None:
         response, session.hot = _response_from_ramps(session, effort, seconds)
     else:
-        session.hot = hot_pixels(session.photograph(np.zeros_like(white), seconds))
+        session.hot = hot_pixels([session.photograph(np.zeros_like(white), seconds)])
     session.camera = CameraModel(response=response)
-    level = brightness(session.photograph(white, seconds), session.hot)
+    level = brightness(session, session.photograph(white, seconds), session.hot)
     # The digest is of photographs at the exposure of white, which tell rigs apart, not of probes.
     shots.digest.clear()
     return unsaturated_exposure(shots, seconds * WHITE_LEVEL / max(level, 0.01))
@@ -352,12 +352,12 @@ def _response_from_ramps(
     shortest = white_exposure / RESPONSE_SPAN
     longest = white_exposure * RESPONSE_SPAN
     times = [*offered_exposures(shots, bracket(shortest, longest, effort.exposures))]
-    height, width = shots.image.shape[:2]
+    height, width = shots.camera_grid or (0, 0)
     ramps = effort.ramps(shots.grid, height * width)
     if times[0] * MIN_DARK_RATIO > white_exposure:
         ramps.append(np.zeros(shots.grid, np.float32))
     exposed = session.take([[(ramp, seconds) for ramp in ramps] for seconds in times])
-    hot = hot_pixels(reduce(np.minimum, (photograph.image for photograph in exposed[0])))
+    hot = hot_pixels(exposed[0])
     if shots.channels == 3:
         _expose_dark_colours(session, ramps, hot, times, exposed)
     images = [_side_by_side(group, hot) for group in exposed]
@@ -413,7 +413,7 @@ class _View:
     @property
     def camera_pixels(self) -> float:
         """Camera pixels for one of the projector's."""
-        used = np.unique(self.resampling.weights.indices)
+        used = self.resampling.camera_pixels()
         return len(used) / max(np.count_nonzero(self.resampling.seen), 1)
 
 
@@ -435,7 +435,7 @@ def _measure_geometry(
         # Linear in light: a pixel that is half lit shows half of it.
         light = PhotographFile(session.file)
         for photograph in stripes:
-            light.append(session.linear(photograph))
+            light.append_rows(photograph.grid, session.linear(photograph))
         with acquisition_error("the geometry"):
             geometry = decode(light, shots.grid, levels=shots.levels)
     resampling = Resampling.of(geometry)

@@ -12,8 +12,10 @@ T is for light relative to white less black: a includes the light of a black pro
 
 from __future__ import annotations
 
+import math
 import os
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,13 +27,21 @@ from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
+from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, on_projector
 from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
+from ltcl.acquisition.scratch import ImageFile
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
 from ltcl.transport.transport import Transport
 
 PREFIX = "calibration."
 """Beginning of the names of the extra arrays that a calibration is kept in."""
+# Between the name of a large array and the number of its part.
+PART = ".part"
+# Bytes of an extra array: a part is in memory several times when it is written or checked.
+PART_BYTES = 1 << 25
+# Beginnings of the names of pictures.
+PICTURES = ("ambient.", "white.")
 # Share of the camera pixels of a projector pixel that must be valid; with less its value is
 # unknown.
 MIN_VALID_SHARE = 0.5
@@ -49,8 +59,9 @@ class Calibration:
         Seconds of the photographs of each pattern, ascending.
     response, noise, offset : Response, NoiseModel, ndarray
         Of the camera; `offset` is its linear value without light, (channels,).
-    ambient, white : Radiance
-        Light (H, W[, 3]) of a black projector, and what a white one adds.
+    ambient, white : Radiance or StoredRadiance
+        Light (H, W[, 3]) of a black projector, and what a white one adds; large pictures are in a
+        temporary file.
     projector : Response
         From codes to light of the projector.
     mixing : ndarray, optional
@@ -67,8 +78,8 @@ class Calibration:
     response: Response
     noise: NoiseModel
     offset: np.ndarray
-    ambient: Radiance
-    white: Radiance
+    ambient: RadiancePicture
+    white: RadiancePicture
     projector: Response
     mixing: np.ndarray | None
     resampling: Resampling
@@ -95,9 +106,10 @@ class Calibration:
         FileError if it has none, or is damaged.
         """
         scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
-        arrays = _stored_arrays(scan)
-        if not arrays:
+        names = [name for name in scan.extras if name.startswith(PREFIX)]
+        if not names:
             raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
+        arrays = _small_arrays(scan, names)
         sharpness = None
         if "sharpness" in arrays:
             y, x, width = arrays["sharpness"].tolist()
@@ -109,8 +121,8 @@ class Calibration:
             response=Response(arrays["response"]),
             noise=NoiseModel(*noise, levels=int(levels)),
             offset=arrays["offset"],
-            ambient=Radiance(**_group(arrays, "ambient.")),
-            white=Radiance(**_group(arrays, "white.")),
+            ambient=_read_radiance(scan, "ambient."),
+            white=_read_radiance(scan, "white."),
             projector=Response(arrays["projector"]),
             mixing=arrays.get("mixing"),
             resampling=_resampling_from_arrays(_group(arrays, "resampling.")),
@@ -132,14 +144,14 @@ class Calibration:
             arrays["sharpness"] = np.hstack(astuple(self.sharpness))
         if self.mixing is not None:
             arrays["mixing"] = self.mixing
-        arrays |= _radiance_arrays("ambient.", self.ambient)
-        arrays |= _radiance_arrays("white.", self.white)
         if self.anchor is not None:
             arrays["anchor.pixels"] = self.anchor.pixels
             arrays["anchor.value"] = self.anchor.value
             arrays["anchor.variance"] = self.anchor.variance
         for name, array in arrays.items():
-            store.extra(PREFIX + name, array)
+            _write_parts(store, name, len(array), array.nbytes, array.__getitem__)
+        _write_radiance(store, "ambient.", self.ambient)
+        _write_radiance(store, "white.", self.white)
 
 
 def is_calibrated(store: BlockStore) -> bool:
@@ -150,13 +162,57 @@ def is_calibrated(store: BlockStore) -> bool:
     return "strategy" in store.attributes
 
 
-def _stored_arrays(store: BlockStore) -> dict[str, np.ndarray]:
-    """The arrays of a calibration, by their names without `PREFIX`."""
+def _write_parts(
+    store: BlockStore,
+    name: str,
+    length: int,
+    nbytes: int,
+    read: Callable[[slice], np.ndarray],
+) -> None:
+    """Commit an array to a store, in several extra arrays if it is large: NAME.part0, ..."""
+    if nbytes <= PART_BYTES:
+        store.extra(PREFIX + name, read(slice(0, length)))
+        return
+    step = max(length * PART_BYTES // nbytes, 1)
+    for number, top in enumerate(range(0, length, step)):
+        store.extra(f"{PREFIX}{name}{PART}{number}", read(slice(top, min(top + step, length))))
+
+
+def _parts(names: Iterable[str]) -> dict[str, list[str]]:
+    """The extra arrays of each array of a calibration, in order, by its name without `PREFIX`."""
+    numbered: dict[str, dict[int, str]] = {}
+    for name in names:
+        array, _, number = name.removeprefix(PREFIX).partition(PART)
+        numbered.setdefault(array, {})[int(number or 0)] = name
+    return {array: [parts[k] for k in sorted(parts)] for array, parts in numbered.items()}
+
+
+def _small_arrays(store: BlockStore, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """The arrays of a calibration but pictures, by their names without `PREFIX`."""
     arrays = {}
-    for name in store.extras:
-        if name.startswith(PREFIX):
-            arrays[name.removeprefix(PREFIX)] = np.array(store.extra(name))
+    for name, parts in _parts(names).items():
+        if name.startswith(PICTURES):
+            continue
+        first = np.array(store.extra(parts[0]))
+        if len(parts) > 1:
+            first = _joined(store, parts)
+        arrays[name] = first
     return arrays
+
+
+def _joined(store: BlockStore, parts: list[str]) -> np.ndarray:
+    """One array of several, which are never in memory together."""
+    file = ImageFile()
+    stored = []
+    for part in parts:
+        stored.append(file.append(np.array(store.extra(part))))
+    length = sum(part.shape[0] for part in stored)
+    joined = np.empty((length, *stored[0].shape[1:]), stored[0].dtype)
+    top = 0
+    for part in stored:
+        joined[top : top + part.shape[0]] = part.read()
+        top += part.shape[0]
+    return joined
 
 
 def _group(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, Any]:
@@ -168,12 +224,36 @@ def _group(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, Any]:
     return group
 
 
-def _radiance_arrays(prefix: str, light: Radiance) -> dict[str, np.ndarray]:
-    return {
-        f"{prefix}value": light.value,
-        f"{prefix}variance": light.variance,
-        f"{prefix}valid": light.valid,
-    }
+def _write_radiance(store: BlockStore, prefix: str, light: RadiancePicture) -> None:
+    for name in ("value", "variance", "valid"):
+        itemsize = 1 if name == "valid" else 4
+
+        def read(rows: slice, name: str = name) -> np.ndarray:
+            return light.part(name, rows)
+
+        nbytes = itemsize * math.prod(light.shape)
+        _write_parts(store, f"{prefix}{name}", light.shape[0], nbytes, read)
+
+
+def _read_radiance(store: BlockStore, prefix: str) -> RadiancePicture:
+    """A picture of a store; a large one in a temporary file."""
+    parts = _parts(name for name in store.extras if name.startswith(PREFIX + prefix))
+    names = [f"{prefix}{name}" for name in ("value", "variance", "valid")]
+    if all(len(parts[name]) == 1 for name in names):
+        return Radiance(*(np.array(store.extra(parts[name][0])) for name in names))
+    file = ImageFile()
+    pictures = []
+    for name in names:
+        shapes = []
+        stored = []
+        for part in parts[name]:
+            rows = store.extra(part)
+            stored.append(file.append(rows))
+            shapes.append(rows.shape)
+        height = sum(shape[0] for shape in shapes)
+        pictures.append(replace(stored[0], shape=(height, *shapes[0][1:])))
+    values, variances, validity = pictures
+    return StoredRadiance(values=values, variances=variances, validity=validity)
 
 
 def _resampling_arrays(resampling: Resampling) -> dict[str, np.ndarray]:
@@ -248,8 +328,8 @@ class Setup:
         """Light under a black projector, (h, w[, 3]) in the units of T; 0 where it is unknown."""
         resampling = self.calibration.resampling
         light = self.calibration.ambient
-        weight = resampling.apply(light.valid.astype(np.float32))
-        value = resampling.apply(light.value * light.valid)
+        weight = on_projector(light, "valid", resampling)
+        value = on_projector(light, "value", resampling)
         mean = value / np.maximum(weight, MIN_VALID_SHARE)
         return self._block_means(np.where(weight >= MIN_VALID_SHARE, mean, 0.0))
 

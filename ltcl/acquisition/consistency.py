@@ -26,6 +26,7 @@ from ltcl.acquisition import agreement, anchor
 from ltcl.acquisition.agreement import ADVICE, CameraModel
 from ltcl.acquisition.geometry import Correspondence, Resampling, decode
 from ltcl.acquisition.geometry.photographs import PhotographFile
+from ltcl.acquisition.radiance import RadiancePicture, on_projector, strips
 from ltcl.acquisition.radiometry import Radiance
 from ltcl.acquisition.radiometry.exposures import NO_LIGHT
 from ltcl.acquisition.rig import Shots
@@ -95,16 +96,19 @@ def check_black(session: CaptureSession, photographs: Sequence[Photograph]) -> N
 
 
 def check_light(
-    exposures: Sequence[float], white: Radiance, resampling: Resampling, camera: CameraModel
+    exposures: Sequence[float], white: RadiancePicture, resampling: Resampling, camera: CameraModel
 ) -> None:
     """Refuse a projector without light; exposures that saturate lit pixels, or show noise alone."""
-    noise_of_sum = math.sqrt(white.variance[white.valid].sum())
-    if white.value.sum() <= MIN_SIGMAS * noise_of_sum:
+    total = 0.0
+    variance = 0.0
+    for strip in strips(white):
+        total += float(strip.value.sum(dtype=np.float64))
+        variance += float(strip.variance[strip.valid].sum(dtype=np.float64))
+    if total <= MIN_SIGMAS * math.sqrt(variance):
         raise AcquisitionError(
             f"photographs are no brighter under white than under black; {NO_LIGHT}"
         )
-    valid_light = np.where(white.valid, white.value, 0.0)
-    light = resampling.apply(valid_light)[resampling.seen]
+    light = on_projector(white, "value", resampling)[resampling.seen]
     is_lit = light > 0
     level = float(np.median(light[is_lit])) if is_lit.any() else 0.0
     shortest = exposures[0]
@@ -287,14 +291,14 @@ def check_map(
     resampling: Resampling,
     stripes: Sequence[Photograph],
     light: PhotographFile,
-    blocks: np.ndarray,
-    white: np.ndarray,
+    blocks: RadiancePicture,
+    white: RadiancePicture,
 ) -> None:
     """Refuse Gray code in which a pattern was exchanged with its inverse.
 
-    Its map is mirrored in part. The picture of blocks (H, W[, c]) tells: it is more like their
-    pattern in the map that exchanging them back gives. `light` is linear, of the stripes; `white`
-    is a picture too, and both are without ambient light.
+    Its map is mirrored in part. The picture of blocks tells: it is more like their pattern in the
+    map that exchanging them back gives. `light` is linear, of the stripes; blocks and white are
+    without ambient light.
     """
     likeness = _block_correlation(resampling, blocks, white)
     if likeness > MIN_MAP_CORRELATION:
@@ -313,11 +317,13 @@ def check_map(
                 )
 
 
-def _block_correlation(resampling: Resampling, blocks: np.ndarray, white: np.ndarray) -> float:
+def _block_correlation(
+    resampling: Resampling, blocks: RadiancePicture, white: RadiancePicture
+) -> float:
     """Correlation of a picture of blocks, relative to white, with their pattern."""
     codes = anchor.pattern(resampling.grid).ravel()
-    lit = resampling.apply(blocks).reshape(len(codes), -1).sum(axis=1)
-    full = resampling.apply(white).reshape(len(codes), -1).sum(axis=1)
+    lit = on_projector(blocks, "value", resampling).reshape(len(codes), -1).sum(axis=1)
+    full = on_projector(white, "value", resampling).reshape(len(codes), -1).sum(axis=1)
     seen = resampling.seen.ravel() & (full > 0)
     # Without any pixels, or if all are alike, the correlation is NaN.
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -13,14 +13,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import reduce
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from ltcl.acquisition.agreement import sample
 from ltcl.acquisition.rig import Shots, nearest
-from ltcl.acquisition.session import CaptureSession
+from ltcl.acquisition.scratch import row_strips
+from ltcl.acquisition.session import CaptureSession, Photograph
 from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
@@ -43,6 +46,8 @@ MIN_WHITE_CODE = 0.3
 MAX_WHITE_CODE = 0.95
 # Quantile of the pixels that is to be bright.
 BRIGHT_QUANTILE = 0.999
+# Quantile of the pixels under black that ambient light must leave dark.
+DARK_QUANTILE = 0.99
 # Share of hot pixels above which the exposure is too long instead.
 MAX_HOT_SHARE = 0.1
 # Longer exposures are no brighter if codes rise by less than this power of the seconds, although
@@ -105,10 +110,14 @@ def expected_exposures(shots: Shots, lit: float, ambient: float) -> tuple[float,
     return scan_exposures(shots, white, min(MAX_EXPOSURE_RATIO * white, limit))
 
 
-def hot_pixels(black: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) at the last code in a photograph (H, W[, 3]) that should be dark."""
-    brightest = black.max(axis=-1) if black.ndim == 3 else black
-    hot = brightest >= SATURATED_CODE
+def hot_pixels(black: Sequence[Photograph]) -> np.ndarray:
+    """Pixels (H, W) at the last code in all of some photographs that should be dark."""
+    shape = black[0].stored.shape
+    hot = np.empty(shape[:2], bool)
+    for rows in row_strips(shape):
+        dark = reduce(np.minimum, (photograph.read(rows) for photograph in black))
+        brightest = dark.max(axis=-1) if dark.ndim == 3 else dark
+        hot[rows] = brightest >= SATURATED_CODE
     if hot.mean() > MAX_HOT_SHARE:
         return np.zeros_like(hot)
     return hot
@@ -132,10 +141,52 @@ def fill_hot_pixels(image: np.ndarray, hot: np.ndarray) -> np.ndarray:
     return filled
 
 
-def brightness(image: np.ndarray, hot: np.ndarray) -> float:
-    """The code that all but a thousandth of the pixels of a photograph do not exceed."""
-    filled = fill_hot_pixels(image, hot)
-    return float(np.quantile(filled, BRIGHT_QUANTILE, method="higher"))
+def brightness(session: CaptureSession, photograph: Photograph, hot: np.ndarray) -> float:
+    """The light that all but a thousandth of the pixels of a photograph do not exceed."""
+    strips = _light_without_hot_pixels(session, photograph, hot)
+    count = math.prod(photograph.stored.shape)
+    return upper_quantile(strips, count, BRIGHT_QUANTILE, "higher")
+
+
+def _light_without_hot_pixels(
+    session: CaptureSession, photograph: Photograph, hot: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Linear values (n, c) of a photograph strip by strip, hot pixels filled."""
+    read = session.linear(photograph)
+    shape = photograph.stored.shape
+    channels = math.prod(shape[2:])
+    has_hot = hot.any()
+    previous = np.empty((0, channels), np.float32)
+    for rows in row_strips(shape):
+        light = read(rows).reshape(-1, channels)
+        if has_hot:
+            # The last pixel of the strip before may be the donor of the first ones.
+            is_hot = np.append(np.zeros(len(previous), bool), hot[rows])
+            light = fill_hot_pixels(np.concatenate([previous, light]), is_hot)[len(previous) :]
+            previous = light[-1:].copy()
+        yield light
+
+
+def upper_quantile(
+    strips: Iterable[np.ndarray], count: int, quantile: float, method: Any = "linear"
+) -> float:
+    """A quantile near 1 of `count` float32 values, which come in strips.
+
+    >>> upper_quantile([np.float32([5, 1]), np.float32([4, 3, 2])], 5, 0.75)
+    4.0
+    """
+    place = (count - 1) * quantile
+    kept = count - math.floor(place)
+    largest = np.empty(0, np.float32)
+    for strip in strips:
+        values = strip.ravel()
+        if len(largest) == kept:
+            values = values[values > largest.min()]
+        largest = np.concatenate([largest, values])
+        if len(largest) > kept:
+            largest = np.partition(largest, len(largest) - kept)[len(largest) - kept :]
+    ends = np.sort(np.partition(largest, min(1, kept - 1))[:2])
+    return float(np.quantile(ends, place - math.floor(place), method=method))
 
 
 def find_white_exposure(session: CaptureSession) -> float:
@@ -146,18 +197,18 @@ def find_white_exposure(session: CaptureSession) -> float:
     seconds = nearest(shots.exposures, FIRST_EXPOSURE)
     previous_level = 0.0
     for _ in range(MAX_PROBES):
-        image = session.photograph(white, seconds)
-        level = brightness(image, hot)
+        photograph = session.photograph(white, seconds)
+        level = brightness(session, photograph, hot)
         if level > MAX_WHITE_CODE:
-            hot = hot_pixels(session.photograph(np.zeros_like(white), seconds))
-            level = brightness(image, hot)
+            hot = hot_pixels([session.photograph(np.zeros_like(white), seconds)])
+            level = brightness(session, photograph, hot)
         if MIN_WHITE_CODE <= level <= MAX_WHITE_CODE:
             break
         if level == previous_level:
             _check_bits(shots, level)
         following = nearest(shots.exposures, seconds * _exposure_factor(level))
         if following == seconds:
-            _check_not_saturated(image, seconds)
+            _check_not_saturated(photograph)
             break
         seconds = following
         previous_level = level
@@ -217,9 +268,11 @@ def _full_scale_error(shots: Shots, plane: np.ndarray, level: float) -> str:
     )
 
 
-def _check_not_saturated(image: np.ndarray, seconds: float) -> None:
+def _check_not_saturated(photograph: Photograph) -> None:
     """Refuse white that saturates every pixel at the shortest exposure."""
-    if image.min() >= SATURATED_CODE:
+    strips = row_strips(photograph.stored.shape)
+    if min(photograph.read(rows).min() for rows in strips) >= SATURATED_CODE:
+        seconds = photograph.seconds
         raise AcquisitionError(
             f"every pixel is saturated under white at the shortest exposure, {seconds:g} s; "
             "the camera must get less light: a smaller aperture, a darker projector or room"
@@ -232,8 +285,9 @@ def longest_exposure(session: CaptureSession, white: float) -> float:
     black = np.zeros(shots.grid, np.float32)
     seconds = nearest(shots.exposures, MAX_EXPOSURE_RATIO * white)
     while seconds > white:
-        light = fill_hot_pixels(session.photograph(black, seconds), session.hot)
-        level = float(np.quantile(light, 0.99))
+        photograph = session.photograph(black, seconds)
+        strips = _light_without_hot_pixels(session, photograph, session.hot)
+        level = upper_quantile(strips, math.prod(photograph.stored.shape), DARK_QUANTILE)
         if level < 1.5 * AMBIENT_LEVEL:
             return seconds
         if level < MAX_WHITE_CODE:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import math
 import os
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
@@ -213,6 +214,7 @@ class Project:
             shots = Shots(rig)
             with self.naming("acquire"):
                 settings = ScanSettings(**self.settings).for_rig(shots)
+            camera_grid = known_camera_grid(rig)
             noise = _expected_noise(rig)
             light = _expected_light(rig)
             exposures = settings.exposures
@@ -224,6 +226,10 @@ class Project:
             noise = calibration.noise
             light = measured(calibration)
             exposures = calibration.exposures
+            camera_grid = calibration.resampling.camera_grid
+        megapixels = None
+        if camera_grid is not None:
+            megapixels = math.prod(camera_grid) / 1e6
         photographs = expected_photographs(
             shots.grid,
             shots.channels,
@@ -241,6 +247,7 @@ class Project:
             "block": settings.block,
             "order": settings.order,
             "threshold": settings.threshold,
+            "megapixels": megapixels,
         }
         return settings, facts
 
@@ -262,6 +269,13 @@ def _known_response(curve: Any) -> Response:
     checks.one_of("response", curve, CURVES)
     _, decode = CURVES[curve]
     return Response(decode(np.linspace(0.0, 1.0, RESPONSE_CODES)))
+
+
+def known_camera_grid(rig: Any) -> tuple[int, int] | None:
+    """(H, W) of the photographs of a rig, if it tells, or if a folder has one; else None."""
+    if isinstance(rig, rigs.FolderRig):
+        return rig.photographed_grid()
+    return getattr(rig, "camera_grid", None)
 
 
 def _expected_noise(rig: Any) -> NoiseModel:

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from ltcl import checks
+from ltcl.acquisition.scratch import row_strips
 from ltcl.errors import AcquisitionError, InputError, InputTypeError, LtclError
 
 # Seconds that a rig without `exposures` must be able to expose for.
@@ -203,7 +204,14 @@ class Shots(Closing):
         AcquisitionError
             The rig fails, or the image cannot be used.
         """
+        self.expose(codes, seconds, stored)
+        return scale_codes(self.image, self.rig)
+
+    def expose(self, codes: Any, seconds: float, stored: Any = None) -> None:
+        """Take one photograph as `photograph` does, which leaves it in `image`, not scaled."""
         codes, seconds = as_shot(self, codes, seconds)
+        # Two photographs need not be in memory at once.
+        self.image = np.zeros((0, 0))
         if stored is None:
             self.image = self._expose(codes, seconds)
         else:
@@ -213,13 +221,12 @@ class Shots(Closing):
             self.image = np.asarray(stored)
         name = self.name(getattr(self.rig, "number", self.count + 1))
         try:
-            scaled = to_unit(name, self.image, self.rig, self._format)
+            check_photograph(name, self.image, self.rig, self._format)
         except InputError as error:
             raise RigError(*error.args) from None
         self._record_format(name)
         self.count += 1
-        self._record_digest(codes, seconds, scaled)
-        return scaled
+        self._record_digest(codes, seconds)
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON for records: the rig's own description, grids, and the photographs so far."""
@@ -269,16 +276,24 @@ class Shots(Closing):
                 f"it must have {expected}, as the scan was begun with, or another store"
             )
 
-    def _record_digest(self, codes: np.ndarray, seconds: float, scaled: np.ndarray) -> None:
+    def _record_digest(self, codes: np.ndarray, seconds: float) -> None:
         """Keep means over cells of the first photograph of black, and of the first of white."""
         for view, code in (("black", 0.0), ("white", 1.0)):
             if view in self.digest or not np.all(codes == code):
                 continue
-            height, width = scaled.shape[:2]
-            size = min(DIGEST_SIDE, width), min(DIGEST_SIDE, height)
-            cells = cv2.resize(scaled, size, interpolation=cv2.INTER_AREA)
-            rounded = cells.astype(float).round(5).tolist()
+            rounded = self._cells().astype(float).round(5).tolist()
             self.digest[view] = {"seconds": seconds, "cells": rounded}
+
+    def _cells(self) -> np.ndarray:
+        """Means of the last photograph over cells, (8, 8[, 3]); one channel after the other."""
+        height, width = self.image.shape[:2]
+        size = min(DIGEST_SIDE, width), min(DIGEST_SIDE, height)
+        channels = []
+        for plane in np.moveaxis(np.atleast_3d(self.image), 2, 0):
+            scaled = scale_codes(np.ascontiguousarray(plane), self.rig)
+            channels.append(cv2.resize(scaled, size, interpolation=cv2.INTER_AREA))
+        cells = np.stack(channels, axis=-1)
+        return cells if self.image.ndim == 3 else cells[..., 0]
 
 
 def nearest(exposures: Iterable[float] | None, seconds: float) -> float:
@@ -348,23 +363,39 @@ def to_unit(
     `expected` is the shape and type of earlier photographs. AcquisitionError, which begins with
     `name`, for an image that cannot be used.
     """
+    check_photograph(name, image, camera, expected)
+    return scale_codes(image, camera)
+
+
+def check_photograph(
+    name: str, image: np.ndarray, camera: Any, expected: ImageFormat | None = None
+) -> None:
+    """Refuse a photograph that `to_unit` cannot scale."""
     _check_image(name, image, camera.channels)
-    white_level = _white_level(image.dtype, camera)
+    _white_level(image.dtype, camera)
     if expected is not None and expected != (image.shape, image.dtype):
         shape, dtype = expected
         raise AcquisitionError(f"{name} is {image.dtype} {image.shape}; it must be {dtype} {shape}")
     if image.dtype.kind == "f":
-        image = _finite_image(name, image)
+        _check_finite(name, image)
+        return
+    largest = largest_code(image.dtype, camera)
+    if image.max() > largest:
+        raise AcquisitionError(
+            f"{name} reaches {image.max()}; by rig.bits the largest code is {largest}"
+        )
+
+
+def scale_codes(image: np.ndarray, camera: Any) -> np.ndarray:
+    """Codes of a checked photograph, or of a part of it, over full scale, float32."""
+    white_level = _white_level(image.dtype, camera)
+    if image.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            image = image.astype(np.float32, copy=False)
         if white_level is None:
             return image
-    else:
-        largest = _largest_code(image.dtype, camera)
-        if image.max() > largest:
-            raise AcquisitionError(
-                f"{name} reaches {image.max()}; by rig.bits the largest code is {largest}"
-            )
-        if white_level is None:
-            white_level = largest
+    elif white_level is None:
+        white_level = largest_code(image.dtype, camera)
     if white_level < image.max():
         image = np.minimum(image, image.dtype.type(white_level))
     return image * np.float32(1.0 / white_level)
@@ -384,14 +415,15 @@ def _check_image(name: str, image: np.ndarray, channels: int) -> None:
         raise AcquisitionError(f"{name} has shape {shape}; it must be {expected}, not empty")
 
 
-def _finite_image(name: str, image: np.ndarray) -> np.ndarray:
-    """An image of floats as float32; AcquisitionError for values that are not finite."""
-    with np.errstate(over="ignore"):
-        scaled = image.astype(np.float32, copy=False)
-    bad = int(np.count_nonzero(~np.isfinite(scaled)))
+def _check_finite(name: str, image: np.ndarray) -> None:
+    """Refuse an image of floats with values that are not finite as float32."""
+    bad = 0
+    for rows in row_strips(image.shape):
+        with np.errstate(over="ignore"):
+            strip = image[rows].astype(np.float32, copy=False)
+        bad += int(np.count_nonzero(~np.isfinite(strip)))
     if bad:
         raise AcquisitionError(f"{name} has {bad} NaN or infinite value(s); all must be finite")
-    return scaled
 
 
 def _code_levels(dtype: np.dtype, camera: Any) -> int | None:
@@ -401,10 +433,10 @@ def _code_levels(dtype: np.dtype, camera: Any) -> int | None:
     white_level = _white_level(dtype, camera)
     if white_level is not None:
         return int(white_level) + 1
-    return _largest_code(dtype, camera) + 1
+    return largest_code(dtype, camera) + 1
 
 
-def _largest_code(dtype: np.dtype, camera: Any) -> int:
+def largest_code(dtype: np.dtype, camera: Any) -> int:
     """The largest code that photographs of integers can have."""
     if dtype == np.uint8:
         return 255
@@ -421,7 +453,7 @@ def _white_level(dtype: np.dtype, camera: Any) -> float | None:
         return None
     if dtype.kind == "f":
         return checks.number("rig.white_level", level, above=0.0)
-    return checks.count("rig.white_level", level, most=_largest_code(dtype, camera))
+    return checks.count("rig.white_level", level, most=largest_code(dtype, camera))
 
 
 def require_members(name: str, value: Any, *members: str) -> None:

@@ -6,14 +6,19 @@ A calibration takes about 150 photographs, of which 45 megapixels in colour are 
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import threading
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+# Values of a strip of rows.
+STRIP_VALUES = 1 << 20
 
 
 class ImageFile:
@@ -35,13 +40,27 @@ class ImageFile:
         self._file: Any = tempfile.TemporaryFile(dir=folder, prefix="ltcl-")  # noqa: SIM115
         weakref.finalize(self, self._file.close)
         self._lock = threading.Lock()
+        self._end = 0
 
     def append(self, image: np.ndarray) -> StoredImage:
         """Write a picture (H, W[, c]) to the end of the file."""
+        stored = self.reserve(image.shape, image.dtype)
+        stored.write(0, image)
+        return stored
+
+    def reserve(self, shape: tuple[int, ...], dtype: Any) -> StoredImage:
+        """Room for a picture at the end of the file, to be written row by row."""
+        dtype = np.dtype(dtype)
         with self._lock:
-            offset = self._file.seek(0, os.SEEK_END)
-            self._file.write(np.ascontiguousarray(image).data.cast("B"))
-        return StoredImage(file=self, offset=offset, shape=image.shape, dtype=image.dtype)
+            offset = self._end
+            self._end += math.prod(shape) * dtype.itemsize
+        return StoredImage(file=self, offset=offset, shape=shape, dtype=dtype)
+
+    def write(self, array: np.ndarray, offset: int) -> None:
+        """Write an array from `offset` on."""
+        with self._lock:
+            self._file.seek(offset)
+            self._file.write(np.ascontiguousarray(array).data.cast("B"))
 
     def read_into(self, array: np.ndarray, offset: int) -> None:
         """Fill a contiguous array with the bytes from `offset` on."""
@@ -72,3 +91,33 @@ class StoredImage:
         for row, number in zip(array, numbers, strict=True):
             self.file.read_into(row, self.offset + number * row_bytes)
         return array
+
+    def write(self, top: int, rows: np.ndarray) -> None:
+        """Write rows of the picture, from the row `top` on."""
+        row_values = math.prod(self.shape[1:])
+        offset = self.offset + top * row_values * self.dtype.itemsize
+        self.file.write(np.asarray(rows, self.dtype), offset)
+
+    def at(self, pixels: np.ndarray) -> np.ndarray:
+        """Values at pixels, numbered row by row in ascending order: (n, c)."""
+        channels = math.prod(self.shape[2:])
+        width = self.shape[1]
+        values = np.empty((len(pixels), channels), self.dtype)
+        for rows in row_strips(self.shape):
+            first, last = np.searchsorted(pixels, [rows.start * width, rows.stop * width])
+            if first < last:
+                strip = self.read(rows).reshape(-1, channels)
+                values[first:last] = strip[pixels[first:last] - rows.start * width]
+        return values
+
+
+def row_strips(shape: tuple[int, ...], values: int = STRIP_VALUES) -> Iterator[slice]:
+    """Strips of rows of about so many values, of a picture of this shape.
+
+    >>> list(row_strips((5, 2), 4))
+    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
+    height = shape[0]
+    step = max(values // max(math.prod(shape[1:]), 1), 1)
+    for top in range(0, height, step):
+        yield slice(top, min(top + step, height))

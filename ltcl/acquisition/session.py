@@ -20,11 +20,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from ltcl.acquisition.agreement import AgreementRecord, CameraModel
+from ltcl.acquisition.agreement import AgreementRecord, CameraModel, sample
+from ltcl.acquisition.radiance import StoredRadiance
 from ltcl.acquisition.radiometry import Radiance, Response, merge
-from ltcl.acquisition.rig import RigError, Shots, shot_key, to_unit
+from ltcl.acquisition.radiometry.exposures import exposure_stack
+from ltcl.acquisition.radiometry.merge import Merger
+from ltcl.acquisition.radiometry.noise import choose_levels
+from ltcl.acquisition.radiometry.strips import in_strips
+from ltcl.acquisition.rig import RigError, Shots, largest_code, scale_codes, shot_key
 from ltcl.acquisition.scratch import ImageFile, StoredImage
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
 from ltcl.files import locked, sweep
@@ -40,7 +46,7 @@ SHOT_PREFIX = "shot_"
 # Pixels of a photograph that determine what is common to all, such as noise.
 MAX_SAMPLED_PIXELS = 1 << 13
 # Values of all photographs that are merged at once.
-MERGED_VALUES = 1 << 20
+MERGED_VALUES = 1 << 19
 
 # Codes (h, w[, 3]) and seconds.
 Request = tuple[np.ndarray, float]
@@ -61,10 +67,22 @@ class Photograph:
     seconds: float
     number: int
 
+    @classmethod
+    def of(cls, shots: Shots, seconds: float, file: ImageFile) -> Photograph:
+        """The last photograph of a rig, which is appended to a file."""
+        stored = file.append(shots.image)
+        return cls(stored=stored, rig=shots.rig, seconds=seconds, number=shots.number)
+
     @property
     def image(self) -> np.ndarray:
         """(H, W[, 3]) in [0, 1] of full scale."""
         return self.read(slice(None))
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(H, W)."""
+        height, width = self.stored.shape[:2]
+        return height, width
 
     @property
     def step(self) -> int:
@@ -79,7 +97,87 @@ class Photograph:
 
     def read(self, rows: slice) -> np.ndarray:
         """Some rows of the image."""
-        return to_unit(f"photograph {self.number}", self.stored.read(rows), self.rig)
+        return scale_codes(self.stored.read(rows), self.rig)
+
+    def at(self, pixels: np.ndarray) -> np.ndarray:
+        """The image at pixels, numbered row by row in ascending order: (n, c)."""
+        return scale_codes(self.stored.at(pixels), self.rig)
+
+    def linear(self, response: Response) -> Callable[[slice], np.ndarray]:
+        """Function that reads some rows in linear values, by a table if codes are integers."""
+        dtype = self.stored.dtype
+        if dtype.kind == "f":
+            return lambda rows: response.linear(self.read(rows))
+        codes = np.arange(largest_code(dtype, self.rig) + 1).astype(dtype)
+        unit = scale_codes(codes, self.rig)
+        tables = [Response(table).linear(unit) for table in response.values]
+        return lambda rows: _look_up(tables, self.stored.read(rows))
+
+
+def _look_up(tables: list[np.ndarray], codes: np.ndarray) -> np.ndarray:
+    """Values of integer codes (..., [3]) by a table, or one for each channel."""
+    if len(tables) == 1:
+        return _take(tables[0], codes)
+    planes = [_take(table, codes[..., c]) for c, table in enumerate(tables)]
+    return np.stack(planes, axis=-1)
+
+
+def _take(table: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    if codes.dtype == np.uint8 and len(table) == 256:
+        return cv2.LUT(np.ascontiguousarray(codes), table).reshape(codes.shape)
+    return table.take(codes)
+
+
+def merge_photographs(
+    photographs: Sequence[Photograph], camera: CameraModel, levels: int | None, file: ImageFile
+) -> StoredRadiance:
+    """Photographs of one pattern as radiance in a file, strip by strip of rows.
+
+    Their order by seconds is checked at the pixels of `Photograph.sampled`. AcquisitionError if
+    they determine no radiance.
+    """
+    with _about(photographs):
+        stack = exposure_stack(
+            [photograph.sampled for photograph in photographs],
+            [photograph.seconds for photograph in photographs],
+            choose_levels(levels, camera.noise),
+        )
+        shape = photographs[0].stored.shape
+        channels = math.prod(shape[2:])
+        merger = Merger(
+            stack.seconds,
+            camera.response,
+            camera.noise,
+            levels=stack.levels,
+            black=camera.offset,
+            channels=channels,
+        )
+    ascending = sorted(photographs, key=lambda photograph: photograph.seconds)
+    readers = [photograph.linear(camera.response) for photograph in ascending]
+    merged = StoredRadiance.reserve(file, shape)
+
+    def merge_rows(rows: slice) -> None:
+        light = np.stack([read(rows) for read in readers]).reshape(len(readers), -1, channels)
+        parts = []
+        for c in range(channels):
+            parts.append(merger.merge(light[..., c], c))
+        value, variance, valid = (np.stack(part, axis=-1) for part in zip(*parts, strict=True))
+        strip_shape = (rows.stop - rows.start, *shape[1:])
+        strip = Radiance(
+            value.reshape(strip_shape), variance.reshape(strip_shape), valid.reshape(strip_shape)
+        )
+        merged.write(rows.start, strip)
+
+    in_strips(shape[0], MERGED_VALUES // (len(readers) * math.prod(shape[1:])), merge_rows)
+    return merged
+
+
+@contextlib.contextmanager
+def _about(photographs: Sequence[Photograph]) -> Iterator[None]:
+    """Name photographs in an AcquisitionError that the block raises as an InputError."""
+    numbers = [photograph.number for photograph in photographs]
+    with acquisition_error(f"photographs {min(numbers)} to {max(numbers)}"):
+        yield
 
 
 class CaptureSession:
@@ -130,51 +228,31 @@ class CaptureSession:
         remaining = iter(photographs)
         return [[next(remaining) for _ in group] for group in groups]
 
-    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        """The image of one request: codes, or light as soon as the response is known."""
+    def photograph(self, codes: np.ndarray, seconds: float) -> Photograph:
+        """The photograph of one request."""
         [[photograph]] = self.take([[(codes, seconds)]])
-        return self.linear(photograph)
+        return photograph
 
-    def linear(self, photograph: Photograph) -> np.ndarray:
-        """Linear values of a photograph, as far as the response is known."""
-        return self.camera.response.linear(photograph.image)
+    def linear(self, photograph: Photograph) -> Callable[[slice], np.ndarray]:
+        """Function that reads some rows in linear values, as far as the response is known."""
+        return photograph.linear(self.camera.response)
 
     def name(self, photograph: Photograph) -> str:
         """Name of a photograph in messages."""
         return self.shots.name(photograph.number)
 
-    def merge(self, photographs: Sequence[Photograph]) -> Radiance:
+    def merge(self, photographs: Sequence[Photograph]) -> StoredRadiance:
         """Photographs of one pattern as radiance, ambient light included.
 
         AcquisitionError if they determine none.
         """
-        shape = photographs[0].stored.shape
-        merged = Radiance(
-            value=np.empty(shape, np.float32),
-            variance=np.empty(shape, np.float32),
-            valid=np.empty(shape, bool),
-        )
-        step = max(MERGED_VALUES // (len(photographs) * math.prod(shape[1:])), 1)
-        for top in range(0, shape[0], step):
-            rows = slice(top, min(top + step, shape[0]))
-            images = [photograph.read(rows) for photograph in photographs]
-            strip = self._merge(images, photographs)
-            merged.value[rows] = strip.value
-            merged.variance[rows] = strip.variance
-            merged.valid[rows] = strip.valid
-        return merged
+        return merge_photographs(photographs, self.camera, self.shots.levels, self.file)
 
     def merge_sampled(self, photographs: Sequence[Photograph]) -> Radiance:
         """The radiance at the pixels of `Photograph.sampled`."""
-        images = [photograph.sampled for photograph in photographs]
-        return self._merge(images, photographs)
-
-    def _merge(self, images: list[np.ndarray], photographs: Sequence[Photograph]) -> Radiance:
-        """Images, which are parts of photographs, as radiance."""
-        numbers = [photograph.number for photograph in photographs]
-        with acquisition_error(f"photographs {min(numbers)} to {max(numbers)}"):
+        with _about(photographs):
             return merge(
-                images,
+                [photograph.sampled for photograph in photographs],
                 [photograph.seconds for photograph in photographs],
                 self.camera.response,
                 self.camera.noise,
@@ -200,16 +278,14 @@ class CaptureSession:
         """Take one photograph, or read it from the log."""
         codes, seconds = request
         stored = self._stored_image(name)
-        image = self.shots.photograph(codes, seconds, stored)
+        self.shots.expose(codes, seconds, stored)
         if self._log is not None and stored is None:
             self._log.put(name, image=self.shots.image)
-        photograph = Photograph(
-            stored=self.file.append(self.shots.image),
-            rig=self.shots.rig,
-            seconds=seconds,
-            number=self.shots.number,
-        )
-        self.record.add(codes, seconds, image, photograph.number)
+        photograph = Photograph.of(self.shots, seconds, self.file)
+        pixels = scale_codes(sample(self.shots.image), self.shots.rig)
+        self.record.add_sample(codes, seconds, pixels, photograph.number)
+        # It is in the file now.
+        self.shots.image = np.zeros((0, 0))
         if codes.min() == codes.max():
             self._uniform[name] = photograph
         self._progress(self.shots.count)

@@ -71,12 +71,14 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
     are guessed. No camera is opened.
     """
     from ltcl.acquisition import Project
+    from ltcl.acquisition.scanning.pace import seconds_per_megapixel
     from ltcl.acquisition.scanning.plan import choose, plans
 
     project = Project.open(folder)
     settings, facts = project.outlook()
     with project.naming("acquire"):
-        strategies = plans(**facts, overhead=overhead)
+        pace = seconds_per_megapixel(facts["channels"])
+        strategies = plans(**facts, overhead=overhead, pace=pace)
     best, why = choose(strategies)
     report = PlanReport(
         folder=folder,
@@ -89,6 +91,8 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
         noise=facts["noise"],
         light=facts["light"],
         channels=facts["channels"],
+        megapixels=facts["megapixels"],
+        pace=pace,
         plans={},
     )
     for name, strategy in strategies.items():
@@ -120,8 +124,24 @@ def _plan_lines(report: PlanReport, calibration_photographs: int) -> list[str]:
         table(PLAN_COLUMNS, rows),
         f"\nphotographs: all, with {calibration_photographs} of the calibration; "
         "error of T p: by noise, relative",
+        _computing_line(report),
         advice,
     ]
+
+
+def _computing_line(report: PlanReport) -> str:
+    """How long the computer works besides, by the pace that was measured."""
+    if report.megapixels is None:
+        return (
+            "time: exposures and overhead; computing adds about "
+            f"{report.pace:.2g} s for each photograph and megapixel of the camera"
+        )
+    strategy = report.auto if report.asked_for == "auto" else report.asked_for
+    seconds = report.plans[strategy].computing or 0.0
+    return (
+        f"time: exposures and overhead; computing adds about {max(seconds / 60, 0.1):.1f} minutes "
+        f"for {strategy}, with {report.megapixels:.3g} megapixels"
+    )
 
 
 @app.command()

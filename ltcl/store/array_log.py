@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -19,6 +18,8 @@ from ltcl.store.guards import about
 
 ENTRY_FILE = re.compile(r"([A-Za-z][A-Za-z0-9_.-]{0,120})\.npz")
 CHECKSUM_CHARACTERS = 64
+# Bytes of a file that are in memory at once.
+PIECE_BYTES = 1 << 20
 
 
 @dataclass
@@ -45,18 +46,34 @@ class ArrayLog:
             )
         with replace_file(self.path / f"{name}.npz") as temporary:
             np.savez(temporary, **arrays)
-            content = temporary.read_bytes()
-            temporary.write_bytes(content + _checksum(content))
+            with open(temporary, "r+b") as file:
+                checksum = _checksum(file, os.path.getsize(temporary))
+                file.seek(0, os.SEEK_END)
+                file.write(checksum)
 
     def get(self, name: str) -> dict[str, np.ndarray]:
         """The arrays under a name; FileError where their checksum differs."""
         with about(self.path, reading=True):
-            raw = input_file(self.path / f"{name}.npz").read_bytes()
-            content = raw[:-CHECKSUM_CHARACTERS]
-            if _checksum(content) != raw[-CHECKSUM_CHARACTERS:]:
-                raise FileError(f"{name}.npz is damaged: its checksum differs")
-            return dict(np.load(io.BytesIO(content), allow_pickle=False))
+            path = input_file(self.path / f"{name}.npz")
+            with open(path, "rb") as file:
+                size = max(os.path.getsize(path) - CHECKSUM_CHARACTERS, 0)
+                checksum = _checksum(file, size)
+                if file.read() != checksum:
+                    raise FileError(f"{name}.npz is damaged: its checksum differs")
+                # The reader of archives looks for their end before other bytes, too.
+                file.seek(0)
+                with np.load(file, allow_pickle=False) as arrays:
+                    return dict(arrays)
 
 
-def _checksum(content: bytes) -> bytes:
-    return hashlib.sha256(content).hexdigest().encode()
+def _checksum(file: IO[bytes], size: int) -> bytes:
+    """SHA-256 of the first bytes of a file, which is then read up to there."""
+    digest = hashlib.sha256()
+    file.seek(0)
+    while size > 0:
+        piece = file.read(min(size, PIECE_BYTES))
+        if not piece:
+            break
+        digest.update(piece)
+        size -= len(piece)
+    return digest.hexdigest().encode()

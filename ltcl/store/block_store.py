@@ -15,6 +15,7 @@ import itertools
 import os
 import re
 import shutil
+from collections import ChainMap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -250,12 +251,12 @@ class BlockStore:
         memory: int,
     ) -> None:
         """Write the files of the final store."""
-        extras = {name: self.extra(name) for name in self.extras}
+        extras = _StoredExtras(self)
         layout = self.layout
         if compressed is not None:
             layout, content = compressed_content(compressed)
             state = {**self.attributes, **content.state}
-            content = FinalContent(extras={**extras, **content.extras}, state=state)
+            content = FinalContent(extras=ChainMap(dict(content.extras), extras), state=state)
         else:
             missing = self.missing()
             if missing:
@@ -409,6 +410,17 @@ def places_of_arrays(files: Any) -> dict[str, dict[str, str]]:
         arrays = places.setdefault(group.replace("extra/", EXTRA), {})
         arrays[BINSPARSE.get(array, array)] = place
     return places
+
+
+class _StoredExtras(dict[str, Any]):
+    """The extra arrays of a store, which are read one by one."""
+
+    def __init__(self, store: BlockStore) -> None:
+        super().__init__(dict.fromkeys(store.extras))
+        self._store = store
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._store.extra(name)
 
 
 def read(path: Path) -> StoreRecord | CompressedRecord:

@@ -90,11 +90,11 @@ def write_final(root: Path, layout: StoreLayout, provenance: Any, content: Final
             start, stop = layout.span(number)
             F[channel, start:stop] = _first_bounce(rows, start, content.sigmas)
 
-    extras = dict(content.extras)
-    if layout.kind == "blocks" and layout.is_square:
-        extras.setdefault("first_bounce", F)
-    for name, array in extras.items():
-        _write_group(root / "extra" / f"{name}.0", {"array": np.asarray(array)})
+    for name in content.extras:
+        _write_group(root / "extra" / f"{name}.0", {"array": np.asarray(content.extras[name])})
+    has_first_bounce = "first_bounce" in content.extras
+    if layout.kind == "blocks" and layout.is_square and not has_first_bounce:
+        _write_group(root / "extra" / "first_bounce.0", {"array": F})
 
     checksums = {}
     for group in groups:

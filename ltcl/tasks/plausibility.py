@@ -106,6 +106,12 @@ def bounce_limits(T: Transport) -> str:
             f"; the first bounces diag(T) and 1 / diag(T^-1) differ by {first}, {second} and "
             f"{third} % in bounces 1, 2 and 3 under white"
         )
+    if not np.isnan(T.resolution_spread).any():
+        first, second, third = (f"{100 * spread:.2g}" for spread in T.resolution_spread)
+        text += (
+            f"; light that is uneven within pixels makes about {first}, {second} and {third} %, as "
+            "pixels of twice the size do"
+        )
     return f"{text}; std is the effect of noise in T alone"
 
 

@@ -422,16 +422,30 @@ class Transport:
         """Share of light that one bounce takes away, for each channel; computed once."""
         return tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
 
-    @cached_property
+    @property
     def bounce_spread(self) -> tuple[float, ...]:
         """Relative difference of bounces 1 to 3 under white with diag(T) and 1 / diag(T^-1) as F.
 
         Values of the worst channel, NaN if no method solves with S; computed once.
         """
+        return tuple(self._bounce_spreads[0].tolist())
+
+    @property
+    def resolution_spread(self) -> tuple[float, ...]:
+        """Relative change of bounces 1 to 3 under white by pixels of twice the size.
+
+        About the error of bounces by light that is uneven within pixels. Values of the worst
+        channel, NaN if T has more than 8192 pixels or shows no entries; computed once.
+        """
+        return tuple(self._bounce_spreads[1].tolist())
+
+    @cached_property
+    def _bounce_spreads(self) -> np.ndarray:
+        """The spreads of the worst channel, (2, 3): by the choice of F, and by larger pixels."""
         spreads = []
         for T, F, S in zip(self.matrices, self._require_first_bounce(), self.systems, strict=True):
-            spreads.append(diagnostics.bounce_spread_of_system(T, F, S))
-        return tuple(np.max(spreads, axis=0).tolist())
+            spreads.append(diagnostics.bounce_spreads_of_system(T, F, S, self.grid))
+        return np.max(spreads, axis=0)
 
     @cached_property
     def ambient_share(self) -> float:

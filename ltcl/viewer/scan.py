@@ -20,6 +20,7 @@ from ltcl import checks
 from ltcl.acquisition import Calibration, Project, Setup
 from ltcl.acquisition.agreement import find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
+from ltcl.acquisition.radiance import valid_share
 from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.errors import LtclError
 from ltcl.store import BlockStore, load
@@ -181,7 +182,7 @@ class Scan(ViewerScene):
         calibration = self.agreement.calibration
         if calibration is not None:
             progress["coverage"] = float(np.mean(calibration.resampling.coverage > 0))
-            progress["saturated"] = 1.0 - float(np.mean(calibration.white.valid))
+            progress["saturated"] = 1.0 - valid_share(calibration.white)
         return progress
 
     def _read_new(self, files: list[ScanFile], rig: Any, store: BlockStore | None) -> None:

@@ -90,6 +90,7 @@ def test_few_photons_deviate_from_nothing() -> None:
         assert not message(images, times, camera=camera)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_hand", [False, True])
 @pytest.mark.parametrize(
     ("gain", "albedo"), [(500.0, 0.6), *product([1000.0, 3000.0], [0.6, (0.8, 0.6, 0.4)])]

@@ -45,6 +45,7 @@ def test_camera_and_projector() -> None:
     assert 0.1 < 0.02 * longest < 0.7
 
 
+@pytest.mark.slow
 def test_a_dark_room_around_the_picture_decides_no_exposure() -> None:
     """Three quarters of the camera's pixels show only noise, half of which is above 0."""
     grid = (6, 8)

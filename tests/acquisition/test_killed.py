@@ -45,6 +45,7 @@ def committed(path: Path) -> tuple[bool, bool, int]:
     return False, False, calibration_photographs(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "strategy",
     [

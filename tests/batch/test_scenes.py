@@ -81,6 +81,7 @@ def test_a_result_that_cannot_be_sent_is_the_error_of_its_scene(client):
     assert isinstance(error.value.results[1], InputTypeError)
 
 
+@pytest.mark.slow
 def test_an_error_that_is_none_of_ltcl_ends_all(where):
     with pytest.raises(ZeroDivisionError):
         ltcl.batch.map(lambda scene: 1 / scene, [1, 0, 1], client=where)

@@ -99,6 +99,9 @@ def test_plans_before_and_after_the_calibration(program, simulated, acquired):
         # Two photographs are taken again, one for each batch.
         photographs = pixel["patterns"] * exposures + 2 + pixel["calibration"]
         assert pixel["photographs"] == photographs
+        computing = pixel["photographs"] * report["megapixels"] * report["pace"]
+        assert pixel["computing"] == pytest.approx(computing)
+        assert report["megapixels"] == pytest.approx(pixel["grid"][0] * pixel["grid"][1] / 1e6)
     assert after["exposures"] == program("acquire", "report", acquired, "--json").json["exposures"]
 
 

@@ -188,6 +188,7 @@ def test_compression_prints_its_error(program, colour_transport, tmp_path):
         assert word in printed
 
 
+@pytest.mark.slow
 def test_compression_down_to_the_noise(program, colour_transport, tmp_path):
     arguments = ["--rtol", "noise", "--out", tmp_path / "N.npz", "--json"]
     report = program("compress", colour_transport, *arguments).json

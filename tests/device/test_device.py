@@ -125,12 +125,14 @@ with multiprocessing.get_context("fork").Pool(1) as pool:  # the error has to co
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_a_forked_process_is_refused_and_does_not_hang(device):
     run = [sys.executable, "-c", FORK, device.description.index]
     assert subprocess.run(run, timeout=120).returncode == 0
 
 
+@pytest.mark.slow
 def test_opening_a_device_leaves_the_environment_alone_and_reads_no_pickles(device):
     code = (
         "import os, ltcl; before = dict(os.environ); ltcl.open_device();"

@@ -36,6 +36,7 @@ formats = pytest.mark.parametrize(
 kernels = pytest.mark.parametrize("make", helpers.FORMATS.values(), ids=list(helpers.FORMATS))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({*gallery.SPARSE} - {"129x129"}))
 @kernels
 @pytest.mark.parametrize("launch", helpers.LAUNCHES)
@@ -47,6 +48,7 @@ def test_products_of_every_launch_meet_their_twin(device, monkeypatch, name, mak
     helpers.meets_twin(A, A.to_dense())
 
 
+@pytest.mark.slow
 @kernels
 @pytest.mark.parametrize("launch", helpers.LAUNCHES)
 def test_steps_of_every_launch_meet_their_twin(device, monkeypatch, make, launch):
@@ -135,6 +137,7 @@ def asked(monkeypatch, device):
     return calls
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", helpers.ROWS)
 def test_each_width_of_large_matrices_is_timed_once(device, asked, form):
     A = helpers.FORMATS[form](device, gallery.sparse(65, 53))
@@ -145,6 +148,7 @@ def test_each_width_of_large_matrices_is_timed_once(device, asked, form):
     helpers.meets_twin(A, A.to_dense())
 
 
+@pytest.mark.slow
 def test_kernels_of_different_tiles_are_timed_apart(device, asked):
     """The answer of one width or precision was that of all others."""
     kinds = list(itertools.product((1, 8), ("float32", "float16", "int8")))
@@ -160,6 +164,7 @@ def test_slabs_have_no_more_values_than_32_bits_count(device, monkeypatch):
     assert (stop - start) * (1 << 28) + 256 < 1 << 31
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", gallery.DENSE)
 @pytest.mark.parametrize(("strip", "strips"), [(1, 1), (1, 16), (256, 1)])
 def test_dense_transposes_meet_their_twin(device, monkeypatch, name, strip, strips):

@@ -120,6 +120,7 @@ def _fewest(places: list[int], width: int) -> int:
     return 1 + min(counts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize(("columns", "itemsize"), [(65536, 2), (65537, 4)])
 def test_column_indices_of_wide_matrices_are_long(device, monkeypatch, columns, itemsize, width):

@@ -46,6 +46,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_products_meet_their_twin(shaped, name):
     patches, blocks = SCENES[name]
@@ -124,6 +125,7 @@ def test_a_scene_gives_its_operators(device, block):
         assert np.linalg.norm(light - expected) < 0.01 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_launches_in_slabs_give_the_same(device, monkeypatch):
     patches = cut(WALLS, 3)
     A = FormFactor(patches, 0.5, device=device)

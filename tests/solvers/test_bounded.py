@@ -57,6 +57,7 @@ def errors(
     return np.linalg.norm(w * (A.astype(np.float64) @ x.astype(np.float64) - b), axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "k"), SHAPES)
 @pytest.mark.parametrize("group", [1, 100])
 def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):

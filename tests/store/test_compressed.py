@@ -77,6 +77,7 @@ TRANSPORTS: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TRANSPORTS)
 @pytest.mark.parametrize("extension", [".npz", ".zarr"])
 def test_the_same_transport_comes_back(

@@ -77,6 +77,7 @@ GREY_TRANSPORTS = [(SCENE.T, SCENE.F), (SCENE.T, "diagonal")]
 COLOUR_TRANSPORT = ([scene.T for scene in SCENES], "diagonal")
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(
     st.sampled_from([*GREY_TRANSPORTS, COLOUR_TRANSPORT]),

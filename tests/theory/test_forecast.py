@@ -110,6 +110,7 @@ def test_bounds_on_both_sides_of_one_leave_the_series_uncertified(device):
     assert theory.forecasts(S, rho, (0.5, 2.0), 1e-2)["jacobi"].certificate == "power iteration"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-2, 1e-4])
 @pytest.mark.parametrize("rho", [0.8, 4.0, 9.0])
 @pytest.mark.parametrize("method", ["cg", "gmres", "bicgstab"])

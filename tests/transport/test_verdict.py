@@ -206,6 +206,7 @@ def blocks(order: tuple[int, ...]) -> ltcl.Transport:
     return ltcl.Transport(rows, (12, 24))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("T", "words", "expected"),
     [
@@ -254,6 +255,7 @@ def test_colours_shapes_and_surfaces(T, words, expected):
     assert re.search(words, judged.text, re.IGNORECASE), judged.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "photons", "least"),
     [
@@ -308,6 +310,7 @@ def test_a_closed_bright_room_is_no_ambient_light(ambient, causes):
     assert set(judged.causes) - {"dark", "bounces"} == causes, judged.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "known", [{"sum_deviation": 0.07}, {"saturation": 0.07}, {"negative_bounce": 0.07}]
 )

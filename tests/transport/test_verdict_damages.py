@@ -30,6 +30,7 @@ def judge(name: str, matrix: np.ndarray) -> Verdict:
     return verdict(ltcl.Transport(matrix, SCENES[name].grid))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("cut", [0.99, 0.8, 0.5])
 def test_a_T_that_saturates_at_every_pixel_saturates(name, cut):
@@ -94,6 +95,7 @@ CAMERAS: list[tuple[str, Callable[[np.ndarray], np.ndarray], tuple[int, int]]] =
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "resample", "camera_grid"), CAMERAS)
 @pytest.mark.parametrize("ambient", [0.0, 1e-3, 1e-2])
 def test_ambient_light_is_named_whatever_the_camera(
@@ -115,6 +117,7 @@ def test_ambient_light_is_named_whatever_the_camera(
         assert entry["verdict"]["text"] == judged.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera_grid", [(24, 24), (24, 72)])
 def test_a_camera_of_other_pixels_saturates_and_drifts_too(camera_grid):
     rows, columns = camera_grid
@@ -162,6 +165,80 @@ def test_bounces_are_good_as_far_as_T_shows(device, first_bounce):
         assert judged.numbers[f"spread_{k + 1}"] == pytest.approx(expected, rel=0.03)
         assert T.bounce_spread[k] == pytest.approx(expected, rel=0.03)
         assert f"{100 * T.bounce_spread[k]:.2g}" in b.warning
+
+
+def large_pixels(T: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """T of a camera and a projector of pixels of twice the size."""
+    h, w = grid
+    parts = T.reshape(h // 2, 2, w // 2, 2, h // 2, 2, w // 2, 2)
+    return parts.mean(axis=(1, 3)).sum(axis=(3, 5)).reshape(len(T) // 4, -1)
+
+
+def mean_of_pixels(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    h, w = grid
+    return picture.reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3)).ravel()
+
+
+def bounces_under_white(T: np.ndarray, first_bounce: str) -> list[np.ndarray]:
+    """Bounces 1 to 3, in float64."""
+    inverse = np.linalg.inv(T)
+    F = T.diagonal() if first_bounce == "diagonal" else 1.0 / inverse.diagonal()
+    light = T.sum(axis=1)
+    bounces = []
+    for _ in range(4):
+        bounces.append(F * (inverse @ light))
+        light = light - bounces[-1]
+    return bounces[1:]
+
+
+@pytest.mark.parametrize("first_bounce", ["diagonal", "exact"])
+@pytest.mark.parametrize("name", SCENES)
+def test_the_change_by_larger_pixels_is_told(device, name, first_bounce):
+    """It is that of T of pixels of twice the size; pixels of half the size change as much."""
+    scene = SCENES[name]
+    T = ltcl.Transport(TRUE[name], scene.grid, first_bounce, device=device)
+    judged = verdict(T)
+    b = ltcl.separate(T, T @ np.ones(T.grid), 3)
+    fine = bounces_under_white(TRUE[name], first_bounce)
+    coarse = bounces_under_white(large_pixels(TRUE[name], scene.grid), first_bounce)
+    for k in range(3):
+        expected = mean_of_pixels(fine[k], scene.grid)
+        change = np.linalg.norm(coarse[k] - expected) / np.linalg.norm(expected)
+        assert judged.numbers[f"resolution_{k + 1}"] == pytest.approx(change, rel=0.03, abs=3e-4)
+        assert T.resolution_spread[k] == pytest.approx(change, rel=0.03, abs=1e-3)
+        assert f"{100 * T.resolution_spread[k]:.2g}" in b.warning
+    if judged.bounces:
+        largest = max(judged.numbers[f"resolution_{k}"] for k in (1, 2, 3))
+        assert f"{100 * largest:.2g} %" in judged.text
+
+
+def test_the_change_by_larger_pixels_is_about_the_error_of_bounces(device):
+    """T of pixels in which light is uneven, beside bounces that are known."""
+    scene = ltcl.scenes.dihedral(24, albedo=0.7)
+    fine = scene.transport().to_numpy().astype(float)
+    true = bounces_under_white(fine, "diagonal")
+    T = large_pixels(fine, scene.grid)
+    grid = (scene.grid[0] // 2, scene.grid[1] // 2)
+    measured = bounces_under_white(T, "diagonal")
+    spread = ltcl.Transport(T, grid, device=device).resolution_spread
+    for k in range(3):
+        expected = mean_of_pixels(true[k], scene.grid)
+        error = np.linalg.norm(measured[k] - expected) / np.linalg.norm(expected)
+        # What is left of the error beyond half of these pixels is as large again.
+        assert error < spread[k] < 3.0 * error
+
+
+@pytest.mark.parametrize("grid", [(1, 64), (9, 7), (8, 8)])
+def test_masked_pixels_and_odd_grids_have_a_change_by_larger_pixels(device, grid):
+    pixels = grid[0] * grid[1]
+    step = np.abs(np.subtract.outer(np.arange(pixels), np.arange(pixels)))
+    matrix = 0.6 * np.eye(pixels) + 0.01 * np.exp(-step / 10.0)
+    is_dark = np.arange(pixels) % 13 == 5
+    matrix[is_dark] = 0.0
+    matrix[:, is_dark] = 0.0
+    T = ltcl.Transport(matrix, grid, on_dark="mask", device=device)
+    assert np.all(np.array(T.resolution_spread) > 0.0)
+    assert max(T.resolution_spread) < 1.0
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -428,6 +428,7 @@ def test_an_address_of_ipv6(colour):
         assert urllib.request.urlopen(viewer.url).status == 200  # noqa: S310
 
 
+@pytest.mark.slow
 def test_the_command_runs_until_ctrl_c(tmp_path):
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(6) / 2, (2, 3)))
     images.write(tmp_path / "wanted.png", np.full((2, 3), 0.3))
@@ -452,6 +453,7 @@ def test_the_command_runs_until_ctrl_c(tmp_path):
             assert process.wait(30) == 0
 
 
+@pytest.mark.slow
 def test_without_the_extra_ltcl_imports_and_says_how_to_get_it():
     code = "import sys; sys.modules['starlette'] = None; import ltcl, numpy; "
     code += "ltcl.view(ltcl.Transport(numpy.eye(2), (1, 2)))"

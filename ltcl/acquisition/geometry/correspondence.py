@@ -156,8 +156,11 @@ def decode(
     h, w = code.grid
     if not subpixel:
         return Correspondence(x.value, y.value, valid, code.grid)
+    # Bits and edges of an axis are not needed any more: 5 bytes a camera pixel.
     fine_x = refine(x, valid, w)
+    del x
     fine_y = refine(y, valid, h)
+    del y
     valid &= np.isfinite(fine_x) & np.isfinite(fine_y)
     return Correspondence(fine_x, fine_y, valid, code.grid)
 

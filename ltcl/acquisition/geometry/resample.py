@@ -27,6 +27,8 @@ within a projector pixel, the value is that at a place 0.03 pixels from its cent
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -73,8 +75,9 @@ MIN_ENTRY = 0.1 * MIN_WEIGHT
 # Part of the answer of least squares that is a pixel's own light; with less it is not seen.
 MIN_RESOLUTION = 0.9
 
-# Pixels solved at once: 20 MB of 25 x 25 systems.
+# Pixels solved at once: 20 MB of 25 x 25 systems; and entries of their weights, at most.
 PIXELS_AT_ONCE = 1 << 12
+ENTRIES_AT_ONCE = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -132,14 +135,11 @@ class Resampling:
                 "mapping has no two valid neighbours; the size of a camera pixel is unknown"
             )
         padded = PaddedGrid(mapping.grid, RIM)
-        shares = footprints.shares(padded)
-        area = np.asarray(footprints.areas() @ shares)[padded.inner]
         if footprints.width < SEPARABLE_WIDTH:
-            weights = _separate_pixels(shares, footprints, padded)
+            area, weights = _separated_pixels(footprints, padded)
             is_covered = area >= MIN_SEPARATED_AREA
         else:
-            tents = footprints.shares(padded, tent=True)
-            weights = _normalise_rows(tents[:, padded.inner].T)
+            area, weights = _tent_means(footprints, padded)
             is_covered = area >= MIN_AREA
         is_seen = is_covered & (np.asarray(weights.sum(axis=1)).ravel() > 0)
         weights = _keep_rows(weights, is_seen)
@@ -179,18 +179,35 @@ class Resampling:
         >>> R.ascertained(np.array([[0.55, 1.0]]), np.ones((1, 2), bool)).seen
         array([[False,  True]])
         """
-        light = np.where(np.asarray(valid), np.maximum(np.asarray(white), 0.0), 0.0)
-        total = self._product(abs(self.weights), "white", light)
-        difference = self._product(self.weights, "white", light)
-        negative = (total - difference).reshape(*self.grid, -1) / 2
-        positive = total.reshape(negative.shape) - negative
-        is_doubtful = self.seen & (negative > MAX_NEGATIVE_SHARE * positive).any(axis=-1)
+        light = np.where(np.asarray(valid), np.asarray(white), 0.0)
+        planes = light.reshape(*light.shape[:2], -1)
+        return self.ascertained_by(planes[..., c] for c in range(planes.shape[2]))
+
+    def ascertained_by(self, white: Iterable[np.ndarray]) -> Resampling:
+        """The same, by the channels (H, W) of the photograph, 0 where they are not valid."""
+        is_doubtful = np.zeros(self.grid, bool)
+        for plane in white:
+            light = np.maximum(plane, 0.0)
+            total = self._product(self._with_data(np.abs(self.weights.data)), "white", light)
+            difference = self._product(self.weights, "white", light)
+            negative = (total - difference) / 2
+            positive = total - negative
+            is_doubtful |= self.seen & (negative > MAX_NEGATIVE_SHARE * positive)
         return replace(
             self,
             weights=_keep_rows(self.weights, ~is_doubtful.ravel()),
             coverage=np.where(is_doubtful, np.float32(0.0), self.coverage),
             doubtful=is_doubtful,
         )
+
+    def camera_pixels(self, projector_pixels: np.ndarray | None = None) -> np.ndarray:
+        """Numbers of the camera pixels that see the projector, or some of its pixels, ascending."""
+        weights = self.weights
+        if projector_pixels is not None:
+            weights = weights[projector_pixels]
+        is_used = np.zeros(math.prod(self.camera_grid), bool)
+        is_used[weights.indices] = True
+        return np.flatnonzero(is_used)
 
     @property
     def seen(self) -> np.ndarray:
@@ -203,7 +220,12 @@ class Resampling:
 
     def variance(self, variance: Any) -> np.ndarray:
         """Variance of the result of `apply`, for independent pixels with this variance."""
-        return self._product(self.weights.power(2), "variance", variance)
+        return self._product(self._with_data(self.weights.data**2), "variance", variance)
+
+    def _with_data(self, data: np.ndarray) -> scipy.sparse.csr_array:
+        """Other weights at the places of those of this resampling."""
+        weights = self.weights
+        return scipy.sparse.csr_array((data, weights.indices, weights.indptr), weights.shape)
 
     def _product(self, matrix: scipy.sparse.csr_array, name: str, image: Any) -> np.ndarray:
         array = checks.real(name, image)
@@ -216,32 +238,94 @@ class Resampling:
         return (matrix @ columns).reshape(*self.grid, *array.shape[2:])
 
 
-def _separate_pixels(
-    shares: scipy.sparse.csr_array, footprints: Footprints, padded: PaddedGrid
+def _tent_means(
+    footprints: Footprints, padded: PaddedGrid
+) -> tuple[np.ndarray, scipy.sparse.csr_array]:
+    """Covered area (N,) of the projector's pixels, and weights (N, M) of means by tents."""
+    area = np.zeros(padded.size)
+    strips = []
+    for rows in footprints.strips():
+        shares, footprint_areas = footprints.shares(padded, rows)
+        area += footprint_areas @ shares
+        tents, _ = footprints.shares(padded, rows, tent=True)
+        strips.append(tents)
+    tents = scipy.sparse.csr_array(scipy.sparse.vstack(strips))
+    return area[padded.inner], _normalise_rows(tents[:, padded.inner].T)
+
+
+def _separated_pixels(
+    footprints: Footprints, padded: PaddedGrid
+) -> tuple[np.ndarray, scipy.sparse.csr_array]:
+    """Covered area (N,) of the projector's pixels, and weights (N, M) by least squares."""
+    area = np.zeros(padded.size)
+    normal = scipy.sparse.csr_array((padded.size, padded.size))
+    strips = []
+    for rows in footprints.strips():
+        shares, footprint_areas = footprints.shares(padded, rows)
+        area += footprint_areas @ shares
+        weighted = _inverse_variance_shares(shares, footprints.straddling[rows])
+        normal = normal + weighted @ shares
+        strips.append(weighted)
+    return area[padded.inner], _solve_pixels(scipy.sparse.csr_array(normal), strips, padded)
+
+
+def _solve_pixels(
+    normal: scipy.sparse.csr_array, strips: list[scipy.sparse.csr_array], padded: PaddedGrid
 ) -> scipy.sparse.csr_array:
-    """Weights of camera pixels for all projector pixels by least squares, (N, M)."""
-    weighted = _inverse_variance_shares(shares, footprints)  # C^T V^-1
-    normal = scipy.sparse.csr_array(weighted @ shares)
+    """Weights (N, M) of least squares, by C^T V^-1 C and strips of C^T V^-1, which are used up."""
+    weighted = _join_columns(strips)
     normal.sort_indices()  # entries are then found three times as fast
     steps = np.arange(-REACH, REACH + 1)
-    window = np.add.outer(steps * padded.width, steps).ravel()
-    pixels = padded.inner
+    window = np.add.outer(steps * padded.width, steps).ravel().astype(np.int32)
+    pixels = padded.inner.astype(np.int32)
+    # A row may have the entries of all pixels of a window, most of which are then dropped.
+    most = weighted.nnz // len(pixels) * len(window)
+    step = int(np.clip(ENTRIES_AT_ONCE // max(most, 1), 1, PIXELS_AT_ONCE))
     chunks = []
-    for start in range(0, len(pixels), PIXELS_AT_ONCE):
-        windows = pixels[start : start + PIXELS_AT_ONCE, None] + window
+    for start in range(0, len(pixels), step):
+        windows = pixels[start : start + step, None] + window
         rows = _inverse_rows(normal, windows) @ weighted
         normalised = _normalise_rows(_drop_small_weights(rows))
-        chunks.append(normalised.astype(np.float32))
+        entries = (
+            normalised.data.astype(np.float32),
+            _short(normalised.indices),
+            normalised.indptr,
+        )
+        chunks.append(scipy.sparse.csr_array(entries, normalised.shape))
+    del weighted
     return scipy.sparse.csr_array(scipy.sparse.vstack(chunks))
 
 
+def _join_columns(strips: list[Any]) -> scipy.sparse.csr_array:
+    """Matrices side by side; the list is emptied meanwhile, as both do not fit into the memory."""
+    if len(strips) == 1:
+        return strips.pop()
+    lengths: list[np.ndarray] = [np.diff(strip.indptr) for strip in strips]
+    counts = np.sum(lengths, axis=0)
+    ends = np.cumsum(counts)
+    indptr = np.append(0, ends)
+    data = np.empty(ends[-1], strips[0].dtype)
+    indices = np.empty(ends[-1], np.int32)
+    next_place = indptr[:-1].copy()
+    width = 0
+    for length in lengths:
+        strip = strips.pop(0)
+        first = np.repeat(next_place - np.asarray(strip.indptr)[:-1], length)
+        places = first + np.arange(strip.nnz)
+        data[places] = strip.data
+        indices[places] = strip.indices + width
+        next_place += length
+        width += int(strip.shape[1])
+    return scipy.sparse.csr_array((data, indices, _short(indptr)), (len(counts), width))
+
+
 def _inverse_variance_shares(
-    shares: scipy.sparse.csr_array, footprints: Footprints
+    shares: scipy.sparse.csr_array, straddling: np.ndarray
 ) -> scipy.sparse.csr_array:
-    """C^T V^-1."""
+    """C^T V^-1 of some camera pixels."""
     mixed = shares.copy()
     mixed.data *= 1.0 - mixed.data
-    blurred = np.asarray(mixed.sum(axis=1)).ravel() + footprints.straddling.ravel()
+    blurred = np.asarray(mixed.sum(axis=1)).ravel() + straddling.ravel()
     precision = 1.0 / (NOISE**2 + MAP_ERROR**2 * blurred)
     return (shares * precision[:, None]).T.tocsr()
 
@@ -259,7 +343,7 @@ def _inverse_rows(normal: Any, windows: np.ndarray) -> scipy.sparse.csr_array:
     Z *= 1.0 - Z[:, [middle]] >= MIN_RESOLUTION
     # Entries that give no weight above the least one.
     Z[np.abs(Z) < MIN_ENTRY * np.abs(Z[:, [middle]])] = 0.0
-    indptr = np.arange(0, Z.size + 1, n)
+    indptr = np.arange(0, Z.size + 1, n, dtype=np.int32)
     rows = scipy.sparse.csr_array((Z.ravel(), windows.ravel(), indptr), (len(Z), normal.shape[0]))
     rows.eliminate_zeros()
     return rows
@@ -279,9 +363,22 @@ def _normalise_rows(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
     return scipy.sparse.diags_array(1.0 / np.where(total > 0, total, 1.0)) @ rows
 
 
-def _keep_rows(weights: scipy.sparse.csr_array, is_kept: np.ndarray) -> scipy.sparse.csr_array:
+def _keep_rows(weights: Any, is_kept: np.ndarray) -> scipy.sparse.csr_array:
     """Weights in float32, with empty rows for pixels that are not kept."""
-    mask = scipy.sparse.diags_array(is_kept.astype(np.float32))
-    rows = scipy.sparse.csr_array(mask @ weights, dtype=np.float32)
+    matrix = scipy.sparse.csr_array(weights)
+    lengths = np.diff(np.asarray(matrix.indptr))
+    is_kept_entry = np.repeat(is_kept, lengths)
+    kept = (
+        matrix.data[is_kept_entry].astype(np.float32),
+        _short(matrix.indices[is_kept_entry]),
+        _short(np.append(0, np.cumsum(lengths * is_kept))),
+    )
+    rows = scipy.sparse.csr_array(kept, matrix.shape)
     rows.eliminate_zeros()
     return rows
+
+
+def _short(indices: np.ndarray) -> np.ndarray:
+    """Indices in 32 bits, if that is enough."""
+    is_short = len(indices) == 0 or indices.max() <= np.iinfo(np.int32).max
+    return indices.astype(np.int32 if is_short else np.int64, copy=False)

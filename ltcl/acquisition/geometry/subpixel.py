@@ -65,6 +65,10 @@ MAX_REACH = 15
 # Pixels of a strip of rows: its moments stay in the cache.
 STRIP_PIXELS = 1 << 16
 
+# Bytes of a pixel of a strip while it is refined, and those of all strips at once, at most.
+BYTES_PER_PIXEL = 200
+MAX_BYTES = 1 << 28
+
 # Instead of a division by zero, where no valid pixel is near.
 MIN_COUNT = 1e-6
 MIN_DETERMINANT = 1e-9
@@ -184,7 +188,9 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> np.ndarray:
     def refine_rows(rows: slice) -> None:
         value[rows] = _refine_strip(axis, valid, size, rows, reach)
 
-    in_strips(H, max(STRIP_PIXELS // W, 8 * reach), refine_rows)
+    rows = max(STRIP_PIXELS // W, 4 * reach)
+    strip_bytes = (rows + 2 * reach) * W * BYTES_PER_PIXEL
+    in_strips(H, rows, refine_rows, workers=max(MAX_BYTES // strip_bytes, 1))
     return value
 
 

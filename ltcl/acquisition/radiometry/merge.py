@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.radiometry.exposures import ExposureStack, exposure_stack
+from ltcl.acquisition.radiometry.exposures import exposure_stack
 from ltcl.acquisition.radiometry.noise import NoiseModel, choose_levels
 from ltcl.acquisition.radiometry.response import Response
 from ltcl.acquisition.radiometry.strips import in_strips
@@ -61,6 +61,19 @@ class Radiance:
     value: np.ndarray
     variance: np.ndarray
     valid: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W[, 3])."""
+        return self.value.shape
+
+    def rows(self, rows: slice) -> Radiance:
+        """Some rows of the picture."""
+        return Radiance(self.value[rows], self.variance[rows], self.valid[rows])
+
+    def part(self, name: str, rows: slice) -> np.ndarray:
+        """Some rows of value, variance or valid."""
+        return getattr(self, name)[rows]
 
     def __repr__(self) -> str:
         return f"Radiance(shape={self.value.shape}, valid={self.valid.mean():.1%})"
@@ -128,17 +141,18 @@ def merge(
         raise InputError("response has 3 channels, but images are grey; it must have one")
     if black is None:
         black = noise.black
-    offsets = _channel_offsets(black, channels)
-    mergers = []
-    for c, offset in enumerate(offsets):
-        mergers.append(ChannelMerger(stack, response, noise, offset, c))
+    merger = Merger(
+        stack.seconds, response, noise, levels=stack.levels, black=black, channels=channels
+    )
     value = np.empty((pixels, channels), np.float32)
     variance = np.empty((pixels, channels), np.float32)
     valid = np.empty((pixels, channels), bool)
 
     def merge_rows(rows: slice) -> None:
-        for c, merger in enumerate(mergers):
-            value[rows, c], variance[rows, c], valid[rows, c] = merger.merge(rows)
+        for c in range(channels):
+            codes = np.stack([image[rows, c] for image in stack.images])
+            light = merger.linear(codes, c)
+            value[rows, c], variance[rows, c], valid[rows, c] = merger.merge(light, c)
 
     in_strips(pixels, BLOCK_PIXELS, merge_rows)
     shape = stack.shape
@@ -152,34 +166,72 @@ def _channel_offsets(black: Any, channels: int) -> np.ndarray:
     return np.broadcast_to(offset, (channels,)).astype(np.float32)
 
 
+class Merger:
+    """Merges linear values of photographs, by the exposures and the camera that took them.
+
+    Parameters
+    ----------
+    seconds : (K,) float64
+        Exposures, ascending.
+    response, noise, black : Response, NoiseModel, float or (channels,)
+        As in `merge`.
+    levels : int
+        Number of codes of the camera, 0 if it is not known.
+    channels : int
+        Channels of a photograph.
+    """
+
+    def __init__(
+        self,
+        seconds: np.ndarray,
+        response: Response,
+        noise: NoiseModel,
+        *,
+        levels: int,
+        black: Any,
+        channels: int,
+    ) -> None:
+        self._channels = []
+        for c, offset in enumerate(_channel_offsets(black, channels)):
+            table = Response(response.values[c % response.channels])
+            self._channels.append(ChannelMerger(seconds, levels, table, noise, offset))
+
+    def linear(self, codes: np.ndarray, channel: int) -> np.ndarray:
+        """Linear values of codes of a channel, black still in them."""
+        return self._channels[channel].linear(codes)
+
+    def merge(self, light: np.ndarray, channel: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value, variance and validity of linear values (K, pixels) of a channel."""
+        return self._channels[channel].merge(light)
+
+
 class ChannelMerger:
     """Merges blocks of pixels of one channel, arrays (K, pixels) of K exposures, by tables."""
 
     def __init__(
         self,
-        stack: ExposureStack,
+        seconds: np.ndarray,
+        levels: int,
         response: Response,
         noise: NoiseModel,
         black: np.float32,
-        channel: int,
     ) -> None:
-        self.response = Response(response.values[channel % response.channels])
+        self.response = response
         self.black = black
         self.saturation = np.float32(noise.saturation)
-        self.images = [image[:, channel] for image in stack.images]
-        self.t = stack.seconds.astype(np.float32)[:, None]
-        codes = np.linspace(0.0, 1.0, max(stack.levels, 2))
+        self.t = seconds.astype(np.float32)[:, None]
+        codes = np.linspace(0.0, 1.0, max(levels, 2))
         self.linear_of_code = self.response.linear(codes)
 
         # Above black. The lowest whole code is 0; floats have no end there.
         self.lowest = np.float32(-np.inf)
-        if stack.levels:
+        if levels:
             self.lowest = self.linear_of_code[0] - black
 
         # Weights at linear values above black.
         x = np.linspace(0.0, 1.0, TABULATED_VALUES)
         slope = self.response.derivative(self.response.codes(x + black))
-        variance = replace(noise, levels=stack.levels).variance(x, slope)
+        variance = replace(noise, levels=levels).variance(x, slope)
         self.weights = (1.0 / variance).astype(np.float32)
 
         # Radiance whose noise is clipped at neither end of an exposure.
@@ -188,12 +240,10 @@ class ChannelMerger:
         self.min_clear = (self.lowest + low_margin) / self.t
         self.max_clear = (self.saturation - high_margin - black) / self.t
 
-    def merge(self, pixels: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value, variance and validity of some pixels."""
-        codes = np.stack([image[pixels] for image in self.images])
-        light = self._linear(codes)
+    def merge(self, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value, variance and validity of some pixels, by linear values with black in them."""
         is_unsaturated = light <= self.saturation
-        light -= self.black
+        light = light - self.black
         light *= is_unsaturated
 
         # First L: the sum of light over the sum of seconds.
@@ -220,7 +270,7 @@ class ChannelMerger:
         variance[~valid] = np.inf
         return value * valid, variance, valid
 
-    def _linear(self, codes: np.ndarray) -> np.ndarray:
+    def linear(self, codes: np.ndarray) -> np.ndarray:
         """Linear values, black still in them."""
         if codes.dtype.kind == "f":
             return self.response.linear(codes)

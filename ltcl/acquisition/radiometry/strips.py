@@ -8,12 +8,18 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 
-def in_strips(height: int, rows: int, work: Callable[[slice], None]) -> None:
-    """Do `work` on slices of at most `rows` (at least one) of `height` rows, in parallel."""
+def in_strips(
+    height: int, rows: int, work: Callable[[slice], None], workers: int | None = None
+) -> None:
+    """Do `work` on slices of at most `rows` (at least one) of `height` rows, in parallel.
+
+    At most so many `workers` have strips in memory; None: one for each core.
+    """
     step = max(rows, 1)
     strips = [slice(top, min(top + step, height)) for top in range(0, height, step)]
     if len(strips) == 1:  # a thread takes longer to start than the work on a small picture
         work(strips[0])
         return
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    cores = os.cpu_count() or 1
+    with ThreadPoolExecutor(min(cores, workers or cores)) as pool:
         list(pool.map(work, strips))

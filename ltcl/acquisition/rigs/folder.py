@@ -10,6 +10,7 @@ Codes of photographs are not changed.
 
 from __future__ import annotations
 
+import contextlib
 import filecmp
 import os
 import re
@@ -30,7 +31,7 @@ from ltcl.acquisition.rigs.photographs import (
     read_photograph,
 )
 from ltcl.acquisition.rigs.shooting_list import ShootingList, Shot, ShotKey
-from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
+from ltcl.errors import AcquisitionError, FileError, InputError, LtclError, PhotographMissing
 from ltcl.files import as_path, input_file, make_folders, replace_file
 
 PHOTOGRAPH_NAME = re.compile(r"photo_(\d{1,9})", re.IGNORECASE | re.ASCII)
@@ -186,6 +187,16 @@ class FolderRig:
         self._files = self._list_photographs()
         numbers = [shot.number for shot in self.shots]
         return tuple(number for number in numbers if number not in self._files)
+
+    def photographed_grid(self) -> tuple[int, int] | None:
+        """(H, W) of the first photograph in the folder; None if there is none that can be read."""
+        self._files = self._list_photographs()
+        for number in sorted(self._files):
+            path = self._files[number][0]
+            with contextlib.suppress(LtclError):
+                image = read_photograph(path.name, path, self.channels, None)
+                return image.shape[0], image.shape[1]
+        return None
 
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in place of those that are missing.

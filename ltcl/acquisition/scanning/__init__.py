@@ -3,7 +3,7 @@
 
 columns, adaptive    strategies: batches of columns, or cells that are divided where needed
 pictures             pictures of patterns on the pixels of the scan
-plan, report         photographs, time and errors before a scan; its result after it
+plan, pace, report   photographs, time and errors before a scan; its result after it
 """
 
 from __future__ import annotations

@@ -23,13 +23,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ltcl.acquisition import anchor
-from ltcl.acquisition.agreement import ADVICE, Deviation, find_deviation, sample, spread
+from ltcl.acquisition.agreement import ADVICE, Deviation, find_deviation, spread
 from ltcl.acquisition.calibration import Calibration, Setup
 from ltcl.acquisition.geometry.blocks import Blocks
-from ltcl.acquisition.radiometry import Radiance, merge
+from ltcl.acquisition.radiance import (
+    RadiancePicture,
+    StoredRadiance,
+    planes,
+    valid_share,
+    values_at,
+)
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scratch import ImageFile
-from ltcl.acquisition.session import acquisition_error
+from ltcl.acquisition.scratch import ImageFile, StoredImage
+from ltcl.acquisition.session import Photograph, merge_photographs
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
 from ltcl.transport.noise import Noise
@@ -126,19 +132,15 @@ class ScanGrid:
         samples = [entries(channel) for channel in range(self.channels)]
         return Noise.fit((pixels, pixels), samples, "acquired", white).to_arrays()
 
-    def picture(self, light: Radiance) -> Picture:
+    def picture(self, light: RadiancePicture) -> Picture:
         """Means of a radiance over the blocks of the scan, as far as they are seen and valid."""
         resampling = self.calibration.resampling
-        valid = light.valid
-        value = resampling.apply(np.where(valid, light.value, 0.0))
-        variance = resampling.variance(np.where(valid, light.variance, 0.0))
-        if valid.all():
-            weight = resampling.seen
+        value = np.stack([*map(resampling.apply, planes(light, "value"))], axis=-1)
+        variance = np.stack([*map(resampling.variance, planes(light, "variance"))], axis=-1)
+        if valid_share(light) == 1.0:
+            weight = resampling.seen[..., None]
         else:
-            weight = resampling.apply(valid.astype(np.float32))
-        value = value.reshape(*resampling.grid, -1)
-        variance = variance.reshape(*resampling.grid, -1)
-        weight = weight.reshape(*resampling.grid, -1)
+            weight = np.stack([*map(resampling.apply, planes(light, "valid"))], axis=-1)
 
         is_good = np.broadcast_to(weight >= MIN_VALID_SHARE, value.shape)
         share = np.where(is_good, 1.0 / np.maximum(weight, MIN_VALID_SHARE), 0.0)
@@ -160,14 +162,14 @@ class ScanGrid:
 
 @dataclass(frozen=True, kw_only=True)
 class _ExposedPattern:
-    """The photographs of a pattern: its codes (h, w), images, their seconds and numbers."""
+    """The photographs of a pattern: its codes (h, w), and their seconds and numbers."""
 
     codes: np.ndarray
-    images: Sequence[np.ndarray]
+    images: Sequence[Photograph]
     seconds: Sequence[float]
     numbers: Sequence[int]
-    # The radiance, by `anchor.compact`: a StoredImage once it is merged.
-    light: Any = None
+    # The radiance, by `anchor.compact`, once it is merged.
+    light: StoredImage | None = None
 
 
 class ScanCamera(ScanGrid):
@@ -177,8 +179,12 @@ class ScanCamera(ScanGrid):
         super().__init__(calibration, side)
         self.shots = shots
         # Photographs are compared at some of the pixels that see the projector.
-        seeing = np.unique(calibration.resampling.weights.indices)
+        seeing = calibration.resampling.camera_pixels()
         self._pixels = spread(seeing)
+        # Ambient light at the pixels of the anchor.
+        self._room = np.zeros(0)
+        if calibration.anchor is not None:
+            self._room = values_at(calibration.ambient, calibration.anchor.pixels, "value")
         # Gain of the lamp since the calibration at the last batch; a store keeps it.
         self.lamp_gain = 1.0
 
@@ -210,7 +216,7 @@ class ScanCamera(ScanGrid):
                 self._refuse(photographs, batch[k + 1 : k + 2])
             light = self._merge(photographs)
             pictures.append(self._without_ambient(self.picture(light)))
-            stored = self._compact.append(anchor.compact(light))
+            stored = anchor.compact(light, self._compact)
             exposed.append(replace(photographs, images=[], light=stored))
             progress(1)
         self._check_patterns(patterns, pictures, exposed)
@@ -221,24 +227,19 @@ class ScanCamera(ScanGrid):
         return [picture.scaled(1.0 / g) for picture, g in zip(pictures, gains, strict=True)]
 
     def _photograph(self, codes: np.ndarray, seconds: Sequence[float]) -> _ExposedPattern:
-        images = [self.shots.photograph(codes, t) for t in seconds]
+        # The file of the photographs is removed with the last of them.
+        file = ImageFile()
+        images = []
+        for t in seconds:
+            self.shots.expose(codes, t)
+            images.append(Photograph.of(self.shots, t, file))
         end = self.shots.number + 1
         numbers = range(end - len(images), end)
         return _ExposedPattern(codes=codes, images=images, seconds=seconds, numbers=numbers)
 
-    def _merge(self, photographs: _ExposedPattern) -> Radiance:
+    def _merge(self, photographs: _ExposedPattern) -> StoredRadiance:
         """The radiance of a pattern."""
-        camera = self.calibration.camera
-        first = photographs.numbers[0]
-        last = photographs.numbers[-1]
-        with acquisition_error(f"photographs {first} to {last}"):
-            return merge(
-                photographs.images,
-                photographs.seconds,
-                camera.response,
-                camera.noise,
-                black=camera.offset,
-            )
+        return merge_photographs(photographs.images, self.calibration.camera, None, ImageFile())
 
     def _without_ambient(self, lit: Picture) -> Picture:
         """A picture less the ambient light, of whose variance each picture has the same part."""
@@ -253,11 +254,10 @@ class ScanCamera(ScanGrid):
         if len(photographs.images) < 2:
             return None
         is_lit = photographs.codes.reshape(*self.shots.grid, -1).any(axis=2)
-        weights = self.calibration.resampling.weights
         camera = self.calibration.camera
-        seeing_lit = np.unique(weights[np.flatnonzero(is_lit)].indices)
+        seeing_lit = self.calibration.resampling.camera_pixels(np.flatnonzero(is_lit))
         for pixels in (self._pixels, spread(seeing_lit)):
-            samples = [sample(image, pixels) for image in photographs.images]
+            samples = [photograph.at(pixels) for photograph in photographs.images]
             deviation = find_deviation(samples, photographs.seconds, camera)
             if deviation is not None:
                 return deviation
@@ -313,17 +313,17 @@ class ScanCamera(ScanGrid):
         [seconds] = blocks.seconds
         if known.anchor is None:
             return 1.0
-        shot = image, seconds, known.camera, known.ambient
+        shot = image.at(known.anchor.pixels), seconds, known.camera, self._room
         gain = known.anchor.lamp_gain(*shot)
         if known.anchor.deviation(*shot, gain) is None:
             return gain
-        light = self._compact.append(anchor.compact(self._merge(blocks)))
+        light = anchor.compact(self._merge(blocks), self._compact)
         series = [*exposed, replace(blocks, images=[], light=light)]
         setup = known.white, known.ambient, known.resampling
         shifts = []
         for photographs in series:
-            picture = photographs.light.read()
-            shifts.append(anchor.shift_of(photographs.codes, picture, *setup))
+            if photographs.light is not None:
+                shifts.append(anchor.shift_of(photographs.codes, photographs.light, *setup))
         *earlier, moved = shifts
         first = anchor.first_moved(earlier, moved)
         start = series[max(first - 1, 0)].numbers[0]

@@ -28,6 +28,7 @@ import numpy as np
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry.blocks import Blocks
+from ltcl.acquisition.radiance import valid_values
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import adaptive, columns
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
@@ -80,6 +81,8 @@ class Plan:
         Bytes on the disk, at most.
     error : float
         Relative error of T p by noise, 1 at most.
+    computing : float, optional
+        Time of computing besides, in seconds; None if the size of the camera is not known.
     """
 
     strategy: str
@@ -90,6 +93,7 @@ class Plan:
     seconds: float
     disk: int
     error: float
+    computing: float | None = None
 
     def __repr__(self) -> str:
         h, w = self.grid
@@ -122,6 +126,8 @@ def plans(
     threshold: float = ScanSettings.threshold,
     overhead: float = 0.0,
     calibration: int | None = None,
+    megapixels: float | None = None,
+    pace: float | None = None,
 ) -> dict[str, Plan]:
     """Plan a scan with every strategy.
 
@@ -142,6 +148,10 @@ def plans(
         Seconds of each photograph besides its exposure.
     calibration : int, optional
         Photographs of the calibration; None: as many as expected.
+    megapixels : float, optional
+        Pixels of the camera in millions; None: not known.
+    pace : float, optional
+        Seconds of computing for each photograph and megapixel (`scanning.pace`); None: not known.
 
     Examples
     --------
@@ -171,6 +181,9 @@ def plans(
         # The calibration's exposures are about the geometric mean of those of the scan.
         calibration_seconds = calibration * math.sqrt(times[0] * times[-1])
         scan_seconds = outlook.patterns * times.sum()
+        computing = None
+        if megapixels is not None and pace is not None:
+            computing = photographs * megapixels * pace
         seconds = calibration_seconds + scan_seconds + outlook.batches * times[0]
         result[strategy] = Plan(
             strategy=strategy,
@@ -181,6 +194,7 @@ def plans(
             seconds=float(seconds + photographs * overhead),
             disk=channels * ENTRY_BYTES * outlook.entries,
             error=_relative_error(outlook.variance, light),
+            computing=computing,
         )
     return result
 
@@ -261,8 +275,8 @@ def _relative_error(variance: float, light: Light) -> float:
 
 def measured(calibration: Calibration) -> Light:
     """Light of a measured scene; a quarter of it is taken as indirect."""
-    white = calibration.white.value[calibration.white.valid]
-    dark = calibration.ambient.value[calibration.ambient.valid]
+    white = valid_values(calibration.white)
+    dark = valid_values(calibration.ambient)
     lit = Light.direct
     if white.size:
         is_lit = white > LIT_SHARE * white.max(initial=0.0)

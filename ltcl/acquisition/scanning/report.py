@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.radiance import valid_share
 from ltcl.acquisition.scanning import adaptive, columns
 from ltcl.acquisition.scanning.pictures import ScanGrid
 from ltcl.errors import FileError
@@ -113,7 +114,7 @@ class Report:
             sharpness=sharpness,
             blur=blur,
             masked=float(np.mean((first_bounce <= 0).any(axis=0))),
-            saturated=1.0 - float(np.mean(calibration.white.valid)),
+            saturated=1.0 - valid_share(calibration.white),
             entries=entries.count,
             unknown=entries.unknown / max(entries.count, 1),
             noise_direct=_relative_noise(entries.variance, first_bounce),

@@ -68,6 +68,9 @@ class StrategyPlan(Report):
     seconds: Annotated[float, "Duration of all photographs."]
     disk: Annotated[int, "Bytes on disk at most."]
     error: Annotated[float, "Relative error of T p by noise."]
+    computing: Annotated[
+        float | None, "Seconds of computing; null if the size of the camera is not known."
+    ] = None
 
 
 @dataclass(kw_only=True)
@@ -83,6 +86,8 @@ class PlanReport(FolderReport):
     noise: Annotated[CameraNoise, "Noise of the camera."]
     light: Annotated[ScanLight, "Light in sensor values a second."]
     channels: Channels
+    megapixels: Annotated[float | None, "Pixels of the camera in millions; null if not known."]
+    pace: Annotated[float, "Seconds of computing for each photograph and megapixel, as measured."]
     plans: Annotated[
         dict[str, StrategyPlan],
         "Plans by strategy, as `ltcl.acquisition.scanning.Plan`.",

@@ -174,6 +174,9 @@ class VerdictNumbers(Report):
     spread_1: Annotated[Measured, "Difference of bounce 1 by F = diag(T) or 1 / diag(T^-1)."] = None
     spread_2: Annotated[Measured, "The same for bounce 2."] = None
     spread_3: Annotated[Measured, "The same for bounce 3."] = None
+    resolution_1: Annotated[Measured, "Change of bounce 1 by pixels of twice the size."] = None
+    resolution_2: Annotated[Measured, "The same for bounce 2."] = None
+    resolution_3: Annotated[Measured, "The same for bounce 3."] = None
     other_grid: Annotated[Measured, "1 if another grid fits better."] = None
     exchanged: Annotated[Measured, "Colour channels that look exchanged. Good: 0."] = None
     no_bounces: Annotated[Measured, "1 if T is not square."] = None

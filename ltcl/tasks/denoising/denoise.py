@@ -14,8 +14,16 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
+from ltcl.tasks.denoising.multiwavelets import Grid
 from ltcl.tasks.denoising.problem import DenoisingProblem
-from ltcl.tasks.denoising.risk import picture_risk
+from ltcl.tasks.denoising.risk import (
+    NOISE_MARGIN,
+    NoiseProbe,
+    max_risk,
+    noise_to_add,
+    picture_risk,
+    probe_count,
+)
 from ltcl.tasks.denoising.shrinkage import NoteShare, first_estimate, refine
 from ltcl.tasks.requirements import check_progress
 from ltcl.transport.noise import Noise
@@ -23,10 +31,8 @@ from ltcl.transport.transport import Transport, check_transport
 
 log = logging.getLogger(__name__)
 
-# Estimated squared error of pictures over that of T, at most, with room for the estimate's own.
-MAX_RISK = 1.05
 # Arrays of float32 of the size of T that are in memory at once.
-ARRAYS_AT_ONCE = 18
+ARRAYS_AT_ONCE = 20
 
 
 def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = None) -> Transport:
@@ -41,11 +47,11 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     Returns
     -------
     Transport
-        T itself, with a warning, if its noise is unknown or its pictures would become worse. Else
-        float32, on the same grid, with the same first bounce, mixing and masked pixels, without
-        negative entries off the diagonal. Its `noise` is that of T, scaled to the estimated error
-        of a picture under white; the first bounce itself has that of T, and errors of neighbours
-        are alike.
+        T itself, with a warning, if its noise is unknown, or if nothing shows that its pictures
+        become better. Else float32, on the same grid, with the same first bounce, mixing and
+        masked pixels, without negative entries off the diagonal. Its `noise` is that of T, scaled
+        to the estimated error of a picture under white; the first bounce itself has that of T, and
+        errors of neighbours are alike.
 
     Raises
     ------
@@ -54,7 +60,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     InputError
         3 x 3 blocks between colours.
     MemoryLimitError
-        The host lacks memory for 18 arrays of float32 of the size of T.
+        The host lacks memory for 20 arrays of float32 of the size of T.
 
     Examples
     --------
@@ -76,16 +82,20 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     for channel in range(T.channels):
         note = partial(_report_share, report, channel, T.channels)
         channels.append(_denoise_channel(T, channel, note))
-    kept = sum(channel.risk > MAX_RISK for channel in channels)
+        note(1.0)
+    kept = sum(channel.entries is None for channel in channels)
     if kept:
         log.warning(
-            "%d of %d channels of T are not changed: they would lose more light than noise",
+            "%d of %d channels of T are not changed: nothing shows that pictures become better",
             kept,
             T.channels,
         )
     if kept == T.channels:
         return T
-    matrices = [channel.entries for channel in channels]
+    matrices = []
+    for matrix, channel in zip(T.matrices, channels, strict=True):
+        entries = channel.entries
+        matrices.append(_dense(matrix) if entries is None else entries)
     shares = np.array([channel.variance_share for channel in channels])
     return _transport_like(T, matrices, _scaled_noise(T.noise, shares))
 
@@ -107,20 +117,15 @@ def _check_entries(T: Any) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DenoisedChannel:
-    """Entries (M, N), the share of the variance of noise that is left, and the risk of pictures."""
+    """Entries (M, N), None if they stay, and the share of the variance of noise that is left."""
 
-    entries: np.ndarray
-    variance_share: float
-    risk: float
+    entries: np.ndarray | None = None
+    variance_share: float = 1.0
 
 
 def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> DenoisedChannel:
-    """The channel with less noise, or as it is if its pictures would become worse."""
-    matrix = T.matrices[channel]
-    if not isinstance(matrix, np.ndarray):
-        matrix = matrix.tocsr().toarray()
-    Y = matrix.astype(np.float32)
-    unchanged = DenoisedChannel(entries=Y.copy(), variance_share=1.0, risk=np.inf)
+    """The channel with less noise, or as it is if nothing shows that its pictures become better."""
+    Y = _dense(T.matrices[channel])
     # In this unit, a power of 2, squares fit into float32.
     _, exponent = np.frexp(np.abs(Y).max(initial=0.0))
     unit = np.float32(2.0 ** int(exponent))
@@ -130,36 +135,98 @@ def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> DenoisedCha
         photons=T.noise.photons / unit,
         floor=T.noise.floor / unit,
     )
+    trials = _Trials(Y, noise, channel, (T.camera_grid, T.grid), note)
     for may_be_reciprocal in (True, False):
-        problem = DenoisingProblem.from_entries(
-            Y, noise, channel, T.camera_grid, T.grid, may_be_reciprocal
-        )
-        denoised = _solve(problem, Y, note)
-        if denoised.risk <= MAX_RISK:
-            return dataclasses.replace(denoised, entries=unit * denoised.entries)
-        if not problem.is_reciprocal:
+        run = trials.run(Y, may_be_reciprocal)
+        if trials.risk(run, may_be_reciprocal) <= max_risk(len(Y)):
+            entries = unit * run.entries
+            return DenoisedChannel(entries=entries, variance_share=run.variance_share)
+        if not run.is_reciprocal:
             break
-    return unchanged
+    return DenoisedChannel()
 
 
-def _solve(problem: DenoisingProblem, Y: np.ndarray, note: NoteShare) -> DenoisedChannel:
-    """Denoised entries of a problem with the measured entries Y, (M, N)."""
-    first = first_estimate(problem, note)
-    problem = first.problem
-    estimate = refine(problem, first.pilot, lambda share: note(1.0 + share))
-    entries = problem.restore_entries(estimate.Z, Y)
-    left = np.where(problem.is_outstanding, 0.0, estimate.noise / problem.gauge)
-    variance = problem.noise.variance(entries, problem.channel)
-    # Errors of a picture under white, before and after.
-    variance_before = variance.sum()
-    if variance_before == 0.0:
-        variance_before = 1.0
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Run:
+    """Denoised entries (M, N), and the share of the variance of noise that is left."""
+
+    entries: np.ndarray
+    variance_share: float
+    is_reciprocal: bool
+
+
+class _Trials:
+    """Ways to denoise the measured entries Y, (M, N), of a channel, and their risks."""
+
+    def __init__(
+        self, Y: np.ndarray, noise: Noise, channel: int, grids: tuple[Grid, Grid], note: NoteShare
+    ) -> None:
+        self.Y = Y
+        self.noise = noise
+        self.channel = channel
+        self.camera_grid, self.grid = grids
+        self.note = note
+        self.runs = 0
+        self.probe_count = probe_count(len(Y))
+
+    def run(self, Y: np.ndarray, may_be_reciprocal: bool) -> _Run:
+        """Denoise these entries, (M, N)."""
+        problem = DenoisingProblem.from_entries(
+            Y, self.noise, self.channel, self.camera_grid, self.grid, may_be_reciprocal
+        )
+        first = first_estimate(problem, lambda share: self._note(share / 2))
+        problem = first.problem
+        estimate = refine(problem, first.pilot, lambda share: self._note((1.0 + share) / 2))
+        left = np.where(problem.is_outstanding, 0.0, estimate.noise / problem.gauge)
+        entries = problem.restore_entries(estimate.Z, Y)
+        variance = self.noise.variance(entries, self.channel).sum()
+        self.runs += 1
+        return _Run(
+            entries=entries,
+            variance_share=_variance_share(left, variance),
+            is_reciprocal=problem.is_reciprocal,
+        )
+
+    def risk(self, run: _Run, may_be_reciprocal: bool) -> float:
+        """`picture_risk` of the denoised entries, by further runs with more noise."""
+        probes = []
+        for seed in range(self.probe_count):
+            variance = self._variance(run.entries)
+            added = noise_to_add(variance, self.noise, self.grid, self.channel, seed)
+            del variance
+            noisier = self.run(self.Y + added, may_be_reciprocal)
+            probes.append(NoiseProbe(added=added, change=noisier.entries - run.entries))
+        variance = self._variance(run.entries)
+        filtered = partial(self.noise.filtered, grid=self.grid, channel=self.channel)
+        margin = 1.0 if self.noise.is_measured else NOISE_MARGIN
+        return picture_risk(self.Y, run.entries, variance, probes, filtered, self.grid, margin)
+
+    def _variance(self, entries: np.ndarray) -> np.ndarray:
+        """The variance of entries, (M, N), that may change: the first bounce stays."""
+        variance = self.noise.variance(entries, self.channel)
+        if self.camera_grid == self.grid:
+            np.fill_diagonal(variance, 0.0)
+        return variance
+
+    def _note(self, share: float) -> None:
+        # With and without reciprocity, and once more for each probe.
+        most = 2 * (1 + self.probe_count)
+        self.note((self.runs + share) / most)
+
+
+def _variance_share(left: np.ndarray, variance: float) -> float:
+    """The variance of errors under white by the noise `left`, (M, N), over that before."""
+    if variance == 0.0:
+        return 0.0
     error_under_white = left.sum(axis=1, dtype=float)
-    share = error_under_white @ error_under_white / variance_before
-    # The first bounce and outstanding entries stay, with their errors.
-    variance[entries == Y] = 0.0
-    risk = picture_risk(Y - entries, left, variance, problem)
-    return DenoisedChannel(entries=entries, variance_share=share, risk=risk)
+    return float(error_under_white @ error_under_white / variance)
+
+
+def _dense(matrix: Any) -> np.ndarray:
+    """A copy of a matrix, an array or sparse, as an array of float32."""
+    if not isinstance(matrix, np.ndarray):
+        matrix = matrix.tocsr().toarray()
+    return matrix.astype(np.float32)
 
 
 def _scaled_noise(noise: Noise, variance_shares: np.ndarray) -> Noise:
@@ -192,5 +259,5 @@ def _transport_like(T: Transport, matrices: list[np.ndarray], noise: Noise) -> T
 def _report_share(
     report: Callable[[str, float], object], channel: int, channels: int, share: float
 ) -> None:
-    """Report progress: `share` is 1 after the first estimate of a channel, and 2 at its end."""
-    report("denoising", (channel + share / 2) / channels)
+    """Report progress: `share` is that of a channel."""
+    report("denoising", (channel + share) / channels)

@@ -9,7 +9,7 @@ from ltcl.transport.diagnostics.bounce import (
     negative_bounce,
     picture_parts,
 )
-from ltcl.transport.diagnostics.choice import bounce_spread_of_system
+from ltcl.transport.diagnostics.choice import bounce_spreads_of_system
 from ltcl.transport.diagnostics.energy import Energy, check_energy
 from ltcl.transport.diagnostics.grid import other_grid
 from ltcl.transport.diagnostics.reciprocity import QUICK_ENTRIES, reciprocity_defect
@@ -21,7 +21,7 @@ __all__ = [
     "ambient",
     "ambient_share",
     "between_parts",
-    "bounce_spread_of_system",
+    "bounce_spreads_of_system",
     "check_energy",
     "negative_bounce",
     "other_grid",

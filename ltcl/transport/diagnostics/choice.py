@@ -24,6 +24,7 @@ import scipy.sparse
 from ltcl.errors import ConvergenceError, MemoryLimitError
 from ltcl.operators import IdentityPlus
 from ltcl.solvers import solve
+from ltcl.transport.diagnostics.resolution import resolution_spread
 
 # Pixels whose m is computed column by column.
 MAX_EXACT_PIXELS = 256
@@ -43,18 +44,37 @@ class SolvedSystem(NamedTuple):
     diagonal: np.ndarray
     second_diagonal: np.ndarray | None
 
+    @property
+    def has_diagonal_of_T(self) -> bool:
+        """True if the first bounce is diag(T)."""
+        return bool(np.allclose(self.diagonal, 1.0, rtol=1e-6))
 
-def bounce_spread_of_system(T: Any, F: np.ndarray, S: IdentityPlus) -> np.ndarray:
-    """`bounce_spread` of T (N, N) with first bounce F and its S on the device; NaN if unknown."""
+
+class BounceSpreads(NamedTuple):
+    """Relative changes of bounces 1 to 3 under white, (3,) each; NaN if unknown.
+
+    By the `choice` of the first bounce, and by pixels of twice the size (`resolution`).
+    """
+
+    choice: np.ndarray
+    resolution: np.ndarray
+
+
+def bounce_spreads_of_system(
+    T: Any, F: np.ndarray, S: IdentityPlus, grid: tuple[int, int]
+) -> BounceSpreads:
+    """`bounce_spreads` of T (N, N) with first bounce F and its S on the device."""
     system = S.as_it_stands()
 
     def inverse(light: np.ndarray) -> np.ndarray:
         return solve(system, light, rtol=SOLVE_RTOL).x
 
     try:
-        return bounce_spread(solved_system(T, F, system.matmat, inverse), F)
+        solved = solved_system(T, F, system.matmat, inverse)
+        return bounce_spreads(T, F, solved, grid)
     except (ConvergenceError, MemoryLimitError):
-        return np.full(BOUNCES, np.nan)
+        unknown = np.full(BOUNCES, np.nan)
+        return BounceSpreads(unknown, unknown)
 
 
 def solved_system(
@@ -84,33 +104,44 @@ def second_diagonal(T: Any, inverse_F: np.ndarray, diagonal: np.ndarray) -> np.n
     return inverse_F * squares - 2.0 * diagonal + 1.0
 
 
-def bounce_spread(S: SolvedSystem, F: np.ndarray) -> np.ndarray:
-    """Relative difference of bounces 1 to 3 under white by both choices, (3,).
-
-    The picture under white is S F; F, (N,), is 0 at masked pixels.
+def bounce_spreads(T: Any, F: np.ndarray, S: SolvedSystem, grid: tuple[int, int]) -> BounceSpreads:
+    """Relative changes of bounces under white; F, (N,), is 0 at masked pixels.
 
     Examples
     --------
-    >>> matrix = np.array([[1.0, 0.2], [0.2, 1.0]])
-    >>> S = SolvedSystem(matrix.dot, lambda b: np.linalg.solve(matrix, b), np.ones(2), None)
-    >>> bounce_spread(S, np.ones(2)).round(2).tolist()
+    >>> T = np.array([[1.0, 0.2], [0.2, 1.0]])
+    >>> S = SolvedSystem(T.dot, lambda b: np.linalg.solve(T, b), np.ones(2), None)
+    >>> bounce_spreads(T, np.ones(2), S, (1, 2)).choice.round(2).tolist()
     [0.13, 0.28, 0.4]
     """
-    m = np.maximum(_inverse_diagonal(S), MIN_INVERSE_DIAGONAL)
     is_lit = F > 0
+    exact, diagonal = _bounces_by_choice(S, is_lit, F)
+    choice = np.zeros(BOUNCES)
+    for number in range(BOUNCES):
+        bounce = exact[number + 1, is_lit]
+        size = max(float(np.linalg.norm(bounce)), 1e-300)
+        choice[number] = np.linalg.norm(bounce - diagonal[number + 1, is_lit]) / size
+    is_exact = not S.has_diagonal_of_T
+    bounces = exact if is_exact else diagonal
+    return BounceSpreads(choice, resolution_spread(T, F, bounces, grid, is_exact))
+
+
+def _bounces_by_choice(
+    S: SolvedSystem, is_lit: np.ndarray, F: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Direct light and bounces under white, S F, by 1 / diag(T^-1) and by diag(T), (4, N) each."""
+    m = np.maximum(_inverse_diagonal(S), MIN_INVERSE_DIAGONAL)
     white = np.where(is_lit, S.product(F[:, None])[:, 0], 0.0)
     # Both sequences side by side.
     scales = np.stack([1.0 / m, S.diagonal], axis=1)
     remaining = np.repeat(white[:, None], 2, axis=1).astype(np.float64)
-    remaining -= scales * S.inverse(remaining)
-    spread = np.zeros(BOUNCES)
-    for number in range(BOUNCES):
+    pictures = []
+    for _ in range(BOUNCES + 1):
         bounces = scales * S.inverse(remaining)
         remaining -= bounces
-        exact, diagonal = bounces[is_lit].T
-        size = max(float(np.linalg.norm(exact)), 1e-300)
-        spread[number] = np.linalg.norm(exact - diagonal) / size
-    return spread
+        pictures.append(bounces)
+    exact, diagonal = np.stack(pictures, axis=0).transpose(2, 0, 1)
+    return exact, diagonal
 
 
 def _inverse_diagonal(S: SolvedSystem) -> np.ndarray:

@@ -53,7 +53,9 @@ def compare(first: Any, second: Any) -> tuple[float, float]:
         sum_ratios.extend(np.sum(noisy, axis=1) ** 2 / np.sum(noisy**2, axis=1))
     neighbours = 0.0
     if sum_ratios:
-        neighbours = cancellation(float(np.mean(sum_ratios)), len(sum_ratios))
+        # Each ratio is the square of a normal value.
+        scatter = (2.0 / len(sum_ratios)) ** 0.5
+        neighbours = cancellation(float(np.mean(sum_ratios)), scatter)
     exposure = float(np.median(exposures)) if exposures else 1.0
     return neighbours, exposure
 

@@ -21,7 +21,7 @@ an upper bound. Photon noise that only a textured first bounce could show is lef
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
@@ -53,6 +53,8 @@ from ltcl.transport.noise.windows import Windows
 BLOCK_WINDOWS = ((6, 2), (4, 2), (3, 1))
 # Side and order of windows of a first bounce, or of another picture.
 PICTURE_WINDOWS = ((4, 2), (4, 3), (6, 4))
+# Relative standard deviation of the median of n squares of normal values, times the root of n.
+MEDIAN_SCATTER = 2.33
 # Bounds on the variance below this share of others count in their place.
 BETTER_SHARE = 0.5
 # Correlation of detail of the first bounce and of bounced light, at most, without texture.
@@ -180,7 +182,7 @@ class _ChannelEstimator:
 
     def _neighbours(self, agreement: Agreement, rows: np.ndarray, columns: np.ndarray) -> float:
         """Share of neighbours that errors of a row lack, by the detail of row sums."""
-        M, N = self.T.shape
+        N = self.T.shape[1]
         q = agreement.q
         patterns = np.stack([np.ones(N), columns], axis=1).astype(np.float32)
         white, weighted = (self.T @ patterns).T
@@ -190,8 +192,10 @@ class _ChannelEstimator:
             white = white - self.F
             variance = variance - columns * (1.0 + q * self.F)
         expected = np.maximum(agreement.floor2 * rows * variance, MIN_VARIANCE)
-        sums = _picture_detail(white, self.camera_grid, expected)
-        return cancellation(sums.variance, M // 8)
+        shares = []
+        for bound in _noise_bounds(white, self.camera_grid, expected):
+            shares.append(cancellation(bound.variance, bound.scatter))
+        return max(shares)
 
 
 def _ratio(blocks: Blocks, best: Blocks) -> float:
@@ -203,12 +207,32 @@ def _ratio(blocks: Blocks, best: Blocks) -> float:
     return float(np.exp(np.median(logs[is_known])))
 
 
+class NoiseBound(NamedTuple):
+    """An upper bound on the variance of noise in a picture, and its relative standard deviation."""
+
+    variance: float
+    scatter: float
+
+
 def _picture_detail(F: np.ndarray, grid: tuple[int, int], variance: np.ndarray) -> PictureDetail:
     """Median of a picture F (N,), and an upper bound on its noise over `variance`."""
+    least = min(bound.variance for bound in _noise_bounds(F, grid, variance))
+    return PictureDetail(light=max(float(np.median(F)), 0.0), variance=least)
+
+
+def _noise_bounds(F: np.ndarray, grid: tuple[int, int], variance: np.ndarray) -> list[NoiseBound]:
+    """Bounds on the noise of a picture F (N,) over `variance`, by windows of each kind."""
     bounds = []
     for side, order in PICTURE_WINDOWS:
         windows = Windows.from_grid(grid, side, order, overlap=True)
         expected = variance[windows.pixels].mean(axis=1)[:, None]
         squares = (F[windows.pixels] @ windows.detail.T) ** 2 / expected
-        bounds.append(np.median(squares) / MEDIAN_SQUARE)
-    return PictureDetail(light=max(float(np.median(F)), 0.0), variance=float(min(bounds)))
+        # Overlapping windows tell hardly more than those that tile the picture.
+        independent = len(F) * len(windows.detail) / windows.pixels.shape[1]
+        bounds.append(
+            NoiseBound(
+                variance=float(np.median(squares) / MEDIAN_SQUARE),
+                scatter=MEDIAN_SCATTER / independent**0.5,
+            )
+        )
+    return bounds

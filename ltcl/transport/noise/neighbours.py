@@ -49,13 +49,12 @@ def squared_norm(c: float) -> float:
     return 1.0 - 2.0 * CENTRE * c + SQUARED_NORM * c**2
 
 
-def cancellation(ratio: float, rows: int) -> float:
+def cancellation(ratio: float, scatter: float) -> float:
     """The share c for which (1 - c)^2 / ||1 - c G||^2 is `ratio`.
 
-    The ratio is the variance of sums of a row over that of independent errors, a mean over so many
-    `rows`. 0 if it may be below 1 by chance.
+    The ratio is the variance of sums of a row over that of independent errors, with this relative
+    standard deviation. 0 if it may be below 1 by chance.
     """
-    scatter = (2.0 / max(rows, 1)) ** 0.5
     # Written so that NaN is chance, too.
     if not ratio * (1.0 + CHANCE_SIGMAS * scatter) < 1.0:
         return 0.0

@@ -19,7 +19,7 @@ import numpy as np
 from ltcl.errors import InputError
 from ltcl.transport import diagnostics
 from ltcl.transport.covariance import channel_matrices
-from ltcl.transport.diagnostics.choice import bounce_spread, solved_system
+from ltcl.transport.diagnostics.choice import bounce_spreads, solved_system
 from ltcl.transport.first_bounce import ENTRIES
 from ltcl.transport.transport import Transport
 from ltcl.transport.uncertainty import bounce_variances
@@ -174,7 +174,7 @@ class Evidence:
         yield self._relative_error("pictures", channel, gain * plain, deviation)
 
     def _measure_bounces(self) -> Iterator[Measure]:
-        """Errors of bounces 1 to 3 under white, and their change by the choice of F."""
+        """Errors of bounces 1 to 3 under white, and their changes by F and by larger pixels."""
         random = np.random.default_rng(0)
         for channel, S in enumerate(self.systems):
             yield from self._measure_spread(S)
@@ -191,13 +191,16 @@ class Evidence:
                 yield error._replace(name="bounces")
 
     def _measure_spread(self, S: HostSystem) -> Iterator[Measure]:
-        """The change of bounces by the choice of F; it counts where F is diag(T)."""
+        """Changes of bounces by the choice of F, which counts if F is diag(T), and by pixels."""
         system = solved_system(S.T, S.F, S.matmat, S.solve)
-        spread = bounce_spread(system, S.F)
-        for k, value in enumerate(spread.tolist(), 1):
-            yield Measure(f"spread_{k}", value)
-        is_diagonal = np.allclose(system.diagonal, 1.0, rtol=1e-6)
-        yield Measure("spread", spread.max() if is_diagonal else 0.0)
+        spreads = bounce_spreads(S.T, S.F, system, self.T.grid)
+        for k in (1, 2, 3):
+            yield Measure(f"spread_{k}", float(spreads.choice[k - 1]))
+            change = float(spreads.resolution[k - 1])
+            if not math.isnan(change):
+                yield Measure(f"resolution_{k}", change)
+        largest = float(spreads.choice.max())
+        yield Measure("spread", largest if system.has_diagonal_of_T else 0.0)
 
     def _relative_error(
         self, name: str, channel: int, light: np.ndarray, deviation: np.ndarray

@@ -8,10 +8,12 @@ damage spoils the use (`ltcl.transport.verdict.damages`). The numbers come from 
 
 Known limits: bounces are those of light between surfaces that the projector lights and that are
 matt; light from other surfaces, gloss that T does not show as such, and light that returns to its
-own pixel are unknown. T alone cannot show damages that another scene would explain as well: a gain
-of entries, camera pixels or colours; light that changes slowly during a scan (`sum_deviation` shows
-it); saturation without noise; three channels exchanged as a whole; light of one colour in another
-without `mixing` or blocks; little ambient light, or any if gloss has bounces below 0.
+own pixel are unknown. Light that is uneven within pixels changes bounces, by about as much as
+pixels of twice the size do (`resolution_1` to `resolution_3`), which the text tells. T alone cannot
+show damages that another scene would explain as well: a gain of entries, camera pixels or colours;
+light that changes slowly during a scan (`sum_deviation` shows it); saturation without noise; three
+channels exchanged as a whole; light of one colour in another without `mixing` or blocks; little
+ambient light, or any if gloss has bounces below 0.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class Verdict:
     compensation, bounces : bool or None
         Whether T is good for them: errors by noise are at most 2 % in pictures, 5 % in bounces 1 to
         3, the choice of the first bounce changes these by at most 5 %, and no damage spoils them.
-        Bounces are good as far as light between lit, matt surfaces explains T. None if unknown.
+        Bounces are good as far as light between lit, matt surfaces explains T, and is even within
+        pixels. None if unknown.
     causes : tuple of str
         Names of those `numbers` that deviate, most important first; docs/reference/json.md lists
         them.
@@ -183,17 +186,24 @@ def _explain(findings: list[Finding], numbers: Mapping[str, float]) -> str:
         pictures = _round_percent(numbers.get("pictures", 0.0))
         text = f"Errors by noise are {pictures} in pictures"
         if "bounces" in numbers:
-            spread = max(numbers[f"spread_{k}"] for k in (1, 2, 3))
-            text += (
-                f" and {_round_percent(numbers['bounces'])} in bounces at most; the choice of the "
-                f"first bounce makes {_round_percent(spread)} in bounces"
-            )
+            bounces = _round_percent(numbers["bounces"])
+            text += f" and {bounces} in bounces at most; {_describe_spreads(numbers)}"
         return text
     first = findings[0]
     text = f"{first.cause}: {first.advice}"
     text = text[0].upper() + text[1:]
     if len(findings) > 1:
         text += f"; also, {findings[1].cause}"
+    return text
+
+
+def _describe_spreads(numbers: Mapping[str, float]) -> str:
+    """Changes of bounces by what T alone does not decide."""
+    spread = max(numbers[f"spread_{k}"] for k in (1, 2, 3))
+    text = f"the choice of the first bounce makes {_round_percent(spread)} in bounces"
+    if "resolution_1" in numbers:
+        change = max(numbers[f"resolution_{k}"] for k in (1, 2, 3))
+        text += f", pixels of twice the size make {_round_percent(change)}"
     return text
 
 

@@ -405,3 +405,11 @@ def test_a_bad_photograph_is_named_by_its_file(
     assert BlockStore.open(store).written
     shutil.copytree(session[0] / "photographs", folder / "photographs", dirs_exist_ok=True)
     np.testing.assert_array_equal(scan(folder, store), session[1])
+
+
+def test_the_first_photograph_tells_the_size_of_the_camera(tmp_path: Path) -> None:
+    rig = prepared(tmp_path)
+    assert rig.photographed_grid() is None
+    path = place(tmp_path, number=2)
+    write(path)
+    assert rig.photographed_grid() == images.read_codes(path).shape[:2]

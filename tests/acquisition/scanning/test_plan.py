@@ -137,3 +137,9 @@ def test_time_disk_and_saturation() -> None:
     saturated = plans(GRID, (8.0,), NoiseModel(), Light(direct=0.5))
     assert saturated["pixel"].error == 1.0
     assert saturated["hadamard"].error == 1.0
+
+
+def test_computing_takes_its_time_by_megapixel() -> None:
+    for plan in plans(GRID, (0.5, 8.0), megapixels=45.0, pace=0.2).values():
+        assert plan.computing == pytest.approx(plan.photographs * 9.0)
+    assert plans(GRID, (0.5, 8.0), pace=0.2)["pixel"].computing is None

@@ -114,6 +114,7 @@ def test_the_gain_is_the_largest_within_the_loss(T, bounds, ambient, allowed):
     assert c.clipped > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-3, 1e-2])
 @pytest.mark.parametrize(
     ("bounds", "contrast"),

@@ -83,6 +83,7 @@ HOLDERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holder", HOLDERS)
 def test_rows_from_elsewhere_give_the_same_bits(holder, client, matrix, tmp_path):
     rows = HOLDERS[holder](matrix, tmp_path / "T.zarr")
@@ -113,6 +114,7 @@ def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limits", [{"threshold": 1e-3, "first": 2e-4}, {"drop": 0.1}, {"drop": 0.1, "most": 900}]
 )

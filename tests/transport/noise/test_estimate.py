@@ -154,3 +154,17 @@ def test_unknown_noise_is_kept_in_files(tmp_path: Path) -> None:
     given = ltcl.Transport(T.to_numpy(), T.grid, noise=T.noise)
     ltcl.save(tmp_path / "T.npz", given)
     assert ltcl.load(tmp_path / "T.npz").noise.source == "unknown"
+
+
+def test_errors_of_few_pixels_do_not_seem_to_cancel() -> None:
+    """Row sums of a small T may have little detail by chance."""
+    exact = truth("box", 6)
+    noise = noise_of(exact, 3e-3)
+    entries = exact.to_numpy()
+    shares = []
+    for seed in range(60):
+        E = np.sqrt(noise.variance(entries)) * np.random.default_rng(seed).standard_normal(
+            exact.shape
+        )
+        shares.append(ltcl.Transport(entries + E, exact.grid).noise.neighbours[0])
+    assert np.count_nonzero(shares) <= 1

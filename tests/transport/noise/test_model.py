@@ -56,6 +56,7 @@ def same(a: Noise | None, b: Noise) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ATTRIBUTES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photons", [0.0, 1.0, 300.0])
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("scene", SCENES)
