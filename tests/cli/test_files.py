@@ -195,12 +195,13 @@ def test_compression_down_to_the_noise(program, colour_transport, tmp_path):
     assert report["compression"]["rtol"] == "noise"
 
 
-def test_a_transport_with_less_noise(program, colour_transport, tmp_path):
+@pytest.mark.slow
+def test_a_transport_with_less_noise(program, tmp_path):
     noisy = tmp_path / "noisy.npz"
     out = tmp_path / "D.zarr"
-    T = ltcl.load(colour_transport)
+    T = scenes.box(8, sides=3, albedo=[(0.7, 0.3, 0.2)] * 3).transport()
     exact = T.to_numpy()
-    entries = exact + 1e-3 * random.standard_normal((3, 48, 48))
+    entries = exact + 1e-3 * random.standard_normal(exact.shape)
     ltcl.save(noisy, ltcl.Transport(entries, T.grid, T.first_bounce))
     noise = program("denoise", noisy, "--out", out, "--json").json["noise"]
     for before, after in zip(noise["before"], noise["after"], strict=True):

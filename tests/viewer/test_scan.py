@@ -26,7 +26,7 @@ import ltcl
 from ltcl import errors, images
 from ltcl.acquisition import FolderRig, Project, rigs
 from ltcl.acquisition.agreement import CameraModel
-from ltcl.acquisition.radiometry import Response
+from ltcl.acquisition.radiometry import Radiance, Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.show.player import play
@@ -115,12 +115,12 @@ def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
         path = tmp_path / f"{shot.save_as}.png"
         images.write(path, np.minimum(factor * codes, 1), encoding="linear")
     scan = Scan(tmp_path, None)
-    valid = SimpleNamespace(valid=np.ones(6))
+    white = Radiance(*np.ones((3, 1, 6)))
     known: Any = {
         "exposures": (0.1, 0.4),
         "camera": CameraModel(response=Response.identity()),
     }
-    known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
+    known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": white}
     scan.agreement.calibration = cast(Any, SimpleNamespace(**known))
     warnings = scan.scan(0)[0]["warnings"]
     for first, second in ((3, 4), (5, 6)):
