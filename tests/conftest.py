@@ -22,8 +22,8 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SMALL = 4096  # bytes: a 53 x 53 matrix takes several slabs, its vectors still fit
 ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 # A table of tests with so many cases is long; the default run takes one case in TABLE_STEP of it.
-LONG_TABLE = 6
-TABLE_STEP = 6
+LONG_TABLE = 4
+TABLE_STEP = 8
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -35,7 +35,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Count most cases of a long table as slow: without `-m ''` every sixth is run.
+    """Count most cases of a long table as slow: without `-m ''` every eighth is run.
 
     Whoever chooses tests by ``-k`` or by the name of a case gets all of them.
     """
