@@ -24,8 +24,8 @@ ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 # A table of tests with so many cases is long; the default run takes one case in TABLE_STEP of it.
 LONG_TABLE = 4
 TABLE_STEP = 8
-# "2/4": of long tables, also of slow ones, run the cases 2, 6, 10, ... only, counted from 0. CI does
-# so, and goes on by one at each commit, so that four landings run all.
+# "2/4": of long tables, also of slow ones, only the cases 2, 6, 10, ... are run, counted from 0. CI
+# does so, and goes on by one at each commit, so that four landings run all.
 TABLE_PART = os.environ.get("LTCL_TABLE_PART", "0/1")
 
 
