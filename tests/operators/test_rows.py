@@ -126,10 +126,10 @@ def asked(monkeypatch, device):
     calls = []
 
     def choose(device, file, problem, variants):
-        for launch in variants.values():
-            launch()
+        *_, last = variants
+        variants[last]()
         calls.append(problem)
-        return list(variants)[-1]
+        return last
 
     monkeypatch.setattr(tuning, "choose", choose)
     # CPUs have one kernel.

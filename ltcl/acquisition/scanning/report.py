@@ -55,8 +55,8 @@ class Report:
     >>> rig, store = VirtualRig(np.eye(64) / 2, (8, 8), bits=12), f"{tempfile.mkdtemp()}/T.zarr"
     >>> T = ltcl.acquire(rig, geometry="aligned", strategy="adaptive", store=store)
     >>> report = Report.of(store)
-    >>> report.patterns, report.coverage
-    (12, 1.0)
+    >>> report.patterns < 64, report.coverage  # one pixel at a time: 64
+    (True, 1.0)
     """
 
     strategy: str
