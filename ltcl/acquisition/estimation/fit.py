@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,12 +24,18 @@ from ltcl import checks
 from ltcl.acquisition.estimation.pairs import Pairs, gains
 from ltcl.acquisition.estimation.regression import ROUNDS, Prior, Rows, learn_prior, solve_rows
 from ltcl.acquisition.estimation.view import find_view
-from ltcl.acquisition.estimation.windows import Windows, hat_matrix, sums_under_hats
+from ltcl.acquisition.estimation.windows import (
+    Windows,
+    functions_of_row,
+    hat_matrix,
+    sums_under_hats,
+)
 from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.errors import InputError, InputTypeError
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.matrices import check_mixing
+from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport
 
 logger = logging.getLogger(__name__)
@@ -46,6 +52,12 @@ MAX_COLOUR_CONDITION = 1e4
 BASIS = "hats"
 # Standard deviations by which a first bounce must be above 0.
 FIRST_BOUNCE_SIGMAS = 5.0
+# Least factor of the variances of entries.
+LEAST_SCALE = 1e-4
+# Rows of T that are looked at together.
+ENTRY_ROWS = 256
+# Bytes of a function of a row while it is learned: mean, variance, node, and what is made of them.
+ROW_BYTES = 40
 # Light of a function that is left out, relative to that of the camera pixel.
 NEGLIGIBLE_LIGHT = 1e-6
 
@@ -71,6 +83,17 @@ class Fit:
         What T leaves of a photograph at a pixel, relative to its light: noise of the camera, and
         light that varies faster than the functions do.
     pairs : Pairs
+        Those that were given.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> patterns = numpy.random.default_rng(0).random((40, 3, 4))
+    >>> photographs = 0.5 * patterns + 0.01 * patterns.sum(axis=(1, 2), keepdims=True)
+    >>> result = ltcl.fit(patterns[:20], photographs[:20])
+    >>> result = result.add(patterns[20:], photographs[20:])
+    >>> len(result.pairs), bool(result.error < 0.01)
+    (40, True)
     """
 
     transport: Transport
@@ -144,6 +167,8 @@ def fit(
     InputError, InputTypeError
         Shapes that do not fit together, NaN, too few pairs, patterns that are all the same,
         photographs that are saturated.
+    MemoryLimitError
+        More pixels than the host has memory for.
     AcquisitionError
         Photographs in another order than the patterns; pairs that do not show the geometry.
 
@@ -232,11 +257,12 @@ def _fit(
     errors = _norms(left) / np.maximum(_norms(steady.photographs[judges]), np.finfo(float).tiny)
 
     error = float(np.sqrt(np.mean(errors**2)))
+    scales = estimator.scale_of_variance(pairs.patterns[judges], left)
 
     # 3. The transport, from all pairs.
     estimator.solve(steady)
     return Fit(
-        transport=Transport.from_arrays(estimator.arrays(), device=device),
+        transport=Transport.from_arrays(estimator.arrays(scales), device=device),
         error=error,
         errors=errors,
         held_out=judges,
@@ -258,8 +284,10 @@ class _Estimator:
         progress: Callable[[str, int, int], object] | None,
     ) -> None:
         self.grid = grid
+        _check_memory(grid, channels)
         self.windows = Windows.of(grid)
         self.W = hat_matrix(grid)
+        self.W_squared: Any = scipy.sparse.csr_array(self.W.multiply(self.W))
         self.channels = channels
         self.finds_mixing = mixing is None and channels == 3
         self.mixing = np.eye(channels) if mixing is None else mixing
@@ -311,8 +339,42 @@ class _Estimator:
         """The median of what rows leave of a photograph, relative to the light of the pixel."""
         return float(np.sqrt(np.median([prior.noise for prior in self.priors])))
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of the transport (`ltcl.transport.stored`)."""
+    def scale_of_variance(self, patterns: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Factors of the variances of all entries, under which T p errs as it did, (channels,).
+
+        `left` is what T left of photographs, (frames, N, channels). Errors of entries in a row go
+        together, which their variances do not tell.
+        """
+        scales = []
+        for channel in range(self.channels):
+            prior = self.priors[channel]
+            squares = (patterns @ self.mixing[channel]) ** 2
+            sums = self.W_squared @ squares.T
+            expected = (self._variances(channel) @ sums).sum()
+            noise = len(patterns) * (prior.noise * prior.light**2).sum()
+            measured = max((left[:, :, channel] ** 2).sum() - noise, 0.0)
+            scales.append(max(measured / expected, LEAST_SCALE))
+        return np.array(scales)
+
+    def arrays(self, scales: np.ndarray) -> dict[str, np.ndarray]:
+        """The arrays of the transport (`ltcl.transport.stored`), with the noise of its entries."""
+        pixels = len(self.windows.nodes)
+        samples = [self._entries(channel, scales[channel]) for channel in range(self.channels)]
+        noise = Noise.fit((pixels, pixels), samples, "acquired")
+        return self._transport_arrays() | noise.to_arrays()
+
+    def _entries(self, channel: int, scale: float) -> Iterator[tuple[np.ndarray, ...]]:
+        """Rows, columns, light and variances of entries of T, some rows at a time."""
+        C: Any = self._core(channel)
+        V: Any = self._variances(channel) * scale
+        for start in range(0, C.shape[0], ENTRY_ROWS):
+            rows = slice(start, start + ENTRY_ROWS)
+            light = (C[rows] @ self.W).toarray()
+            variance = (V[rows] @ self.W_squared).toarray()
+            i, j = np.indices(light.shape).reshape(2, -1)
+            yield i + start, j, light.ravel(), variance.ravel()
+
+    def _transport_arrays(self) -> dict[str, np.ndarray]:
         cores = []
         diagonals = []
         first_bounce = []
@@ -335,6 +397,14 @@ class _Estimator:
 
     def _core(self, channel: int) -> scipy.sparse.csr_array:
         """C (N, nodes) of T = C W."""
+        return self._in_nodes(channel, self.rows[channel].mean)
+
+    def _variances(self, channel: int) -> scipy.sparse.csr_array:
+        """Variances of C, in the same pattern."""
+        return self._in_nodes(channel, self.rows[channel].variance)
+
+    def _in_nodes(self, channel: int, values: np.ndarray) -> scipy.sparse.csr_array:
+        """Values of functions of each row, (N, q), at their nodes, where T has light."""
         mean = self.rows[channel].mean
         area = self.windows.area[self.windows.group]
         light = self.priors[channel].light[:, None]
@@ -343,7 +413,7 @@ class _Estimator:
         row, function = np.nonzero(matters)
         column = self.windows.nodes[row, function]
         shape = len(mean), self.windows.absent
-        return scipy.sparse.csr_array((mean[row, function], (row, column)), shape=shape)
+        return scipy.sparse.csr_array((values[row, function], (row, column)), shape=shape)
 
     def _sums(self, patterns: np.ndarray, channel: int) -> np.ndarray:
         """Sums under all hats of the light that a channel answers to."""
@@ -371,6 +441,13 @@ class _Estimator:
             # The prior, the rows for those that judge, and at last all pairs.
             expected = (ROUNDS + 2) * self.channels * len(self.windows.nodes)
             self._progress("fit", self._done, max(self._done, expected))
+
+
+def _check_memory(grid: tuple[int, int], channels: int) -> None:
+    """Refuse a grid whose rows do not fit the memory of the host."""
+    height, width = grid
+    numbers = height * width * functions_of_row(grid) * (channels + 1)
+    checks.fits_host(f"fitting {height} x {width} pixels", numbers * ROW_BYTES)
 
 
 def _light(patterns: np.ndarray, photographs: np.ndarray) -> np.ndarray:

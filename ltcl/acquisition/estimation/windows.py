@@ -38,6 +38,20 @@ def hat_levels(grid: tuple[int, int]) -> list[tuple[int, int]]:
     return levels
 
 
+def functions_of_row(grid: tuple[int, int]) -> int:
+    """Number of functions in the window of a pixel.
+
+    >>> functions_of_row((4, 9)), functions_of_row((64, 64))
+    (40, 125)
+    """
+    count = 0
+    for rows, columns in hat_levels(grid):
+        if max(rows, columns) <= 2 * REACH + 1:
+            return count + rows * columns
+        count += (2 * REACH + 1) ** 2
+    return count
+
+
 def hat_matrix(grid: tuple[int, int]) -> scipy.sparse.csr_array:
     """W (nodes, N) of `ltcl.operators.Hats`: the hats of all levels on the pixels."""
     levels = []

@@ -107,10 +107,24 @@ def test_the_pattern_makes_the_wall_look_as_desired(T, result):
     assert relative_error(T @ c.pattern / c.gain, desired) < 0.02
 
 
+def test_standard_deviations_are_those_of_the_errors(T, result):
+    """Errors of pictures, not of entries, which go together."""
+    assert result.transport.measured_noise.source == "acquired"
+    entries = result.transport.to_numpy()
+    variance = result.transport.noise.variance(entries)
+    ratios = []
+    for pattern in pictures(20, seed=5):
+        deviation = np.sqrt(variance @ pattern.ravel() ** 2)
+        error = result.transport @ pattern - T @ pattern
+        ratios.append(error.ravel() / deviation)
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
 def test_the_first_bounce_is_that_of_the_scene(T, result):
     np.testing.assert_allclose(result.transport.first_bounce, T.first_bounce, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_more_pairs_are_added(T, pairs, result):
     patterns = pictures(60, seed=3)
     more = result.add(patterns, photograph(T, patterns))
@@ -141,6 +155,7 @@ def test_colours_that_mix_are_told_apart(colour_T, device):
     assert np.mean(errors) < 0.006
 
 
+@pytest.mark.slow
 def test_grey_patterns_light_all_channels(colour_T, device):
     patterns = pictures(40)
     in_colour = np.repeat(patterns[..., None], 3, axis=3)
@@ -177,6 +192,7 @@ def test_pairs_show_where_the_camera_looks(pairs):
     assert np.quantile(distance, 0.95) < 0.3
 
 
+@pytest.mark.slow
 def test_geometry_from_the_pairs_or_given(T, pairs, device):
     patterns, photographs = pairs
     seen = seen_by_camera(photographs)

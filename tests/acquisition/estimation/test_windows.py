@@ -6,7 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.acquisition.estimation.windows import Windows, hat_levels, hat_matrix, sums_under_hats
+from ltcl.acquisition.estimation.windows import (
+    Windows,
+    functions_of_row,
+    hat_levels,
+    hat_matrix,
+    sums_under_hats,
+)
 from ltcl.operators import Hats
 from tests import reference
 
@@ -24,6 +30,7 @@ def test_hats_are_those_of_the_basis(device, grid):
 def test_windows_hold_the_pixel_itself_once_and_no_function_twice(grid):
     windows = Windows.of(grid)
     pixels = grid[0] * grid[1]
+    assert windows.nodes.shape == (pixels, functions_of_row(grid))
     own = windows.nodes == np.arange(pixels)[:, None]
     assert np.all(own.sum(axis=1) == 1)
     assert np.all(windows.group[own.argmax(axis=1)] == 0)
