@@ -371,8 +371,9 @@ class _Estimator:
             rows = slice(start, start + ENTRY_ROWS)
             light = (C[rows] @ self.W).toarray()
             variance = (V[rows] @ self.W_squared).toarray()
-            i, j = np.indices(light.shape).reshape(2, -1)
-            yield i + start, j, light.ravel(), variance.ravel()
+            # A pixel that the camera does not see has none.
+            i, j = np.nonzero(variance)
+            yield i + start, j, light[i, j], variance[i, j]
 
     def _transport_arrays(self) -> dict[str, np.ndarray]:
         cores = []
