@@ -10,6 +10,7 @@ import pytest
 
 import ltcl
 from ltcl import images, scenes
+from ltcl.images.frames import write_video
 
 FRAMES = 60
 
@@ -52,8 +53,8 @@ def test_films_and_another_grid(program, pairs, T, tmp_path):
         pattern = images.read(pairs / "patterns" / f"p{number}.exr")
         shown.append(pattern)
         seen.append(T @ pattern)
-    images.frames.write_video(folder / "patterns.mkv", shown)
-    images.frames.write_video(folder / "photographs.mkv", seen)
+    write_video(folder / "patterns.mkv", shown)
+    write_video(folder / "photographs.mkv", seen)
     outcome = program("acquire", "fit", folder, "--grid", "4x8")
     assert "4 x 8 pixels, from 60 pairs" in outcome.out, outcome.err
     assert ltcl.load(folder / "transport.npz").grid == (4, 8)
