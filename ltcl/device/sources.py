@@ -7,6 +7,7 @@ file that a person edits.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 import warnings
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 # Exact float32: no fast-math, which deletes tests for NaN. Contraction of a * b + c is left to the
 # driver. Names of arguments are kept for launches, and all warnings are off.
 OPTIONS = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-w"]
+# Times that PoCL is asked for a program before its failure counts.
+POCL_ATTEMPTS = 3
 INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
@@ -67,10 +70,18 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
         The source does not compile; the message has the compiler's own words. Or the driver is
         PoCL, and cannot use its folder of compiled kernels.
     """
-    if pocl_cache.DRIVER in device.driver:
-        with pocl_cache.checked():
-            return _build(device, file, defines)
-    return _build(device, file, defines)
+    if pocl_cache.DRIVER not in device.driver:
+        return _build(device, file, defines)
+    with pocl_cache.checked():
+        for _ in range(POCL_ATTEMPTS - 1):
+            # Two processes that build the same program at the same time disturb each other.
+            with contextlib.suppress(_FailedWithoutReason):
+                return _build(device, file, defines)
+        return _build(device, file, defines)
+
+
+class _FailedWithoutReason(DeviceError):
+    """A program was not built, and its compiler found no error."""
 
 
 def _build(device: Device, file: str, defines: dict[str, Any]) -> Any:
@@ -85,6 +96,5 @@ def _build(device: Device, file: str, defines: dict[str, Any]) -> Any:
             # pyopencl adds options and source to the log.
             log_text = str(error).partition("(options:")[0].strip()
             where = f"{device.name} ({device.driver}) with {' '.join(options)}"
-            raise DeviceError(
-                f"kernels/{file}.cl does not compile on {where}:\n{log_text}"
-            ) from error
+            kind = DeviceError if "error" in log_text else _FailedWithoutReason
+            raise kind(f"kernels/{file}.cl does not compile on {where}:\n{log_text}") from error

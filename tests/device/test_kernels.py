@@ -101,6 +101,32 @@ def test_messages_name_file_line_and_defines(device, own_kernels):
         assert re.search(r"part\.h\W+2\b", str(error.value))
 
 
+@pytest.mark.parametrize("failures", [1, 2, 3])
+def test_a_program_that_fails_without_a_reason_is_built_again(
+    device, own_kernels, monkeypatch, failures
+):
+    """PoCL does so where two processes build the same program at the same time."""
+    # A program of its own for each number of failures: a device keeps what it has built.
+    name = f"own{failures}"
+    (own_kernels / f"{name}.cl").write_text(f"kernel void {name}_a(int n) {{ }}\n")
+    build = cl.Program.build
+    left = failures
+
+    def fail_at_first(program, *options, **more):
+        nonlocal left
+        left -= 1
+        if left >= 0:
+            raise cl.RuntimeError("clBuildProgram failed: BUILD_PROGRAM_FAILURE")
+        return build(program, *options, **more)
+
+    monkeypatch.setattr(cl.Program, "build", fail_at_first)
+    if failures < sources.POCL_ATTEMPTS and "Portable" in device.driver:
+        assert device.kernel(name, f"{name}_a").name == f"{name}_a"
+    else:
+        with pytest.raises(DeviceError, match=name):
+            device.kernel(name, f"{name}_a")
+
+
 @pytest.mark.parametrize("file", ["csr", "dense"])
 def test_missing_and_wrong_defines_and_names_are_refused(device, file):
     for name, defines, part in (

@@ -26,8 +26,6 @@ N = 43
 # As the albedos of a wall differ.
 SCENES = [lambertian(N, rho, density=0.7) for rho in (0.6, 0.3, 0.5)]
 SCENE = SCENES[0]
-CORNER = ltcl.scenes.box(10, sides=3, albedo=0.4).transport().systems[0]
-ROOM = CORNER.to_dense().astype(float)
 
 
 def with_empty_rows(n: int, seed: int, *rows: int) -> np.ndarray:
@@ -129,6 +127,12 @@ def test_the_mean_of_many_runs_is_the_solution_of_every_channel(device, name, va
         assert noisy.size == 0 or 0.8 < np.sqrt(np.mean(noisy**2)) < 1.25
 
 
+@pytest.fixture(scope="module")
+def corner(device):
+    """S of a corner of three walls, 300 pixels."""
+    return ltcl.scenes.box(10, sides=3, albedo=0.4).transport(device=device).systems[0]
+
+
 def light(lights: int, ambient: float = 0.0) -> np.ndarray:
     b = np.full(300, ambient)
     b[np.random.default_rng(lights).choice(300, lights, replace=False)] = 1.0
@@ -142,12 +146,12 @@ LIGHT["dense"] = np.random.default_rng(0).random(300)
 @pytest.mark.parametrize("samples", [64, 256])
 @pytest.mark.parametrize("variant", ["usual", "adjoint"])
 @pytest.mark.parametrize("lights", LIGHT)
-def test_two_standard_errors_hold_at_the_share_they_promise(lights, variant, samples):
+def test_two_standard_errors_hold_at_the_share_they_promise(corner, lights, variant, samples):
     """Also where no walk has met most of the light."""
     b = LIGHT[lights]
     options = VARIANTS[variant]
-    exact = np.linalg.solve(ROOM, b)
-    runs = [sample(CORNER, b, samples=samples, seed=s, **options) for s in range(6)]
+    exact = np.linalg.solve(corner.to_dense().astype(float), b)
+    runs = [sample(corner, b, samples=samples, seed=s, **options) for s in range(6)]
     assert np.mean([covered(run, exact) for run in runs]) >= 0.93
     assert all(np.all(error_of(run) > 0) for run in runs)
 
@@ -180,11 +184,11 @@ def test_errors_hold_where_light_goes_one_way(device, lit, options):
 
 
 @pytest.mark.parametrize("lights", LIGHT)
-def test_a_target_error_is_met_at_every_pixel_however_few_the_lights(lights):
+def test_a_target_error_is_met_at_every_pixel_however_few_the_lights(corner, lights):
     b = LIGHT[lights]
     error = 1e-2 if lights == "dense" else 2e-3
-    exact = np.linalg.solve(ROOM, b)
-    s = sample(CORNER, b, error=error)
+    exact = np.linalg.solve(corner.to_dense().astype(float), b)
+    s = sample(corner, b, error=error)
     assert np.all((error_of(s) > 0) & (error_of(s) <= error))
     assert np.median(error_of(s)) > error / 8  # not by drowning it in samples
     assert np.abs(s.x - exact).max() <= 5 * error

@@ -185,13 +185,18 @@ BRIGHT = ltcl.Transport(1.5 * truth("corner", 8).to_numpy(), (8, 16))
         (ltcl.Transport(np.eye(12), (3, 4)), InputError, r"noise.*grid \(3, 4\)"),
         (ltcl.Transport([np.eye(128)] * 3, (8, 16)), InputError, "noise.*channels 3"),
         (measure(BRIGHT, noise_of(BRIGHT, 1e-3), 1), InputError, r"noise.*1\.5 times"),
-        (ltcl.compress(truth("corner", 8), rtol=0.1), InputError, "noise.*compressed"),
     ],
 )
 def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) -> None:
     T = truth("corner", 8)
     with pytest.raises(error, match=match):
         ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
+
+
+def test_a_compressed_second_measurement_is_refused() -> None:
+    T = truth("corner", 8)
+    with pytest.raises(InputError, match=r"noise.*compressed"):
+        ltcl.Transport(T.to_numpy(), T.grid, noise=ltcl.compress(T, rtol=0.1))
 
 
 BAD = [
