@@ -396,7 +396,7 @@ def scale_codes(image: np.ndarray, camera: Any) -> np.ndarray:
             return image
     elif white_level is None:
         white_level = largest_code(image.dtype, camera)
-    if white_level < image.max():
+    if white_level < image.max(initial=0):
         image = np.minimum(image, image.dtype.type(white_level))
     return image * np.float32(1.0 / white_level)
 

@@ -98,12 +98,16 @@ def test_few_photons_deviate_from_nothing() -> None:
 def test_a_clean_calibration_of_a_noisy_camera_agrees(
     gain: float, albedo: Any, by_hand: bool
 ) -> None:
-    """The response has to be measured in that noise, which the camera clips at black."""
+    """The response has to be measured in that noise, which the camera clips at black.
+
+    The few photographs of a person tell 500 electrons with a standard deviation of 9 %.
+    """
     T = ltcl.scenes.dihedral(8, albedo=albedo).transport()
     rig = Unplugged(T, T.grid, bits=12, gain=gain, response="srgb", ambient=0.01)
     rig.keeps_photographs = by_hand
     calibration = measure(Shots(rig), geometry="aligned")
-    assert calibration.noise.electrons == pytest.approx(gain, rel=0.1)
+    tolerance = 0.25 if by_hand and gain < 1000.0 else 0.1
+    assert calibration.noise.electrons == pytest.approx(gain, rel=tolerance)
 
 
 def test_defects_and_a_moth_deviate_from_nothing() -> None:

@@ -24,6 +24,8 @@ from ltcl.transport.first_bounce import ENTRIES
 FACTOR = 2
 # Large pixels whose T is inverted.
 MAX_LARGE_PIXELS = 2048
+# Numbers of T that are read at once.
+CHUNK_NUMBERS = 1 << 22
 
 
 def resolution_spread(
@@ -52,8 +54,7 @@ def resolution_spread(
         return unknown
     # Of ones where `average` is not 0.
     add = average.T.sign()
-    large = average @ (T @ add) if isinstance(T, np.ndarray) else (average @ T @ add).toarray()
-    large = np.asarray(large, np.float64)
+    large = _large_pixels(T, average, add)
     try:
         inverse = np.linalg.inv(large)
     except np.linalg.LinAlgError:
@@ -69,6 +70,19 @@ def resolution_spread(
         size = max(float(np.linalg.norm(expected)), 1e-300)
         spread[number] = np.linalg.norm(of_large - expected) / size
     return spread
+
+
+def _large_pixels(T: Any, average: Any, add: Any) -> np.ndarray:
+    """T of large pixels, float64; of a dense T, which may lie on the disk, some rows at a time."""
+    if not isinstance(T, np.ndarray):
+        return np.asarray((average @ T @ add).toarray(), np.float64)
+    pixels, _ = average.shape
+    large = np.zeros((pixels, pixels))
+    step = max(CHUNK_NUMBERS // T.shape[1], 1)
+    for start in range(0, T.shape[0], step):
+        rows = slice(start, start + step)
+        large += average[:, rows] @ (T[rows] @ add)
+    return large
 
 
 def _average(grid: tuple[int, int], is_lit: np.ndarray) -> Any:
