@@ -75,9 +75,15 @@ def read_header(data: bytes) -> Header:
         if kind == b"IEND":
             break
         place += length + 12
-    width, height, depth, colour_type, _, _, interlace = struct.unpack(
+    width, height, depth, colour_type, compression, filters, interlace = struct.unpack(
         ">IIBBBBB", chunks[b"IHDR"][0]
     )
+    # Pillow does not look at them, and libpng writes to stderr.
+    if compression != 0 or filters != 0 or interlace not in (0, 1):
+        raise FileError(
+            f"is damaged: compression {compression}, filter {filters} or interlace {interlace} is "
+            "unknown; they must be 0, 0, and 0 or 1"
+        )
     return Header(
         width=width,
         height=height,

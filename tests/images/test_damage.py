@@ -100,9 +100,17 @@ def test_truncated_files_and_any_flip_in_a_png_are_refused(tmp_path, suffix):
             assert refusal(path, data[:place] + flipped + data[place + 1 :])
 
 
-def png(data: bytes, depth: int = 8, size: tuple[int, int] = (3, 4)) -> bytes:
-    """A PNG file whose checksums are right, whatever is in it."""
-    head = struct.pack(">IIBBBBB", *size[::-1], depth, 0, 0, 0, 0)
+def png(
+    data: bytes,
+    depth: int = 8,
+    size: tuple[int, int] = (3, 4),
+    methods: tuple[int, int, int] = (0, 0, 0),
+) -> bytes:
+    """A PNG file whose checksums are right, whatever is in it.
+
+    `methods` are those of compression, filter and interlace.
+    """
+    head = struct.pack(">IIBBBBB", *size[::-1], depth, 0, *methods)
     chunks = [b"IHDR" + head, b"IDAT" + data, b"IEND"]
     file = b"\x89PNG\r\n\x1a\n"
     for chunk in chunks:
@@ -144,6 +152,8 @@ NO_PICTURES = [
     png(zlib.compress(b"\x09" + ROWS[1:])),  # 9 is no filter
     png(zlib.compress(ROWS[:7])),
     png(zlib.compress(ROWS), depth=7),
+    *(png(zlib.compress(ROWS), methods=methods) for methods in ((1, 0, 0), (0, 1, 0), (0, 0, 2))),
+    png(zlib.compress(b"\0abcdabcd" * 3), depth=16, methods=(1, 0, 0)),
 ]
 
 
