@@ -135,8 +135,8 @@ class Hats(MultiscaleSums):
     """Sums under the hat functions of all levels, (M, N), the finest first.
 
     Node (i, j) of level l stands at pixel (i s, j s), s = 2^l, and its hat is bilinear:
-    max(0, 1 - |row / s - i|) max(0, 1 - |column / s - j|). Level 0 is the pixels; on the last, no
-    side has more than two nodes. Sums of hats of one level are all pictures that are bilinear
+    ``max(0, 1 - |row / s - i|) max(0, 1 - |column / s - j|)``. Level 0 is the pixels; on the last,
+    no side has more than two nodes. Sums of hats of one level are all pictures that are bilinear
     between its nodes: the basis of transports that are estimated from pictures (`ltcl.fit`). Not
     orthonormal.
 
