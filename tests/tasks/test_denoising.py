@@ -325,7 +325,7 @@ def test_no_random_scene_gets_worse(seed: int) -> None:
 @pytest.mark.slow
 def test_of_many_random_scenes_none_gets_worse_and_most_get_better() -> None:
     ratios = []
-    for seed in range(6, 66):
+    for seed in range(6, 26):
         light, T = random_measurement(seed)
         ratios.append(picture_error_ratio(light, T, ltcl.denoise(T)))
     assert max(ratios) < 1.0001
