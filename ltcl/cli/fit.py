@@ -114,13 +114,16 @@ def _find_frames(folder: Path, name: str) -> Path:
     """The folder of pictures, or the film, of this name."""
     from ltcl.images.frames import is_frames
 
-    found = [path for path in sorted(folder.glob(f"{name}*")) if path.stem == name]
-    frames = [path for path in found if is_frames(path)]
-    if len(frames) != 1:
-        what = "no" if not frames else " and ".join(path.name for path in frames) + ", two"
-        raise FileError(
-            f"{folder}: has {what} {name}; it must have one folder of pictures or film of this name"
-        )
+    advice = f"it must have one folder of pictures, or one film, called {name}"
+    frames = []
+    for path in sorted(folder.glob(f"{name}*")):
+        if path.stem == name and is_frames(path):
+            frames.append(path)
+    if not frames:
+        raise FileError(f"{folder}: has no {name}; {advice}")
+    if len(frames) > 1:
+        names = " and ".join(path.name for path in frames)
+        raise FileError(f"{folder}: has {names}; {advice}")
     return frames[0]
 
 

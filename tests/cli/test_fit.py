@@ -62,6 +62,9 @@ def test_films_and_another_grid(program, pairs, T, tmp_path):
 
 def test_what_is_missing_is_named(program, pairs, tmp_path):
     program("acquire", "fit", tmp_path).refused(str(tmp_path), "no patterns")
+    (tmp_path / "patterns").mkdir()
+    (tmp_path / "patterns.mkv").touch()
+    program("acquire", "fit", tmp_path).refused("patterns and patterns.mkv", "must have one")
     bad = tmp_path / "T.xyz"
     program("acquire", "fit", pairs, "--out", bad).refused("T.xyz")
     assert not bad.exists()
