@@ -36,13 +36,15 @@ SWAPPED_ERROR_RATIO = 0.5
 class Pairs:
     """Patterns and photographs in linear light, (frames, N or M, channels).
 
-    `grid` is that of the patterns, `camera_grid` that of the photographs.
+    `grid` is that of the patterns, `camera_grid` that of the photographs. `variance` is that of the
+    photographs by the noise of the camera, if it is known.
     """
 
     grid: tuple[int, int]
     camera_grid: tuple[int, int]
     patterns: np.ndarray
     photographs: np.ndarray
+    variance: np.ndarray | None = None
 
     @classmethod
     def of(cls, patterns: Any, photographs: Any) -> Self:
@@ -82,7 +84,13 @@ class Pairs:
 
     def select(self, chosen: np.ndarray) -> Self:
         """Some of the pairs."""
-        return replace(self, patterns=self.patterns[chosen], photographs=self.photographs[chosen])
+        variance = None if self.variance is None else self.variance[chosen]
+        return replace(
+            self,
+            patterns=self.patterns[chosen],
+            photographs=self.photographs[chosen],
+            variance=variance,
+        )
 
     def resampled(self, resampling: Resampling) -> Self:
         """The pairs with photographs on the pixels of the projector."""

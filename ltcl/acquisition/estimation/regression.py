@@ -4,15 +4,16 @@
 A camera pixel saw y_m under pattern p_m. Its row of T is sum_k x_k h_k in the functions h_k of its
 window (`windows`), so
 
-    y_m = sum_k B_mk x_k + noise of variance n,    B_mk = p_m . h_k,    x_k ~ N(0, v_g)
+    y_m = sum_k B_mk x_k + noise of variance n_m,    B_mk = p_m . h_k,    x_k ~ N(0, v_g)
 
-where g is the group of k: its level and its distance. The mean of x given y, and its variance, are
+where g is the group of k: its level and its distance. With N of the n_m, the mean of x given y is
 
-    x = V^1/2 (I + V^1/2 B^T B V^1/2 / n)^-1 V^1/2 B^T y / n
+    x = V^1/2 (I + V^1/2 B^T N^-1 B V^1/2)^-1 V^1/2 B^T N^-1 y
 
 v is learned: the mean of x_k^2 + var(x_k) in a group, over pixels nearby, since light varies faster
-in a crease than on a wall (empirical Bayes, by expectation maximisation). So is n, all that the
-functions leave, relative to the light of the pixel.
+in a crease than on a wall (empirical Bayes, by expectation maximisation). n_m is the noise of the
+camera, as far as it is known, and all that the functions leave, which is learned, too, relative to
+the light of the pixel.
 """
 
 from __future__ import annotations
@@ -35,13 +36,15 @@ FIRST_SHARE = 0.01
 # Noise of a pixel relative to its light: before it is learned, and at least.
 FIRST_NOISE = 0.01
 LEAST_NOISE = 1e-5
+# Variance of a picture from which on it is unknown.
+UNKNOWN_NOISE = 1e9
 # Numbers of B at once.
 CHUNK_NUMBERS = 1 << 22
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prior:
-    """Variances of coefficients, (N, groups), and of the noise (N,), relative to `light` (N,).
+    """Variances of coefficients, (N, groups), and of what they leave, (N,), relative to `light`.
 
     `light` is that of each camera pixel under a pattern of ones, about.
     """
@@ -82,14 +85,15 @@ def learn_prior(
     pictures: np.ndarray,
     light: np.ndarray,
     progress: Callable[[int], None],
+    variance: np.ndarray | None = None,
 ) -> Prior:
     """The prior under which pictures (N, patterns) are likely; `sums` are those under all hats.
 
-    `progress` is called with the number of rows that were solved since its last call.
+    `variance` is that of the pictures by the noise of the camera, if it is known; `progress` is called with the number of rows that were solved since its last call.
     """
     prior = Prior.first(windows, light)
     for _ in range(ROUNDS):
-        rows = solve_rows(windows, sums, pictures, prior, progress)
+        rows = solve_rows(windows, sums, pictures, prior, progress, variance)
         prior = _more_likely(windows, rows, prior)
     return prior
 
@@ -100,36 +104,44 @@ def solve_rows(
     pictures: np.ndarray,
     prior: Prior,
     progress: Callable[[int], None],
+    variance: np.ndarray | None = None,
 ) -> Rows:
-    """The rows of T, given a prior."""
+    """The rows of T, given a prior; the arguments are those of `learn_prior`."""
     pixels, q = windows.nodes.shape
     mean = np.zeros((pixels, q))
-    variance = np.zeros((pixels, q))
+    uncertainty = np.zeros((pixels, q))
     residual = np.zeros(pixels)
     patterns = sums.shape[1]
     chunk = max(CHUNK_NUMBERS // (q * (patterns + q)), 1)
     for start in range(0, pixels, chunk):
         part = slice(start, start + chunk)
-        mean[part], variance[part], residual[part] = _solve(
+        light = prior.light[part, None]
+        left = prior.noise[part, None] * light**2
+        noise = np.broadcast_to(left, (len(light), patterns))
+        if variance is not None:
+            noise = noise + variance[part]
+        mean[part], uncertainty[part], misfit = _solve(
             sums[windows.nodes[part]],
             pictures[part],
-            np.sqrt(prior.coefficients[part][:, windows.group]) * prior.light[part, None],
-            prior.noise[part] * prior.light[part] ** 2,
+            np.sqrt(prior.coefficients[part][:, windows.group]) * light,
+            noise,
         )
-        progress(len(mean[part]))
-    return Rows(mean=mean, variance=variance, residual=residual)
+        residual[part] = misfit * left[:, 0]
+        progress(len(light))
+    return Rows(mean=mean, variance=uncertainty, residual=residual)
 
 
 def _solve(
     B: np.ndarray, pictures: np.ndarray, deviation: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, variance and residual of some rows.
+    """Mean and variance of some rows, and the mean square of what they leave, relative to noise.
 
-    B is (rows, q, patterns), `deviation` V^1/2 (rows, q), `noise` n (rows,).
+    B is (rows, q, patterns), `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
     """
-    _, q, patterns = B.shape
-    scaled = B * (deviation / np.sqrt(noise)[:, None])[:, :, None]
-    whitened = pictures / np.sqrt(noise)[:, None]
+    q = B.shape[1]
+    precision_of_pictures = 1.0 / np.sqrt(noise)
+    scaled = B * deviation[:, :, None] * precision_of_pictures[:, None, :]
+    whitened = pictures * precision_of_pictures
     precision = scaled @ scaled.transpose(0, 2, 1)
     diagonal = np.arange(q)
     precision[:, diagonal, diagonal] += 1.0
@@ -139,11 +151,12 @@ def _solve(
     shrunk = covariance[:, diagonal, diagonal]
     # Coefficients that the pictures determine, and not the prior.
     determined = q - shrunk.sum(axis=1)
-    freedom = np.maximum(patterns - determined, 1.0)
+    known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
+    freedom = np.maximum(known - determined, 1.0)
     mean = deviation * unscaled
     variance = deviation**2 * shrunk
-    residual = noise * (left**2).sum(axis=1) / freedom
-    return mean, variance, residual
+    misfit = (left**2).sum(axis=1) / freedom
+    return mean, variance, misfit
 
 
 def _more_likely(windows: Windows, rows: Rows, prior: Prior) -> Prior:
