@@ -73,6 +73,8 @@ MIN_DARK_RATIO = 8.0
 MAX_RAMPS = 4
 # Fewest photographs of black and of white: two determine noise.
 MIN_REPEATS = 2
+# Most of them before a scan of few patterns.
+MAX_SPARING_REPEATS = 4
 # Photographs that usually find the exposure of white.
 EXPECTED_PROBES = 2
 # Camera pixels for one of the projector's, in a plan before the first photograph.
@@ -89,23 +91,23 @@ class CaptureTimes(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """Numbers of photographs that an automatic rig takes, or a person.
+    """Numbers of photographs that are taken where they cost little, or much.
 
     Attributes
     ----------
-    by_hand : bool
-        Whether a person takes the photographs.
+    is_sparing : bool
+        Whether they cost much: a person takes them, or the scan after them takes few.
     exposures : int
         Exposures for the response.
     ramp_pixels : int
         Camera pixels in the ramps of each.
     codes : tuple of float
-        Uniform codes of the projector. Monotone cubics through the codes of an automatic rig, none
-        the inverse of another, deviate from sRGB, a power of 2.2 and film by at most 0.02 % of
-        white (root mean square), or 0.3 % by hand.
+        Uniform codes of the projector. Monotone cubics through the many codes, none the inverse of
+        another, deviate from sRGB, a power of 2.2 and film by at most 0.02 % of white (root mean
+        square), through the few by 0.3 %.
     """
 
-    by_hand: bool
+    is_sparing: bool
     exposures: int
     ramp_pixels: int
     codes: tuple[float, ...]
@@ -126,9 +128,9 @@ class Effort:
     def repeats(self, frames: int, camera_pixels: float) -> int:
         """Photographs of black and of white.
 
-        A person's are shared by the camera pixels that see one projector pixel.
+        Few are shared by the camera pixels that see one projector pixel.
         """
-        if not self.by_hand:
+        if not self.is_sparing:
             return max(MIN_REPEATS, frames)
         return max(MIN_REPEATS, math.ceil(frames / max(camera_pixels, 1.0)))
 
@@ -146,7 +148,7 @@ class Effort:
         dark_requests = _repeated(black, times.black, repeats)
         bright_requests = []
         for seconds in times.white:
-            is_single = self.by_hand and seconds != times.black[0]
+            is_single = self.is_sparing and seconds != times.black[0]
             count = 1 if is_single else repeats
             bright_requests += _repeated(white, [seconds], count)
         codes = self.codes
@@ -171,14 +173,14 @@ def _repeated(codes: np.ndarray, times: Sequence[float], count: int) -> list[Req
     return requests
 
 
-AUTOMATIC = Effort(
-    by_hand=False,
+THOROUGH = Effort(
+    is_sparing=False,
     exposures=8,
     ramp_pixels=1 << 14,
     codes=tuple((np.arange(16) + 0.3) / 16),
 )
-BY_HAND = Effort(
-    by_hand=True,
+SPARING = Effort(
+    is_sparing=True,
     exposures=5,
     ramp_pixels=1 << 10,
     codes=(0.07, 0.2, 0.38, 0.68, 0.9),
@@ -191,21 +193,25 @@ def expected_photographs(
     frames: int = 16,
     aligned: bool = False,
     by_hand: bool = False,
+    sparing: bool = False,
 ) -> int:
     """Number of photographs that `measure` takes without a known response.
 
     Probes of the exposure may add some. `by_hand`: by a person, with at least three camera pixels
-    to a side of one of the projector's.
+    to a side of one of the projector's; `sparing`: before a scan of few patterns.
 
     >>> expected_photographs((8, 16)), expected_photographs((8, 16), by_hand=True)
     (149, 39)
     """
-    effort = BY_HAND if by_hand else AUTOMATIC
+    effort = SPARING if by_hand or sparing else THOROUGH
+    if sparing:
+        frames = min(frames, MAX_SPARING_REPEATS)
     camera_pixels = 1 if aligned else EXPECTED_CAMERA_PIXELS
     ramps = effort.ramps(grid, camera_pixels * grid[0] * grid[1])
     # Black and white of the Gray code are photographed anyway.
     stripes = 0 if aligned else GrayCode(grid).count - 2
-    times = CaptureTimes(black=(2.0, 3.0), white=(1.0, 2.0, 3.0), scan=(2.0, 3.0))
+    scan_times = (2.0,) if sparing else (2.0, 3.0)
+    times = CaptureTimes(black=(2.0, 3.0), white=(1.0, 2.0, 3.0), scan=scan_times)
     repeats = effort.repeats(frames, camera_pixels)
     groups = effort.requests(grid, channels, repeats, times)
     captures = sum(map(len, groups))
@@ -220,13 +226,15 @@ def measure(
     exposures: Sequence[float] | None = None,
     frames: int = 16,
     side: int = 1,
+    sparing: bool = False,
     progress: ProgressFunction = ignore_progress,
     log: ArrayLog | None = None,
 ) -> Calibration:
     """Measure a set-up, with as many photographs as `expected_photographs` says.
 
-    The camera must resolve blocks of `side`; `log` has photographs of an earlier run; the other
-    arguments, and errors, are as in `ltcl.acquire`.
+    The camera must resolve blocks of `side`; `sparing`: with few photographs, before a scan of few
+    patterns at one exposure; `log` has photographs of an earlier run; the other arguments, and
+    errors, are as in `ltcl.acquire`.
 
     >>> from ltcl.acquisition import VirtualRig
     >>> calibration = measure(
@@ -235,13 +243,16 @@ def measure(
     >>> bool(abs(calibration.white.value - 0.5).max() < 0.02), calibration.resampling.seen.all()
     (True, np.True_)
     """
-    effort = BY_HAND if shots.keeps_photographs else AUTOMATIC
+    effort = SPARING if shots.keeps_photographs or sparing else THOROUGH
+    if sparing:
+        frames = min(frames, MAX_SPARING_REPEATS)
     expected = expected_photographs(
         shots.grid,
         channels=shots.channels,
         frames=frames,
         aligned=geometry == "aligned",
-        by_hand=effort.by_hand,
+        by_hand=shots.keeps_photographs,
+        sparing=sparing,
     )
 
     def count(done: int) -> None:
@@ -261,7 +272,7 @@ def measure(
         view.sharpness.check(side)
 
     # 3. Black, white, uniform codes and blocks.
-    times = _choose_times(session, white_exposure, exposures)
+    times = _choose_times(session, white_exposure, exposures, sparing)
     repeats = effort.repeats(frames, view.camera_pixels)
     requests = effort.requests(shots.grid, shots.channels, repeats, times)
     before, dark, bright, *uniform, few, after, others = session.take(requests)
@@ -305,15 +316,18 @@ def measure(
 
 
 def _choose_times(
-    session: CaptureSession, white: float, exposures: Sequence[float] | None
+    session: CaptureSession, white: float, exposures: Sequence[float] | None, sparing: bool
 ) -> CaptureTimes:
     """Exposures of black, white and the scan, by that of white."""
     shots = session.shots
     longest = longest_exposure(session, white)
-    if exposures is None:
-        scan = scan_exposures(shots, white, longest)
-    else:
+    if exposures is not None:
         scan = offered_exposures(shots, exposures)
+    elif sparing:
+        # Half of the pixels are lit: no camera pixel is dark.
+        scan = offered_exposures(shots, [white])
+    else:
+        scan = scan_exposures(shots, white, longest)
     return CaptureTimes(
         black=sorted({white, longest}),
         white=offered_exposures(shots, [white / 2, white, longest]),

@@ -29,7 +29,6 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import rigs
-from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration, is_calibrated
 from ltcl.acquisition.metering import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
@@ -230,20 +229,16 @@ class Project:
         megapixels = None
         if camera_grid is not None:
             megapixels = math.prod(camera_grid) / 1e6
-        photographs = expected_photographs(
-            shots.grid,
-            shots.channels,
-            settings.frames,
-            aligned=settings.geometry == "aligned",
-            by_hand=self.kind == "folder",
-        )
         facts = {
             "grid": shots.grid,
             "channels": shots.channels,
             "exposures": tuple(sorted(exposures)),
             "noise": noise,
             "light": light,
-            "calibration": photographs,
+            "frames": settings.frames,
+            "aligned": settings.geometry == "aligned",
+            "by_hand": self.kind == "folder",
+            "fixed_exposures": settings.exposures is not None or self.state != "new",
             "block": settings.block,
             "order": settings.order,
             "threshold": settings.threshold,

@@ -23,10 +23,12 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
+from ltcl.acquisition.estimation.estimator import check_memory
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
-from ltcl.acquisition.scanning import adaptive, columns, plan
+from ltcl.acquisition.scanning import adaptive, columns, plan, sketch
+from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import LAMP_GAIN, ScanCamera, ScanGrid
 from ltcl.acquisition.session import (
     ProgressFunction,
@@ -44,6 +46,8 @@ from ltcl.transport.transport import Transport
 
 logger = logging.getLogger(__name__)
 
+# Strategies whose pictures are kept until T is made of all of them.
+PICTURE_STRATEGIES = ("sketch", "adaptive")
 # Mean difference of black or white, relative to full scale, of the cells of a digest: lamps and
 # exposures vary less.
 MAX_VIEW_DIFFERENCE = 0.03
@@ -75,10 +79,10 @@ def acquire(
         seconds).
     geometry : "graycode", "aligned" or Correspondence
         Which projector pixel each camera pixel sees: measured; the same; or as measured before.
-    strategy : "auto", "adaptive", "pixel", "block" or "hadamard"
-        Cells that are divided where needed; one pixel at a time; blocks of pixels, which makes a
-        coarser transport; many pixels at once. "auto" decides by the noise of the camera
-        (`scanning.plan`).
+    strategy : "auto", "sketch", "adaptive", "pixel", "block" or "hadamard"
+        Some tens of patterns of all scales, from which T is estimated; cells that are divided where
+        needed; one pixel at a time; blocks of pixels, which makes a coarser transport; many pixels
+        at once. "auto" decides by the pixels and the noise of the camera (`scanning.plan`).
     store : path, optional
         Folder of the transport, which keeps the photographs, to be resumed. Until the set-up is
         measured they are in the folder STORE.calibration; to begin again, remove both.
@@ -86,7 +90,8 @@ def acquire(
         Go on with the content of the store; else the store must not exist.
     progress : function of (str, int, int), optional
         Called with "calibration" or "scan", how many of its photographs or patterns are done, those
-        of an earlier run included, and of how many at most.
+        of an earlier run included, and of how many at most; for a sketch then with "fit", rows of T
+        that are estimated, and all.
     exposures : sequence of float, optional
         Seconds of the photographs of each pattern, which the rig must have; by default chosen.
     response : Response, optional
@@ -210,8 +215,8 @@ def finalize(store: str | os.PathLike[str], progress: ProgressFunction | None = 
     grid = ScanGrid.of(opened)
     settings = ScanSettings.from_json(opened.attributes["settings"])
     strategy = opened.attributes["strategy"]
-    if strategy == "adaptive":
-        _run_adaptive(opened, grid, None, settings, progress)
+    if strategy in PICTURE_STRATEGIES:
+        _run_pictures(opened, grid, None, settings, progress)
         return
     if opened.missing():
         raise AcquisitionError(f"{opened.path}: the next batch of patterns is not photographed")
@@ -319,8 +324,12 @@ def _calibrate(
 ) -> BlockStore:
     """Measure the set-up, choose a strategy, and make the store, which is resumed from here on."""
     side = settings.block if settings.strategy == "block" else 1
+    is_sketched = plan.is_sketched(settings.strategy, shots.grid)
+    if is_sketched:
+        check_memory(shots.grid, shots.channels)
     calibration = calibrate.measure(
         shots,
+        sparing=is_sketched,
         geometry=settings.geometry,
         response=settings.response,
         exposures=settings.exposures,
@@ -363,6 +372,7 @@ def _choose_plan(
         order=settings.order,
         threshold=settings.threshold,
         calibration=shots.count,
+        fixed_exposures=True,
     )
     if settings.strategy != "auto":
         return plans[settings.strategy], "as asked for"
@@ -371,16 +381,19 @@ def _choose_plan(
 
 
 def _store_sizes(strategy: str, grid: ScanGrid, order: int) -> dict[str, Any]:
-    """Sizes of the store of a scan: columns of T, or pictures of an adaptive scan."""
+    """Sizes of the store of a scan: columns of T, or pictures."""
     pixels = math.prod(grid.grid)
-    if strategy == "adaptive":
-        most = adaptive.most_patterns(adaptive.Cells(grid.grid))
+    if strategy in PICTURE_STRATEGIES:
+        if strategy == "sketch":
+            most = sketch.most_patterns(grid.grid)
+        else:
+            most = adaptive.most_patterns(adaptive.Cells(grid.grid))
         return {
             "channels": grid.channels,
             "shape": (pixels, most),
             "grid": (1, most),
             "camera_grid": grid.grid,
-            "block_rows": adaptive.BATCH_SIZE,
+            "block_rows": BATCH_SIZE,
         }
     return {
         "channels": grid.channels,
@@ -399,8 +412,8 @@ def _scan(
     side = settings.block if strategy == "block" else 1
     camera = ScanCamera(shots, calibration, side)
     camera.lamp_gain = store.attributes.get(LAMP_GAIN, 1.0)
-    if strategy == "adaptive":
-        _run_adaptive(store, camera, camera, settings, progress)
+    if strategy in PICTURE_STRATEGIES:
+        _run_pictures(store, camera, camera, settings, progress)
         return
     code = columns.choose_code(strategy, camera.grid, settings.order)
     total = columns.count_patterns(code, math.prod(camera.grid))
@@ -415,14 +428,14 @@ def _scan(
     columns.finish(store, camera, total, settings.sigmas)
 
 
-def _run_adaptive(
+def _run_pictures(
     store: BlockStore,
     grid: ScanGrid,
     camera: ScanCamera | None,
     settings: ScanSettings,
     progress: ProgressFunction,
 ) -> None:
-    """Run an adaptive scan through its pictures in the store, and photograph the missing ones.
+    """Run a scan through its pictures in the store, and photograph the missing ones.
 
     Without a camera a missing one is an AcquisitionError.
     """
@@ -432,8 +445,13 @@ def _run_adaptive(
     def count(done: int) -> None:
         progress("scan", done, max(done, planned))
 
-    log = adaptive.PictureLog(store, camera, count)
-    core = adaptive.scan(grid, log, settings.threshold, settings.sigmas)
-    store.update(patterns=log.done)
-    adaptive.finish(store, grid, core, grid.calibration.mixing, settings.sigmas)
+    log = PictureLog(store, camera, count)
+    if store.attributes["strategy"] == "sketch":
+        sketched = sketch.scan(grid, log, progress)
+        store.update(patterns=log.done)
+        sketch.finish(store, sketched)
+    else:
+        core = adaptive.scan(grid, log, settings.threshold, settings.sigmas)
+        store.update(patterns=log.done)
+        adaptive.finish(store, grid, core, grid.calibration.mixing, settings.sigmas)
     progress("scan", log.done, log.done)

@@ -36,6 +36,7 @@ PLAN_COLUMNS = (
     "strategy",
     "pixels",
     "patterns",
+    "calibration",
     "photographs",
     "time",
     "disk at most",
@@ -97,18 +98,22 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
     )
     for name, strategy in strategies.items():
         report.plans[name] = StrategyPlan.from_attributes(strategy)
-    return Answer(report, _plan_lines(report, facts["calibration"]))
+    return Answer(report, _plan_lines(report))
 
 
 def _rig_kind(project: Any) -> RigKind:
     return project.kind
 
 
-def _plan_lines(report: PlanReport, calibration_photographs: int) -> list[str]:
+def _plan_lines(report: PlanReport) -> list[str]:
     rows = []
     for name, strategy in report.plans.items():
         row = [name, size_text(strategy.grid), strategy.patterns]
-        row += [strategy.photographs, datetime.timedelta(seconds=round(strategy.seconds))]
+        row += [
+            strategy.calibration,
+            strategy.photographs,
+            datetime.timedelta(seconds=round(strategy.seconds)),
+        ]
         row += [checks.size(strategy.disk), percent(strategy.error, 2)]
         rows.append(row)
     exposures = ", ".join(f"{seconds:.3g}" for seconds in report.exposures)
@@ -122,8 +127,7 @@ def _plan_lines(report: PlanReport, calibration_photographs: int) -> list[str]:
         f"{report.folder}: {report.rig} rig, {report.channels} channel(s)",
         f"exposures {exposures} s, noise and light {source}\n",
         table(PLAN_COLUMNS, rows),
-        f"\nphotographs: all, with {calibration_photographs} of the calibration; "
-        "error of T p: by noise, relative",
+        "\nphotographs: all, with those of the calibration; error of T p: forecast, relative",
         _computing_line(report),
         advice,
     ]

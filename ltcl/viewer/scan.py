@@ -22,6 +22,7 @@ from ltcl.acquisition.agreement import find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.radiance import valid_share
 from ltcl.acquisition.rigs.shooting_list import Shot
+from ltcl.acquisition.scanning.plan import is_sketched
 from ltcl.errors import LtclError
 from ltcl.store import BlockStore, load
 from ltcl.viewer import scan_files
@@ -112,9 +113,10 @@ class Scan(ViewerScene):
         self._calibration_photographs = expected_photographs(
             facts["grid"],
             facts["channels"],
-            settings.frames,
-            aligned=settings.geometry == "aligned",
-            by_hand=self.project.kind == "folder",
+            facts["frames"],
+            aligned=facts["aligned"],
+            by_hand=facts["by_hand"],
+            sparing=is_sketched(settings.strategy, facts["grid"]),
         )
         height, width = facts["grid"]
         self.pixels = height * width

@@ -28,6 +28,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "hadamard": {"grid": (6, 6), "order": 15},
     "block": {"grid": (8, 8), "channels": 3, "block": 2},
     "adaptive": {"grid": (8, 8)},
+    "sketch": {"grid": (8, 8)},
 }
 """Rigs and settings by strategy."""
 

@@ -51,6 +51,7 @@ def committed(path: Path) -> tuple[bool, bool, int]:
     [
         "pixel",
         "adaptive",
+        "sketch",
         pytest.param("hadamard", marks=pytest.mark.slow),
         pytest.param("block", marks=pytest.mark.slow),
     ],

@@ -19,7 +19,7 @@ from .scanning.helpers import corner, dense, relative_error, rig, unit, unseen_p
 from .stopping import LINEAR_RESPONSE, Unplugged
 
 GRID = (8, 16)
-STRATEGIES = ("pixel", "hadamard", "adaptive")
+STRATEGIES = ("pixel", "hadamard", "adaptive", "sketch")
 
 
 def oblique_view(u: Any, v: Any) -> tuple[Any, Any]:
@@ -108,7 +108,8 @@ def test_progress(tmp_path: Path, strategy: str) -> None:
     """
     path = tmp_path / "T.zarr"
     settings: dict[str, Any] = {"geometry": "aligned", "strategy": strategy, "store": path}
-    stopped = camera(350)
+    # In the middle of the scan.
+    stopped = camera(60 if strategy == "sketch" else 350)
     first = Steps(stopped)
     with pytest.raises(AcquisitionError, match="unplugged"):
         acquire(stopped, **settings, progress=first)

@@ -45,7 +45,10 @@ NEGLIGIBLE_LIGHT = 1e-6
 
 
 class Estimator:
-    """Priors and rows of all channels, for pixels of a grid."""
+    """Priors and rows of all channels, for pixels of a grid.
+
+    `progress` is called with "fit", rows that are done, and all rows of `solves` solutions.
+    """
 
     def __init__(
         self,
@@ -53,9 +56,12 @@ class Estimator:
         channels: int,
         mixing: np.ndarray | None,
         progress: Callable[[str, int, int], object] | None,
+        solves: int = 1,
     ) -> None:
+        # Rounds that learn the prior, and as many times as rows are solved at least.
+        self._solves = ROUNDS + solves
         self.grid = grid
-        _check_memory(grid, channels)
+        check_memory(grid, channels)
         self.windows = Windows.of(grid)
         self.W = hat_matrix(grid)
         self.W_squared: Any = scipy.sparse.csr_array(self.W.multiply(self.W))
@@ -131,6 +137,10 @@ class Estimator:
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
 
+    def own_variance(self) -> np.ndarray:
+        """Variances of the light of each pixel's own, (channels, N)."""
+        return np.stack([self._own(channel)[1] for channel in range(self.channels)])
+
     def arrays(self, scales: np.ndarray) -> dict[str, np.ndarray]:
         """The arrays of the transport (`ltcl.transport.stored`), with the noise of its entries."""
         pixels = len(self.windows.nodes)
@@ -161,15 +171,21 @@ class Estimator:
             diagonals.append(products.sum(axis=1) - 1.0)
             identity = scipy.sparse.eye_array(len(own), self.windows.absent, format="csr")
             cores.append(scipy.sparse.csr_array(C - identity))
-            is_own = self.windows.nodes == own[:, None]
-            rows = self.rows[channel]
-            direct = np.where(is_own, rows.mean, 0.0).sum(axis=1)
-            variance = np.where(is_own, rows.variance, 0.0).sum(axis=1)
+            direct, variance = self._own(channel)
             first_bounce.append(drop_uncertain(direct, variance, FIRST_BOUNCE_SIGMAS))
         mixing = self.mixing if self.channels == 3 else None
         return stored.arrays_of_scan(
             self.grid, cores, np.stack(diagonals), np.stack(first_bounce), mixing, BASIS
         )
+
+    def _own(self, channel: int) -> tuple[np.ndarray, np.ndarray]:
+        """The light of each pixel's own function, and its variance, (N,)."""
+        own = np.arange(len(self.windows.nodes))
+        is_own = self.windows.nodes == own[:, None]
+        rows = self.rows[channel]
+        direct = np.where(is_own, rows.mean, 0.0).sum(axis=1)
+        variance = np.where(is_own, rows.variance, 0.0).sum(axis=1)
+        return direct, variance
 
     def _core(self, channel: int) -> scipy.sparse.csr_array:
         """C (N, nodes) of T = C W."""
@@ -214,16 +230,15 @@ class Estimator:
         """Tell the progress that some rows were solved."""
         self._done += rows
         if self._progress is not None:
-            # The prior, the rows for those that judge, and at last all pairs.
-            expected = (ROUNDS + 2) * self.channels * len(self.windows.nodes)
+            expected = self._solves * self.channels * len(self.windows.nodes)
             self._progress("fit", self._done, max(self._done, expected))
 
 
-def _check_memory(grid: tuple[int, int], channels: int) -> None:
+def check_memory(grid: tuple[int, int], channels: int) -> None:
     """Refuse a grid whose rows do not fit the memory of the host."""
     height, width = grid
     numbers = height * width * functions_of_row(grid) * (channels + 1)
-    checks.fits_host(f"fitting {height} x {width} pixels", numbers * ROW_BYTES)
+    checks.fits_host(f"estimating T of {height} x {width} pixels", numbers * ROW_BYTES)
 
 
 def _light(patterns: np.ndarray, photographs: np.ndarray) -> np.ndarray:

@@ -212,7 +212,8 @@ def _fit(
     is_judge[judges] = True
 
     # 1. The prior and the colours, from the pairs that are not held out.
-    estimator = Estimator(pairs.grid, pairs.channels, mixing, progress)
+    # Rows are solved for those that judge, and at last for all pairs.
+    estimator = Estimator(pairs.grid, pairs.channels, mixing, progress, solves=2)
     estimator.learn(pairs.select(~is_judge))
     explained = estimator.explain(pairs.patterns)
     pairs.check_partners(explained)

@@ -89,7 +89,8 @@ def learn_prior(
 ) -> Prior:
     """The prior under which pictures (N, patterns) are likely; `sums` are those under all hats.
 
-    `variance` is that of the pictures by the noise of the camera, if it is known; `progress` is called with the number of rows that were solved since its last call.
+    `variance` is that of the pictures by the noise of the camera, if it is known; `progress` is
+    called with the number of rows that were solved since its last call.
     """
     prior = Prior.first(windows, light)
     for _ in range(ROUNDS):

@@ -27,18 +27,24 @@ import numpy as np
 
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.estimation.windows import functions_of_row
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiance import valid_values
 from ltcl.acquisition.radiometry import NoiseModel
-from ltcl.acquisition.scanning import adaptive, columns
+from ltcl.acquisition.scanning import adaptive, columns, sketch
+from ltcl.acquisition.scanning.picture_log import BATCH_SIZE
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 
 # Pixels from which one at a time, or as many patterns, take too long.
 MAX_SINGLE_PIXELS = 2048
+# Pixels from which "auto" makes no sketch, which takes some milliseconds of computing for each.
+MAX_SKETCHED_PIXELS = 1 << 15
 # Indirect share of a camera pixel's light under white, unless it is measured: a white corner.
 INDIRECT_SHARE = 0.25
 # Relative error of T p by the calibration: response and white.
 CALIBRATION_ERROR = 0.002
+# Relative error of T p by light that varies faster than the functions of a sketch do.
+SKETCH_ERROR = 0.008
 # Error relative to the smallest one, up to which fewer photographs count more.
 MAX_ERROR_RATIO = 1.5
 # Bytes of an entry: value, index, variance.
@@ -126,6 +132,10 @@ def plans(
     threshold: float = ScanSettings.threshold,
     overhead: float = 0.0,
     calibration: int | None = None,
+    frames: int = ScanSettings.frames,
+    aligned: bool = False,
+    by_hand: bool = False,
+    fixed_exposures: bool = False,
     megapixels: float | None = None,
     pace: float | None = None,
 ) -> dict[str, Plan]:
@@ -148,6 +158,10 @@ def plans(
         Seconds of each photograph besides its exposure.
     calibration : int, optional
         Photographs of the calibration; None: as many as expected.
+    frames, aligned, by_hand
+        What the number of these depends on, as in `calibrate.expected_photographs`.
+    fixed_exposures : bool
+        A sketch takes all exposures, too; else the first one alone.
     megapixels : float, optional
         Pixels of the camera in millions; None: not known.
     pace : float, optional
@@ -163,23 +177,32 @@ def plans(
         noise = NoiseModel()
     if light is None:
         light = Light()
-    if calibration is None:
-        calibration = expected_photographs(grid, channels=channels)
-    times = np.array(exposures)
-    merged = _MergedNoise(noise, light.ambient, times)
+    all_times = np.array(exposures)
     result = {}
     for strategy in STRATEGIES:
         pixels = grid
+        is_sketch = strategy == "sketch"
+        times = all_times
+        if is_sketch and not fixed_exposures:
+            times = all_times[:1]
+        merged = _MergedNoise(noise, light.ambient, times)
+        setup = calibration
+        if setup is None:
+            setup = expected_photographs(
+                grid, channels, frames, aligned=aligned, by_hand=by_hand, sparing=is_sketch
+            )
         if strategy == "block":
             pixels = Blocks(grid, min(block, max(grid))).grid
-        if strategy == "adaptive":
+        if is_sketch:
+            outlook = _sketch_outlook(grid, merged, light)
+        elif strategy == "adaptive":
             outlook = _adaptive_outlook(grid, threshold, merged, light)
         else:
             code = columns.choose_code(strategy, pixels, order)
             outlook = _column_outlook(code, math.prod(pixels), merged, light)
-        photographs = calibration + len(times) * outlook.patterns + outlook.batches
+        photographs = setup + len(times) * outlook.patterns + outlook.batches
         # The calibration's exposures are about the geometric mean of those of the scan.
-        calibration_seconds = calibration * math.sqrt(times[0] * times[-1])
+        calibration_seconds = setup * math.sqrt(times[0] * times[-1])
         scan_seconds = outlook.patterns * times.sum()
         computing = None
         if megapixels is not None and pace is not None:
@@ -189,7 +212,7 @@ def plans(
             strategy=strategy,
             grid=pixels,
             patterns=outlook.patterns,
-            calibration=calibration,
+            calibration=setup,
             photographs=photographs,
             seconds=float(seconds + photographs * overhead),
             disk=channels * ENTRY_BYTES * outlook.entries,
@@ -217,6 +240,20 @@ class _MergedNoise:
         return float(1.0 / np.sum(precision))
 
 
+def _sketch_outlook(grid: tuple[int, int], merged: _MergedNoise, light: Light) -> _Outlook:
+    """A sketch, each of whose pictures has half of the light; what it cannot resolve is guessed."""
+    patterns = sketch.count_patterns(grid)
+    white = light.direct + light.indirect
+    functions = functions_of_row(grid)
+    noise = functions / patterns * merged.variance(0.5 * white)
+    return _Outlook(
+        patterns=patterns,
+        batches=-(-patterns // BATCH_SIZE),
+        entries=math.prod(grid) * (patterns + functions),
+        variance=noise + (SKETCH_ERROR * white) ** 2,
+    )
+
+
 def _adaptive_outlook(
     grid: tuple[int, int], threshold: float, merged: _MergedNoise, light: Light
 ) -> _Outlook:
@@ -232,7 +269,7 @@ def _adaptive_outlook(
     noise = terms * merged.variance(light.indirect / terms)
     return _Outlook(
         patterns=patterns,
-        batches=-(-patterns // adaptive.BATCH_SIZE),
+        batches=-(-patterns // BATCH_SIZE),
         entries=pixels * patterns,
         variance=noise + (threshold / 2 * white) ** 2,
     )
@@ -289,14 +326,24 @@ def measured(calibration: Calibration) -> Light:
     )
 
 
+def is_sketched(strategy: str, grid: tuple[int, int]) -> bool:
+    """True if a scan is a sketch; "auto" makes one of many pixels, but not too many."""
+    if strategy == "auto":
+        return MAX_SINGLE_PIXELS < math.prod(grid) <= MAX_SKETCHED_PIXELS
+    return strategy == "sketch"
+
+
 def choose(plans: dict[str, Plan]) -> tuple[str, str]:
     """The strategy of "auto", and why.
 
-    Adaptive for many pixels, or if it takes fewer photographs at a similar error.
+    A sketch for many pixels, adaptive for even more, or if it takes fewer photographs at a similar
+    error.
     """
     h, w = plans["pixel"].grid
-    if h * w > MAX_SINGLE_PIXELS:
-        return "adaptive", f"{h * w} pixels are more than {MAX_SINGLE_PIXELS}"
+    if is_sketched("auto", (h, w)):
+        return "sketch", f"{h * w} pixels are more than {MAX_SINGLE_PIXELS}"
+    if h * w > MAX_SKETCHED_PIXELS:
+        return "adaptive", f"{h * w} pixels are more than {MAX_SKETCHED_PIXELS}"
     errors = {name: plans[name].error for name in ("pixel", "hadamard", "adaptive")}
     best = "hadamard" if errors["hadamard"] < errors["pixel"] else "pixel"
     takes_fewer = plans["adaptive"].photographs < plans[best].photographs

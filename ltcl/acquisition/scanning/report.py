@@ -46,7 +46,11 @@ class Report:
     noise_direct, noise_sum : float
         Median relative standard deviation of the first bounce, and of row sums.
     sum_deviation : float
-        Relative deviation (rms) of sums of measured columns from white; NaN of an adaptive scan.
+        Relative deviation (rms) of sums of measured columns from white; NaN of a sketch or an
+        adaptive scan.
+    judged_error, judged_bound : float
+        Relative error of T p for the pictures that judge a sketch, to which it was not fitted; and
+        what that of others is below, with a probability of 95 %. NaN of another scan.
 
     Examples
     --------
@@ -77,6 +81,8 @@ class Report:
     noise_direct: float
     noise_sum: float
     sum_deviation: float
+    judged_error: float = math.nan
+    judged_bound: float = math.nan
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Report:
@@ -101,6 +107,7 @@ class Report:
         sum_deviation = math.nan
         if scan.layout.kind != "compressed":
             sum_deviation = columns.deviation(scan.extra(columns.ROW_SUMS), white)
+        judgement = scan.attributes.get("sketch", {})
         return cls(
             strategy=scan.attributes["strategy"],
             why=scan.attributes["why"],
@@ -120,6 +127,8 @@ class Report:
             noise_direct=_relative_noise(entries.variance, first_bounce),
             noise_sum=_relative_noise(white.variance, white.value, white.known),
             sum_deviation=sum_deviation,
+            judged_error=judgement.get("error", math.nan),
+            judged_bound=judgement.get("bound", math.nan),
         )
 
     def to_json(self) -> str:
@@ -154,6 +163,11 @@ class Report:
                 f"{self.sharpness:.0%} of a pixel is its own light: "
                 f"relative error of fine patterns {self.blur:.1%}"
             )
+        if not math.isnan(self.judged_error):
+            lines.append(
+                f"error of T p {self.judged_error:.2%} for pictures that it was not fitted to; for "
+                f"others at most {self.judged_bound:.2%}, with a probability of 95 %"
+            )
         if not math.isnan(self.sum_deviation):
             photographs = f"single {self.strategy}s"
             if self.strategy == "hadamard":
@@ -186,6 +200,10 @@ class _StoredEntries:
 
 def _count_entries(scan: BlockStore, shape: tuple[int, ...]) -> _StoredEntries:
     """Read the variances of all entries in a finished scan."""
+    if scan.attributes["strategy"] == "sketch":
+        cores = [scan.extra(f"system_{channel}.R.core.indices") for channel in range(shape[0])]
+        variance = np.asarray(scan.extra("own_variance"))
+        return _StoredEntries(count=sum(map(len, cores)), unknown=0, variance=variance)
     membership = _cells_of_pixels(scan)
     variance = np.zeros(shape)
     count = 0

@@ -19,7 +19,9 @@ from ltcl.cli.reports.parts import (
 from ltcl.cli.reports.report import Report
 
 RigKind = Annotated[Literal["virtual", "mitsuba", "folder", "live"], "Kind of the rig."]
-Strategy = Annotated[Literal["adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."]
+Strategy = Annotated[
+    Literal["sketch", "adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."
+]
 Exposures = Annotated[list[float], "Seconds of the photographs of a pattern."]
 
 
@@ -67,7 +69,7 @@ class StrategyPlan(Report):
     photographs: Annotated[int, "All photographs."]
     seconds: Annotated[float, "Duration of all photographs."]
     disk: Annotated[int, "Bytes on disk at most."]
-    error: Annotated[float, "Relative error of T p by noise."]
+    error: Annotated[float, "Forecast of the relative error of T p."]
     computing: Annotated[
         float | None, "Seconds of computing; null if the size of the camera is not known."
     ] = None
@@ -116,7 +118,15 @@ class ScanReport(FolderReport):
     unknown: Annotated[float, "Share of entries never well exposed; they are 0."]
     noise_direct: Annotated[float, "Median relative noise of the first bounce."]
     noise_sum: Annotated[float, "Median relative noise of row sums."]
-    sum_deviation: Annotated[float | None, "Deviation of column sums from white; null if adaptive."]
+    sum_deviation: Annotated[
+        float | None, "Deviation of column sums from white; null of a sketch or an adaptive scan."
+    ]
+    judged_error: Annotated[
+        float | None, "Relative error of T p for pictures that no sketch was fitted to; else null."
+    ]
+    judged_bound: Annotated[
+        float | None, "That of other pictures is below, with a probability of 95 %; else null."
+    ]
     verdict: VerdictReport
     error: Annotated[list[float] | None, "Relative error of T p by channel; virtual rigs only."] = (
         None

@@ -25,7 +25,13 @@ from tests.store.stores import contents
 from ..stopping import Unplugged, set_up
 from .helpers import corner
 
-BATCHES = {"pixel": (25, 25), "hadamard": (15, 15), "block": (9, 9), "adaptive": (4, 16)}
+BATCHES = {
+    "pixel": (25, 25),
+    "hadamard": (15, 15),
+    "block": (9, 9),
+    "adaptive": (4, 16),
+    "sketch": (16, 12),
+}
 """Patterns of the first batch, and of the second."""
 Shot = tuple[np.ndarray, float]
 
@@ -94,6 +100,7 @@ def repeated(order: np.ndarray, start: int, n: int) -> np.ndarray:
     [
         "pixel",
         "adaptive",
+        "sketch",
         pytest.param("hadamard", marks=pytest.mark.slow),
         pytest.param("block", marks=pytest.mark.slow),
     ],

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A sketch of T: pictures of some tens of patterns, from which all of T is estimated at once.
+
+T is direct light, which is local, and light that bounces, which is smooth: each row is a sum of few
+functions that widen with the distance from its pixel (`acquisition.estimation`). Their number
+hardly grows with the pixels, so neither does that of the patterns that show them. These are on or
+off, so that the curve of the projector does not matter. Of each scale s = 2^l there are
+
+    stripes    Gray code: 0 1 1 0 of s rows or columns each, repeated
+    products   w(row / s) xor w'(column / s) of Walsh functions w and w' of four steps, repeated
+
+Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
+that of T.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.stats
+
+from ltcl.acquisition.estimation.estimator import Estimator
+from ltcl.acquisition.estimation.pairs import Pairs
+from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
+from ltcl.store import BlockStore, CompressedRecord
+
+# Walsh functions of four steps, but the constant one.
+WALSH = ((0, 0, 1, 1), (0, 1, 1, 0), (0, 1, 0, 1))
+# Probability with which the error of other pictures is below the bound that is stated.
+CONFIDENCE = 0.95
+# Fields of the checkerboard, and lit patches, along the shorter side.
+CHECKERBOARD_FIELDS = 6
+PATCH_SHARE = 8
+# Text is drawn so many times as large; letters of size 1 take so many rows, with their spacing.
+TEXT_SCALE = 4
+FONT_HEIGHT = 64
+SEED = 0
+
+
+def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
+    """The patterns (h, w) of a sketch, of 0 and 1, coarse to fine.
+
+    >>> len(patterns((4, 4))), len(patterns((64, 64)))
+    (7, 52)
+    """
+    row, column = np.indices(grid)
+    chosen: list[np.ndarray] = []
+    known: set[bytes] = set()
+    for level in reversed(range((max(grid) - 1).bit_length())):
+        down = row >> level
+        across = column >> level
+        of_level = [_gray(down), _gray(across)]
+        for w in WALSH:
+            for v in WALSH:
+                of_level.append(np.take(w, down % 4) ^ np.take(v, across % 4))
+        for pattern in of_level:
+            # Complements show the same, as white is known.
+            key = (pattern ^ pattern[0, 0]).astype(np.uint8).tobytes()
+            if pattern.any() and not pattern.all() and key not in known:
+                known.add(key)
+                chosen.append(pattern.astype(np.float32))
+    return chosen
+
+
+def _gray(number: np.ndarray) -> np.ndarray:
+    """The lowest bit of the Gray code of numbers: 0 1 1 0, repeated."""
+    return (number ^ (number >> 1)) & 1
+
+
+def judges(grid: tuple[int, int]) -> list[np.ndarray]:
+    """Pictures (h, w) of 0 and 1 that judge a sketch.
+
+    They are two like nature (spectrum 1 / f), two areas with straight edges, text, a checkerboard
+    and two lit patches.
+
+    >>> len(judges((16, 16)))
+    8
+    """
+    random = np.random.default_rng(SEED)
+    pictures = [_like_nature(grid, random) > 0 for _ in range(2)]
+    pictures += [_half_plane(grid, angle) for angle in (0.4, 2.2)]
+    pictures.append(_text(grid))
+    height, width = grid
+    row, column = np.indices(grid)
+    # No power of 2, which patterns have.
+    field = max(3, min(grid) // CHECKERBOARD_FIELDS)
+    pictures.append((row // field + column // field) % 2 == 1)
+    side = max(1, min(grid) // PATCH_SHARE)
+    for middle_row, middle_column in ((0.3, 0.35), (0.7, 0.6)):
+        is_near_row = np.abs(row + 0.5 - middle_row * height) <= 0.5 * side
+        is_near_column = np.abs(column + 0.5 - middle_column * width) <= 0.5 * side
+        pictures.append(is_near_row & is_near_column)
+    return [picture.astype(np.float32) for picture in pictures]
+
+
+def _like_nature(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+    """Noise (h, w) whose amplitude falls as 1 / f, with mean 0."""
+    frequency = np.hypot(
+        *np.meshgrid(np.fft.fftfreq(grid[0]), np.fft.fftfreq(grid[1]), indexing="ij")
+    )
+    frequency[0, 0] = np.inf
+    return np.fft.ifft2(np.fft.fft2(random.standard_normal(grid)) / frequency).real
+
+
+def _half_plane(grid: tuple[int, int], angle: float) -> np.ndarray:
+    height, width = grid
+    row, column = np.indices(grid)
+    across = (column + 0.5) / width - 0.5
+    down = (row + 0.5) / height - 0.5
+    return np.cos(angle) * across + np.sin(angle) * down > 0
+
+
+def _text(grid: tuple[int, int]) -> np.ndarray:
+    """Letters over the whole picture."""
+    height, width = grid
+    picture = np.zeros((4 * height, 4 * width), np.uint8)
+    scale = 4 * height / 64
+    for line in range(2):
+        place = (int(0.04 * 4 * width), int((0.45 + 0.5 * line) * 4 * height))
+        cv2.putText(
+            picture,
+            "LIGHT"[line:],
+            place,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            scale,
+            255,
+            max(1, int(3 * scale)),
+        )
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) > 127
+
+
+def count_patterns(grid: tuple[int, int]) -> int:
+    """Patterns of a sketch, with those that judge it."""
+    return len(patterns(grid)) + len(judges(grid))
+
+
+def most_patterns(grid: tuple[int, int]) -> int:
+    """Number of patterns that no sketch exceeds, in whole batches."""
+    return BATCH_SIZE * -(-count_patterns(grid) // BATCH_SIZE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sketch:
+    """T of a sketch, and what the judges say.
+
+    Attributes
+    ----------
+    arrays : dict
+        Those of the compressed transport (`ltcl.transport`).
+    own_variance : (channels, N)
+        Variance of the light of each pixel's own.
+    errors : (judges,)
+        Error of T p relative to the photograph of each judge, less the noise of the camera.
+    error : float
+        Their root mean square.
+    bound : float
+        What that of other pictures is below, with a probability of 95 %.
+    """
+
+    arrays: dict[str, np.ndarray]
+    own_variance: np.ndarray
+    errors: np.ndarray
+    error: float
+    bound: float
+
+
+def scan(
+    grid: ScanGrid, log: PictureLog, progress: Callable[[str, int, int], object] | None = None
+) -> Sketch:
+    """Photograph the patterns and the judges, and estimate T.
+
+    `log` takes the pictures, or has those of an earlier run; `progress` is called with "fit", rows
+    that are done, and all.
+    """
+    shown = [*patterns(grid.grid), *judges(grid.grid)]
+    log.announce(shown)
+    pictures: list[Picture] = []
+    for start in range(0, len(shown), BATCH_SIZE):
+        pictures += log.take(shown[start : start + BATCH_SIZE])
+    pairs = _pairs(grid, shown, pictures)
+    is_judge = np.arange(len(pairs)) >= len(pairs) - len(judges(grid.grid))
+    mixing = grid.calibration.mixing
+    estimator = Estimator(grid.grid, grid.channels, _known_mixing(mixing, grid.channels), progress)
+    estimator.learn(pairs.select(~is_judge))
+    return _judged(estimator, pairs.select(is_judge))
+
+
+def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
+    if mixing is None:
+        return np.eye(channels)
+    return mixing
+
+
+def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> Pairs:
+    """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
+    white = grid.white
+    seen = [white, *pictures]
+    variances = [white.variance]
+    for picture in pictures:
+        variances.append(np.where(picture.known, picture.variance + grid.ambient, UNKNOWN))
+    lit = np.stack([np.ones(grid.grid, np.float32), *shown])
+    patterns_of_channels = np.repeat(lit.reshape(len(lit), -1, 1), grid.channels, axis=2)
+    return Pairs(
+        grid=grid.grid,
+        camera_grid=grid.grid,
+        patterns=patterns_of_channels.astype(np.float64),
+        photographs=np.stack([picture.value.T for picture in seen]).astype(np.float64),
+        variance=np.stack([variance.T for variance in variances]).astype(np.float64),
+    )
+
+
+def _judged(estimator: Estimator, pairs: Pairs) -> Sketch:
+    """The transport of an estimator, and its error for pairs that it has not seen."""
+    variance: Any = pairs.variance
+    is_known = variance < KNOWN_VARIANCE
+    explained = estimator.explain(pairs.patterns)
+    left = np.where(is_known, pairs.photographs - explained, 0.0)
+    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
+    light = np.where(is_known, pairs.photographs, 0.0)
+    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
+    squares = np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy
+    error = math.sqrt(squares.mean())
+    degrees = len(squares)
+    bound = error * math.sqrt(degrees / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, degrees))
+    scales = estimator.scale_of_variance(pairs.patterns, left)
+    return Sketch(
+        arrays=estimator.arrays(scales),
+        own_variance=estimator.own_variance() * scales[:, None],
+        errors=np.sqrt(squares),
+        error=error,
+        bound=bound,
+    )
+
+
+def finish(store: BlockStore, sketch: Sketch) -> None:
+    """Make the compressed transport of a sketch, which replaces its pictures in the store."""
+    store.extra("own_variance", sketch.own_variance)
+    store.update(
+        sketch={
+            "error": sketch.error,
+            "bound": sketch.bound,
+            "errors": sketch.errors.tolist(),
+        }
+    )
+    store.finalize(compressed=CompressedRecord(sketch.arrays))

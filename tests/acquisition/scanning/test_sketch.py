@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Sketches: all of T from some tens of patterns."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl.acquisition import Report, VirtualRig, acquire, camera_map
+from ltcl.acquisition.calibrate import expected_photographs
+from ltcl.acquisition.scanning import sketch
+from ltcl.acquisition.scanning.plan import choose, plans
+from ltcl.errors import MemoryLimitError
+
+from ..stopping import Unplugged
+from .helpers import corner, dense, relative_error
+
+GRIDS = [(1, 1), (1, 7), (5, 3), (8, 16), (64, 64), (256, 512)]
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_patterns_are_few_and_all_different(grid: tuple[int, int]) -> None:
+    shown = sketch.patterns(grid)
+    octaves = (max(grid) - 1).bit_length()
+    assert len(shown) <= 10 * octaves
+    kinds = set()
+    for pattern in shown:
+        assert pattern.shape == grid
+        assert set(np.unique(pattern)) == {0.0, 1.0}
+        first = pattern[0, 0]
+        kinds.add((pattern == first).tobytes())
+    # Not even the complement of another.
+    assert len(kinds) == len(shown)
+
+
+@pytest.mark.parametrize("grid", GRIDS[1:5])
+def test_patterns_tell_all_pixels_apart(grid: tuple[int, int]) -> None:
+    codes = np.stack(sketch.patterns(grid)).reshape(-1, math.prod(grid))
+    assert len(np.unique(codes, axis=1).T) == math.prod(grid)
+
+
+@pytest.mark.parametrize("grid", GRIDS[3:])
+def test_judges_are_no_patterns(grid: tuple[int, int]) -> None:
+    shown = {pattern.tobytes() for pattern in sketch.patterns(grid)}
+    pictures = sketch.judges(grid)
+    for picture in pictures:
+        assert 0.0 < picture.mean() < 1.0
+        assert picture.tobytes() not in shown
+    assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Unplugged, ltcl.Transport, Report]:
+    """A corner of 16 x 32 pixels, by a camera of 12 bits with a curve."""
+    path = tmp_path_factory.mktemp("sketch") / "T.zarr"
+    rig = Unplugged(corner(16), (16, 32), response="film")
+    T = acquire(rig, geometry="aligned", strategy="sketch", store=path)
+    return rig, T, Report.of(path)
+
+
+def test_the_error_that_is_stated_holds(scanned: Any) -> None:
+    _, T, report = scanned
+    error = relative_error(dense(T), corner(16), (16, 32))
+    assert error < report.judged_bound
+    assert report.judged_error < report.judged_bound < 0.04
+    assert error < 0.015
+
+
+def test_photographs_are_as_planned_and_few(scanned: Any) -> None:
+    rig, _, report = scanned
+    assert report.patterns == report.photographs == sketch.count_patterns((16, 32))
+    plan = plans((16, 32), (0.5, 8.0), aligned=True)["sketch"]
+    assert plan.patterns == report.patterns
+    assert plan.photographs == pytest.approx(rig.count, abs=3)
+    assert rig.count < 100
+
+
+def test_it_is_compensated_with(scanned: Any) -> None:
+    """The pattern of a sketch makes the true scene look as desired."""
+    _, T, report = scanned
+    assert T.is_compressed
+    desired = np.full(T.grid, 0.25, np.float32)
+    result = ltcl.compensate(T, desired)
+    shown = corner(16) @ np.asarray(result.pattern, np.float64).ravel()
+    # In the camera's unit of light.
+    shown *= 0.25 / shown.mean()
+    assert np.sqrt(np.mean((shown - 0.25) ** 2)) / 0.25 < 0.015
+    assert "not fitted" in str(report)
+
+
+def test_colours_are_told_apart(tmp_path: Path) -> None:
+    scene = [corner(8), corner(8, 0.5), corner(8, 0.4)]
+    mixing = np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.1, 0.9]])
+    truth = ltcl.Transport(scene, (8, 16), mixing=mixing)
+    rig = VirtualRig(truth, (8, 16), bits=12, ambient=0.01)
+    T = acquire(rig, geometry="aligned", strategy="sketch", store=tmp_path / "T.zarr")
+    picture = np.random.default_rng(2).random((8, 16, 3))
+    measured = T @ picture
+    expected = truth @ picture
+    # Each channel has its own unit of light.
+    scale = (measured * expected).sum(axis=(0, 1)) / (measured**2).sum(axis=(0, 1))
+    error = np.linalg.norm(scale * measured - expected) / np.linalg.norm(expected)
+    assert error < 0.03
+
+
+def test_a_person_takes_at_most_80_photographs() -> None:
+    """An oblique camera of three pixels to a side, whose geometry Gray code shows."""
+    view = camera_map(lambda u, v: (u / 3, v / 3), (24, 48), (8, 16))
+    rig = Unplugged(corner(), (8, 16), camera_grid=(24, 48), camera_map=view)
+    rig.keeps_photographs = True
+    T = acquire(rig, strategy="sketch")
+    assert rig.count <= 80
+    planned = expected_photographs((8, 16), by_hand=True, sparing=True)
+    plan = plans((8, 16), (0.5, 8.0), by_hand=True)["sketch"]
+    assert plan.calibration == planned
+    assert plan.photographs == pytest.approx(rig.count, abs=3)
+    assert relative_error(dense(T), corner(), (8, 16)) < 0.025
+
+
+@pytest.mark.slow
+def test_where_light_is_not_smooth_the_error_says_so(tmp_path: Path) -> None:
+    """A mirror sends light of each pixel to the other side of the picture."""
+    n = 16
+    mirror = np.eye(n * n)[::-1]
+    truth = 0.5 * np.eye(n * n) + 0.2 * mirror
+    rig = Unplugged(truth, (n, n))
+    path = tmp_path / "T.zarr"
+    T = acquire(rig, geometry="aligned", strategy="sketch", store=path)
+    report = Report.of(path)
+    assert report.judged_error > 0.05
+    assert relative_error(dense(T), truth, (n, n)) < 2.0 * report.judged_bound
+
+
+def test_what_memory_does_not_hold_is_refused_before_the_first_photograph() -> None:
+    rig = Unplugged(np.eye(4), (2, 2), left=0)
+    rig.projector_grid = (1 << 14, 1 << 14)
+    with pytest.raises(MemoryLimitError, match="16384 x 16384 pixels"):
+        acquire(rig, strategy="sketch", geometry="aligned")
+
+
+@pytest.mark.parametrize(
+    ("grid", "strategy"), [((32, 64), "adaptive"), ((64, 64), "sketch"), ((1080, 1920), "adaptive")]
+)
+def test_auto_sketches_many_pixels(grid: tuple[int, int], strategy: str) -> None:
+    chosen, reason = choose(plans(grid, (0.5, 8.0)))
+    assert chosen == strategy
+    assert strategy == "adaptive" or "more than 2048" in reason
