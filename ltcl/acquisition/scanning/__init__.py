@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Scanning T: the order in which pixels are lit, and T from the pictures.
 
-columns, adaptive    strategies: batches of columns, or cells that are divided where needed
-pictures             pictures of patterns on the pixels of the scan
+columns, adaptive, sketch
+                     strategies: batches of columns; cells that are divided where needed; few
+                     patterns, from which T is estimated
+pictures             pictures of patterns on the pixels of the scan; `picture_log` keeps them
 plan, pace, report   photographs, time and errors before a scan; its result after it
 """
 

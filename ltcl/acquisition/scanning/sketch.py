@@ -47,7 +47,7 @@ def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     """The patterns (h, w) of a sketch, of 0 and 1, coarse to fine.
 
     >>> len(patterns((4, 4))), len(patterns((64, 64)))
-    (7, 52)
+    (13, 53)
     """
     row, column = np.indices(grid)
     chosen: list[np.ndarray] = []
@@ -83,9 +83,9 @@ def judges(grid: tuple[int, int]) -> list[np.ndarray]:
     8
     """
     random = np.random.default_rng(SEED)
-    pictures = [_like_nature(grid, random) > 0 for _ in range(2)]
+    pictures = [like_nature(grid, random) > 0 for _ in range(2)]
     pictures += [_half_plane(grid, angle) for angle in (0.4, 2.2)]
-    pictures.append(_text(grid))
+    pictures.append(text(grid))
     height, width = grid
     row, column = np.indices(grid)
     # No power of 2, which patterns have.
@@ -99,7 +99,7 @@ def judges(grid: tuple[int, int]) -> list[np.ndarray]:
     return [picture.astype(np.float32) for picture in pictures]
 
 
-def _like_nature(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+def like_nature(grid: tuple[int, int], random: np.random.Generator) -> np.ndarray:
     """Noise (h, w) whose amplitude falls as 1 / f, with mean 0."""
     frequency = np.hypot(
         *np.meshgrid(np.fft.fftfreq(grid[0]), np.fft.fftfreq(grid[1]), indexing="ij")
@@ -116,7 +116,7 @@ def _half_plane(grid: tuple[int, int], angle: float) -> np.ndarray:
     return np.cos(angle) * across + np.sin(angle) * down > 0
 
 
-def _text(grid: tuple[int, int]) -> np.ndarray:
+def text(grid: tuple[int, int]) -> np.ndarray:
     """Letters over the whole picture."""
     height, width = grid
     picture = np.zeros((4 * height, 4 * width), np.uint8)

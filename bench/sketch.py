@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A sketch of a transport: how many photographs give T p, and how well.
+
+Virtual cameras photograph scenes whose transport is known: of 12 bits, and of 8 bits with another
+curve. All photographs count: of the set-up, of the patterns, of the pictures that judge the sketch,
+and after each batch. Then T p is compared with the truth, in the camera's unit of light (one scale
+a channel), for pictures that no scan has seen:
+
+    nature         four pictures with the spectrum 1 / f
+    text           letters
+    checkerboard   fields of an eighth of the shorter side
+    patches        nine lit squares of an eighth of the shorter side
+
+and a picture like nature is compensated and shown with the true T. Walls lie side by side in these
+scenes: at their edges light jumps, which is hard for a sketch.
+
+Baselines, on a corner of 64 x 64 pixels: an adaptive scan; pairs of pictures like nature with
+`ltcl.fit`, with linear regression of all of T on them (least squares of least norm, with the best
+of some ridges), and with single lit pixels by the kernel Nystroem method (Wang et al. 2009, rows by
+reciprocity, with the best of some powers). The last three have the light itself, with noise of
+0.2 % of white, and pay nothing for a set-up.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import _figures as figures
+import ltcl
+from _figures import Claim
+from _harness import Options, parse_options
+from acquire import corner
+from ltcl import Transport
+from ltcl.acquisition import Report, VirtualRig, acquire
+from ltcl.acquisition.scanning.sketch import like_nature, text
+from ltcl.scenes import Block
+
+# Response and bits of each camera.
+CAMERAS = {"12 bits": ("linear", 12), "8 bits, film": ("film", 8)}
+# Largest number of photographs, and largest errors of each kind of picture.
+MAX_PHOTOGRAPHS = 100
+MAX_ERRORS = {"nature": 0.01, "text": 0.01, "checkerboard": 0.015, "patches": 0.015}
+MAX_COMPENSATED_ERROR = 0.01
+# Noise of the pictures of the baselines, relative to white.
+NOISE = 0.002
+RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
+POWERS = (0.25, 0.5, 1.0)
+COLOURS = (0.7, 0.5, 0.3)
+
+
+def pictures(grid: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Pictures (k, h, w) of each kind, in [0, 1]."""
+    random = np.random.default_rng(17)
+    nature = []
+    for _ in range(4):
+        noise = like_nature(grid, random)
+        nature.append((noise - noise.min()) / np.ptp(noise))
+    height, width = grid
+    side = max(min(grid) // 8, 1)
+    row, column = np.indices(grid)
+    patches = []
+    for down in (0.15, 0.45, 0.8):
+        for across in (0.1, 0.45, 0.75):
+            top = round(down * (height - side))
+            left = round(across * (width - side))
+            is_lit = (row >= top) & (row < top + side) & (column >= left) & (column < left + side)
+            patches.append(is_lit)
+    return {
+        "nature": np.array(nature),
+        "text": text(grid)[None].astype(float),
+        "checkerboard": ((row // side + column // side) % 2)[None].astype(float),
+        "patches": np.array(patches, float),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """A scan of a scene by a camera: photographs, seconds of computing, and errors.
+
+    `errors` are those of each kind of picture, `bound` what the scan says that they are below.
+    """
+
+    name: str
+    photographs: int
+    seconds: float
+    errors: dict[str, float]
+    compensated: float
+    judged: float
+    bound: float
+
+
+class CountingRig(VirtualRig):
+    """A virtual camera that counts its photographs."""
+
+    count = 0
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        """Take a photograph, and count it."""
+        self.count += 1
+        return super().photograph(codes, seconds)
+
+
+def shown(T: Transport, pattern: np.ndarray) -> np.ndarray:
+    """T p of a grey pattern (h, w), (N, channels) float64."""
+    light = pattern
+    if T.channels == 3:
+        light = np.repeat(pattern[..., None], 3, axis=-1)
+    picture = np.asarray(T @ light.astype(np.float32), np.float64)
+    return picture.reshape(-1, T.channels)
+
+
+def unit(T: Transport, truth: Transport) -> np.ndarray:
+    """The camera's unit of light in each channel, by white."""
+    white = np.ones(truth.grid)
+    ours = shown(T, white)
+    exact = shown(truth, white)
+    return (ours * exact).sum(axis=0) / (ours**2).sum(axis=0)
+
+
+def errors_of(product: Callable[[np.ndarray], np.ndarray], truth: Transport) -> dict[str, float]:
+    """Relative errors of products T p for each kind of picture, root mean square."""
+    errors = {}
+    for kind, patterns in pictures(truth.grid).items():
+        squares = []
+        for pattern in patterns:
+            exact = shown(truth, pattern)
+            left = product(pattern) - exact
+            squares.append((left**2).sum() / (exact**2).sum())
+        errors[kind] = float(np.sqrt(np.mean(squares)))
+    return errors
+
+
+def compensated_error(T: Transport, truth: Transport, scale: np.ndarray) -> float:
+    """Relative error of a picture like nature that is compensated with T and shown by the truth."""
+    pattern = 0.2 + 0.5 * pictures(truth.grid)["nature"][0]
+    desired = shown(truth, pattern)
+    target = (desired / scale).reshape(*truth.grid, -1).astype(np.float32)
+    if T.channels == 1:
+        target = target[..., 0]
+    found = ltcl.compensate(T, target, rtol=1e-3).pattern
+    light = np.asarray(found, np.float32)
+    picture = np.asarray(truth @ light, np.float64).reshape(-1, T.channels)
+    return float(np.linalg.norm(picture - desired) / np.linalg.norm(desired))
+
+
+def run_scan(
+    name: str, truth: Transport, camera: str, strategy: str, options: Options, seed: int = 2
+) -> Result:
+    """Scan a scene with a camera, and compare."""
+    response, bits = CAMERAS[camera]
+    rig = CountingRig(truth, truth.grid, response=response, bits=bits, ambient=0.01, seed=seed)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "T.zarr"
+        start = time.perf_counter()
+        T = acquire(rig, geometry="aligned", strategy=strategy, store=path, device=options.device)
+        seconds = time.perf_counter() - start
+        report = Report.of(path)
+        scale = unit(T, truth)
+        return Result(
+            name=f"{name}, {camera}",
+            photographs=rig.count,
+            seconds=seconds,
+            errors=errors_of(lambda pattern: scale * shown(T, pattern), truth),
+            compensated=compensated_error(T, truth, scale),
+            judged=report.judged_error,
+            bound=report.judged_bound,
+        )
+
+
+def scenes(smoke: bool, options: Options) -> dict[str, Transport]:
+    """The true transports by the names of their scenes."""
+    large, small = (6, 4) if smoke else (32, 16)
+    block = Block(corner=(0.35, 0.35, 0.0), size=(0.3, 0.3, 0.4), albedo=0.6)
+    colours = [[r, g, b] for r, g, b in ((0.7, 0.4, 0.3), (0.4, 0.6, 0.4), (0.6, 0.6, 0.6))]
+    glossy = ltcl.scenes.glossy(
+        ltcl.scenes.dihedral(1), small, 0.7, 0.4, 20.0, projector=(1.6, 1.3, 0.5), directions=64
+    )
+    made = {
+        "dihedral": ltcl.scenes.dihedral(large),
+        "coloured trihedral": ltcl.scenes.box(small, sides=3, albedo=colours),
+        "box with a block": ltcl.scenes.box(small, sides=3, occluder=block, device=options.device),
+        "closed box": ltcl.scenes.box(small, sides=6, albedo=0.5),
+        "glossy corner": glossy,
+    }
+    return {name: scene.transport(device=options.device) for name, scene in made.items()}
+
+
+def like_nature_pairs(truth: Transport, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures like nature, (count, h, w), and noisy photographs of them."""
+    random = np.random.default_rng(5)
+    patterns = []
+    for _ in range(count):
+        noise = like_nature(truth.grid, random)
+        patterns.append(np.clip(0.5 + 0.25 * noise / noise.std(), 0.0, 1.0))
+    light = np.array(patterns)
+    seen = np.stack([shown(truth, pattern)[:, 0] for pattern in light])
+    white = shown(truth, np.ones(truth.grid)).mean()
+    seen += NOISE * white * random.standard_normal(seen.shape)
+    return light, seen.reshape(light.shape)
+
+
+def best(truth: Transport, products: list[Callable[[np.ndarray], np.ndarray]]) -> dict[str, float]:
+    """The errors of the product that has the least one for nature."""
+    return min((errors_of(product, truth) for product in products), key=lambda e: e["nature"])
+
+
+def fitted(truth: Transport, light: np.ndarray, seen: np.ndarray) -> dict[str, float]:
+    """Errors of `ltcl.fit`."""
+    T = ltcl.fit(light, seen, device=truth.device).transport
+    return errors_of(partial(shown, T), truth)
+
+
+def regressed(truth: Transport, light: np.ndarray, seen: np.ndarray) -> dict[str, float]:
+    """Errors of linear regression."""
+    P = light.reshape(len(light), -1)
+    Y = seen.reshape(len(seen), -1)
+    products_of_patterns = P @ P.T
+    size = np.trace(products_of_patterns) / len(P)
+
+    def product(ridge: float, pattern: np.ndarray) -> np.ndarray:
+        system = products_of_patterns + ridge * size * np.eye(len(P))
+        return (np.linalg.solve(system, P @ pattern.ravel()) @ Y)[:, None]
+
+    return best(truth, [partial(product, ridge) for ridge in RIDGES])
+
+
+def nystroem(truth: Transport, count: int) -> dict[str, float]:
+    """Errors of the kernel Nystroem method with columns of T at random pixels."""
+    random = np.random.default_rng(7)
+    N = truth.grid[0] * truth.grid[1]
+    chosen = np.sort(random.choice(N, count, replace=False))
+    columns = np.zeros((N, count))
+    for place, pixel in enumerate(chosen):
+        lit = np.zeros(N)
+        lit[pixel] = 1.0
+        columns[:, place] = shown(truth, lit.reshape(truth.grid))[:, 0]
+    columns += NOISE * columns.max() * random.standard_normal(columns.shape) / np.sqrt(N)
+
+    def product(power: float, pattern: np.ndarray) -> np.ndarray:
+        C = np.sign(columns) * np.abs(columns) ** power
+        core = np.linalg.pinv(C[chosen], rcond=1e-3)
+        dense = C @ core @ C.T
+        return (np.sign(dense) * np.abs(dense) ** (1.0 / power) @ pattern.ravel())[:, None]
+
+    return best(truth, [partial(product, power) for power in POWERS])
+
+
+def claims(result: Result) -> list[Claim]:
+    """Check a sketch."""
+    checked = [
+        Claim(
+            text=f"{result.name}: photographs",
+            measured=str(result.photographs),
+            wanted=f"at most {MAX_PHOTOGRAPHS}",
+            holds=result.photographs <= MAX_PHOTOGRAPHS,
+        )
+    ]
+    limits = {**MAX_ERRORS, "compensated": MAX_COMPENSATED_ERROR}
+    for kind, error in {**result.errors, "compensated": result.compensated}.items():
+        checked.append(
+            Claim(
+                text=f"{result.name}: {kind}",
+                measured=f"{error:.2%}",
+                wanted=f"at most {limits[kind]:.1%}",
+                holds=error <= limits[kind],
+            )
+        )
+    nature = result.errors["nature"]
+    checked.append(
+        Claim(
+            text=f"{result.name}: nature is within the error that is stated",
+            measured=f"{nature:.2%}, stated {result.judged:.2%}, at most {result.bound:.2%}",
+            wanted="below the bound",
+            holds=nature <= result.bound,
+        )
+    )
+    return checked
+
+
+def draw(curves: dict[str, list[tuple[int, float]]]) -> Figure:
+    """Draw the error of pictures like nature over photographs."""
+    figure = figures.page(
+        460,
+        "How many photographs?",
+        "Error of T p for pictures like nature, of a corner. Sketch and adaptive scan with all",
+        "photographs of their set-up; the others are given the light itself.",
+    )
+    axes = figures.graph(figure, (80, 150, 820, 250), "error of T p", "photographs", "")
+    for name, points in curves.items():
+        photographs, errors = zip(*sorted(points), strict=True)
+        axes.plot(photographs, errors, "o-", ms=5, lw=1.5, label=name)
+    axes.set_xscale("log")
+    axes.axhline(MAX_ERRORS["nature"], color=figures.FAINT, lw=1, ls="--")
+    figures.legend(axes, 10)
+    return figure
+
+
+def main() -> None:
+    """Run the bench."""
+    options = parse_options(__doc__)
+    side = 8 if options.smoke else 64
+    counts = (20,) if options.smoke else (25, 50, 100, 200)
+    square = Transport(corner(side), (side, side), device=options.device)
+    truths = {f"corner {side} x {side}": square, **scenes(options.smoke, options)}
+    results = []
+    for name, truth in truths.items():
+        for camera in CAMERAS:
+            results.append(run_scan(name, truth, camera, "sketch", options))
+
+    adaptive = run_scan(f"corner {side} x {side}, adaptive", square, "12 bits", "adaptive", options)
+    curves = {
+        "sketch": [(results[0].photographs, results[0].errors["nature"])],
+        "adaptive scan": [(adaptive.photographs, adaptive.errors["nature"])],
+        "fit": [],
+        "linear regression": [],
+        "kernel Nystroem": [],
+    }
+    facts: dict[str, Any] = {}
+    for count in counts:
+        light, seen = like_nature_pairs(square, count)
+        baselines = {
+            "fit": fitted(square, light, seen),
+            "linear regression": regressed(square, light, seen),
+            "kernel Nystroem": nystroem(square, min(count, side * side // 2)),
+        }
+        for name, errors in baselines.items():
+            curves[name].append((count, errors["nature"]))
+            for kind, error in errors.items():
+                facts[f"{name}, {count} photographs, {kind}"] = error
+    for kind, error in adaptive.errors.items():
+        facts[f"adaptive scan, {adaptive.photographs} photographs, {kind}"] = error
+    checked = []
+    for result in results:
+        facts[f"{result.name}, seconds"] = result.seconds
+        checked += claims(result)
+    if options.smoke:
+        # So few pixels show that it runs, not how few photographs a larger scene takes.
+        checked = []
+    figures.conclude(options, "A sketch of a transport", checked, facts, partial(draw, curves))
+
+
+if __name__ == "__main__":
+    main()
