@@ -139,7 +139,7 @@ def ways() -> dict[str, Length]:
         "compensate to the first kernel": Length(there, len(there), limit=15, aim=12),
         "compensate back": Length(back, len(back), limit=20, aim=16),
         "compress, in its own package": Length(own_files, len(own_files), limit=10, aim=10),
-        "acquire run, around the core": Length(scan, len(scan), limit=48, aim=30),
+        "acquire run, around the core": Length(scan, len(scan), limit=50, aim=30),
         "Python frames of a product in a solver": Length([], solve.frames_of_product, 4, 4),
     }
 
