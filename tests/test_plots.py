@@ -80,6 +80,7 @@ def figures(device: Device) -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 def test_notebooks_show_every_figure(figures, tmp_path: Path) -> None:
     for figure in figures:
         plots.save(figure, tmp_path / "saved.png")

@@ -80,6 +80,7 @@ def test_every_bounce_is_within_what_F_and_noise_allow(truth, errors, how):
     assert np.all(errors[how] <= bound(truth, ERROR_OF_F[how]))
 
 
+@pytest.mark.slow
 def test_the_exact_first_bounce_is_better_where_bias_dominates(truth, errors):
     noise = bound(truth, 0.0)
     biased = errors["diagonal"] > 1.5 * noise

@@ -114,6 +114,7 @@ def test_overhead_counts_for_each_photograph(program, simulated):
     assert more == pytest.approx(10 * slow["photographs"])
 
 
+@pytest.mark.slow
 def test_a_run_continues_from_each_state_of_the_folder(program, scan, acquired, monkeypatch):
     again = f"'ltcl acquire run {scan}' goes on"
     ends = [

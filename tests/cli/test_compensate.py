@@ -205,6 +205,7 @@ def test_a_picture_for_viewing_is_the_linear_one_at_the_exposure_of_the_run(resu
             np.testing.assert_allclose(seen, expected, atol=1.1 / 255)
 
 
+@pytest.mark.slow
 def test_contact_sheets_have_all_panels(results):
     out, _ = results
     assert read_shown(out / "separate.png").shape[1] > 3 * PANEL_WIDTH

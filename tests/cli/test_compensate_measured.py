@@ -85,6 +85,7 @@ def test_a_background_replaces_the_measured_one(program, store, waves, tmp_path,
     assert relative_error(read_codes(tmp_path / "waves_pattern.png"), rig) > 0.02
 
 
+@pytest.mark.slow
 def test_codes_of_a_pattern_are_relit_as_its_light(program, store, compensated, tmp_path):
     out, _ = compensated
     relit = {}
@@ -128,6 +129,7 @@ def test_a_wrong_calibration_is_refused(program, store, waves, transport, tmp_pa
     program("compensate", transport, *common, nowhere).refused("none.zarr: ")
 
 
+@pytest.mark.slow
 def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
     """Nobody has to ask for it, since nobody could change it."""
     T = 0.5 * np.eye(32)

@@ -58,6 +58,7 @@ def test_the_pattern_is_bright_and_hardly_clipped(done):
     assert report["compensation"]["clipped"] < 0.05
 
 
+@pytest.mark.slow
 def test_files_are_listed(done):
     out, report, outcome = done
     files = {*SHEETS}

@@ -179,6 +179,7 @@ def test_a_compressed_file_is_smaller_and_solves(program, colour_transport, tmp_
     assert np.linalg.norm(C @ pattern - seen) <= 0.1 * np.linalg.norm(seen)
 
 
+@pytest.mark.slow
 def test_compression_prints_its_error(program, colour_transport, tmp_path):
     out = tmp_path / "C.zarr"
     arguments = [*COMPRESSION, "--norm", "worst", "--out", out]

@@ -196,6 +196,7 @@ def test_sums_are_those_of_the_twin_to_the_bit(shaped, name, k):
 
 
 # Few items with a few walks each, or many with many.
+@pytest.mark.slow
 @pytest.mark.parametrize("copies", [1, 9])
 @pytest.mark.parametrize("units", [1, 5, 1 << 18])
 @pytest.mark.parametrize("name", ["positive", "alike"])

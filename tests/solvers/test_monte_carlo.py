@@ -103,6 +103,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_mean_of_many_runs_is_the_solution_of_every_channel(device, name, variant):

@@ -144,6 +144,7 @@ def test_negative_light_is_that_of_the_dense_inverse(device):
     assert T.negative_bounces[0] == pytest.approx(expected, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_gloss_takes_more_the_more_there_is(device, caplog):
     shares = []
     projector = (2.0, 1.4, 1.2)

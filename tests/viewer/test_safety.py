@@ -161,6 +161,7 @@ def test_ways_out_of_the_table_of_files(running):
         assert status(response) in (400, 403), (path, response)
 
 
+@pytest.mark.slow
 def test_wrong_tokens_hosts_and_origins(running):
     token = running.token
     own = running.host

@@ -109,6 +109,7 @@ def test_masked_pixels_stay_dark():
     assert ltcl.compensate(T, desired, inverse=inverse, clamp=True).pattern.ravel()[3] == 0.0
 
 
+@pytest.mark.slow
 def test_mixing_of_colours_is_undone():
     T = ltcl.Transport(
         [lambertian(N, 0.4, seed=seed).T for seed in range(3)], GRID, mixing=np.eye(3) + 0.1
@@ -143,6 +144,7 @@ def test_a_transport_of_any_form_is_inverted(form, basis):
     assert inverse.confidence > 0.999
 
 
+@pytest.mark.slow
 def test_another_first_bounce_or_somebodys_operator(device):
     """S of neither has numbers at hand: F / F' stands between, or products are all there are."""
     scene = lambertian(N, 0.8, seed=7)
@@ -241,6 +243,7 @@ def test_the_error_of_coefficients_is_a_bound_and_within_the_tolerance(name, und
     assert error_of_coefficients(C, inverse.D) <= inverse.error <= rtol
 
 
+@pytest.mark.slow
 def test_thresholds_leave_few_numbers_of_what_is_smooth(monkeypatch):
     # Orthonormal; smooth pictures have few coefficients.
     W = scipy.linalg.hadamard(512) / np.sqrt(512)
