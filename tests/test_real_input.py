@@ -24,6 +24,8 @@ import pytest
 
 import ltcl
 
+pytestmark = pytest.mark.slow
+
 ERROR_OF_F = {"diagonal": 0.0093, "exact": 0.0026}
 ALBEDO = 0.7
 NOISE_OF_T = 0.0015

@@ -17,6 +17,8 @@ import ltcl
 from ltcl import errors
 from ltcl.errors import BatchError, ClusterError, FileError, InputTypeError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(params=[False, True], ids=["here", "on a cluster"])
 def where(request) -> Any:

@@ -82,6 +82,7 @@ def test_photographs_become_a_transport_and_run_again_reports_it(program, acquir
         assert text in printed
 
 
+@pytest.mark.slow
 def test_plans_before_and_after_the_calibration(program, simulated, acquired):
     before = program("acquire", "plan", simulated, "--json").json
     after = program("acquire", "plan", acquired, "--json").json
@@ -156,6 +157,7 @@ def test_a_live_scan_with_all_photographs_opens_no_camera(program, finished):
     assert program("acquire", "run", finished).code == 1
 
 
+@pytest.mark.slow
 def test_a_scan_with_other_settings_is_refused(program, finished):
     """The table is named that the setting stands in."""
     change(finished, "bits = 12", "bits = 14")

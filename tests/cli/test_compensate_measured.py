@@ -59,6 +59,7 @@ def relative_error(codes: np.ndarray, rig: Any) -> float:
     return float(np.linalg.norm(scale * seen - DESIRED) / np.linalg.norm(DESIRED))
 
 
+@pytest.mark.slow
 def test_the_scene_under_the_pattern_looks_like_the_picture(store, compensated, rig):
     """The room has light of its own; a pattern in sRGB would fail."""
     out, printed = compensated
@@ -122,6 +123,7 @@ def test_a_copy_takes_the_calibration_of_its_store(program, store, waves, tmp_pa
     assert relative_error(codes, rig) < 0.04
 
 
+@pytest.mark.slow
 def test_a_wrong_calibration_is_refused(program, store, waves, transport, tmp_path):
     common = [waves, "--out", tmp_path / "no", "--calibration"]
     program("compensate", transport, *common, store).refused("(4, 8)", "(5, 10)")

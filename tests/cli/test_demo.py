@@ -16,6 +16,8 @@ from tests import json_schema
 
 from .conftest import Outcome, Program
 
+pytestmark = pytest.mark.slow
+
 VIEWS = [
     "target",
     "uncompensated",

@@ -52,6 +52,7 @@ def test_info_of_dense_transports(program, transport, colour_transport, monkeypa
     assert room["stored"] == "dense"
 
 
+@pytest.mark.slow
 def test_info_of_compressed_transports_and_inverses(program, compressed, inverse):
     small = info(program, compressed)
     assert small["stored"] == "compressed"

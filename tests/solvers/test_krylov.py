@@ -174,6 +174,7 @@ STEPS: dict[str, tuple[float, float, dict[str, Any]]] = {  # launches and waits 
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", STEPS)
 @pytest.mark.parametrize("k", [1, 3, 5])
 def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k):

@@ -29,6 +29,8 @@ from ltcl.store import BlockStore, StoreRecord, formats
 
 from . import stores
 
+pytestmark = pytest.mark.slow
+
 random = np.random.default_rng()
 MOMENTS = int(os.environ.get("LTCL_KILLS", "8"))
 ENDS = {"SIGKILL": (stores.kill, -signal.SIGKILL), "Ctrl-C": (stores.interrupt, 2)}

@@ -26,6 +26,7 @@ def check(device, T, F, form=np.asarray):
     return diagnostics.check_energy(transport.matrices[0], F, transport.systems[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array, aslinearoperator])
 @pytest.mark.parametrize("rho", [0.2, 0.9, 4.0])
 def test_row_sums_are_those_of_A(device, form, rho):

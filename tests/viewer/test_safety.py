@@ -26,6 +26,8 @@ import ltcl
 from ltcl.viewer import client, server
 from tests.viewer.page import Page, question
 
+pytestmark = pytest.mark.slow
+
 GROWTH = 64 << 20  # bytes of memory that a suite of hostile requests may cost
 KEY = (
     "Upgrade: websocket\r\nConnection: Upgrade\r\n"

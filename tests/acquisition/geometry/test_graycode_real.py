@@ -15,6 +15,8 @@ import pytest
 
 from ltcl.acquisition.geometry import Correspondence, decode
 
+pytestmark = pytest.mark.slow
+
 GRID = (768, 1024)
 STEP = 2.0  # the authors' projector pixels in a step of the code
 

@@ -410,6 +410,7 @@ def test_bases_are_compared_in_the_middle_of_a_large_picture():
     assert worst_error(S, C.systems[0].to_dense()) <= C.error <= 0.02
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(n=st.integers(1, 60), size=st.sampled_from([0.1, 0.5, 0.9]), seed=st.integers(0, 999))
 def test_the_bound_is_never_below(device, n, size, seed):

@@ -54,6 +54,7 @@ def smooth():
     return T, ltcl.invert(T, 1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basis", ["db2", "pixels"])
 @pytest.mark.parametrize("rtol", [0.1, 1e-3])
 @pytest.mark.parametrize("name", SCENES)
@@ -87,6 +88,7 @@ def test_colours_have_their_own(forms):
     assert c.error <= 0.1
 
 
+@pytest.mark.slow
 def test_clamping_is_quick_and_says_what_it_costs(smooth):
     T, inverse = smooth
     desired = random.uniform(0.0, 1.0, T.grid)
@@ -101,6 +103,7 @@ def test_clamping_is_quick_and_says_what_it_costs(smooth):
     np.testing.assert_array_equal(clamped.pattern, inverse.pattern(desired))
 
 
+@pytest.mark.slow
 def test_masked_pixels_stay_dark():
     T = ltcl.Transport(SCENES["rho 0.8"].T * (np.arange(N) != 3), GRID, on_dark="mask")
     inverse = ltcl.invert(T, 1e-2)
@@ -156,6 +159,7 @@ def test_another_first_bounce_or_somebodys_operator(device):
             assert error_of(inverse, scene.T / F) <= inverse.error <= 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basis", ["db2", "pixels"])
 @pytest.mark.parametrize("rtol", [9e-7, 1e-6])
 def test_a_tolerance_below_float32_is_refused_with_what_it_does(rtol, basis):
@@ -261,6 +265,7 @@ def test_nothing_to_invert(n):
     assert (inverse.status, inverse.D.nnz, inverse.products) == (Status.CONVERGED, 0, 0)
 
 
+@pytest.mark.slow
 def test_what_takes_too_many_products_is_refused_with_what_there_is(monkeypatch):
     C = rooms(-enclosure(25, 0.998).A, "iteration")
     monkeypatch.setattr(checks, "host_memory", lambda: 0)

@@ -18,6 +18,8 @@ from ltcl.images import read, write
 from ltcl.transport.noise import Noise
 from tests.cli.conftest import program  # noqa: F401
 
+pytestmark = pytest.mark.slow
+
 random = np.random.default_rng()
 n = 32
 GRID = (n, n)

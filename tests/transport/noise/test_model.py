@@ -320,6 +320,7 @@ def test_noise_is_kept_unless_it_is_an_estimate(
     assert estimated.measured_noise is None
 
 
+@pytest.mark.slow
 def test_second_measurement_on_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -334,6 +335,7 @@ def test_second_measurement_on_the_command_line(
     assert "noise is a T of grid (8, 8)" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strategy", "least"),
     [
