@@ -58,6 +58,8 @@ CANNOT_EXCHANGE = (
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EBADF)
 # Errors of a writer that another one overtakes.
 OVERTAKEN = (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST)
+# Attempts to open a folder; it is nowhere for an instant while it is replaced in two steps.
+OPEN_ATTEMPTS = 100
 
 
 def input_file(path: Any, shown: Path | None = None) -> Path:
@@ -202,8 +204,12 @@ def restore(target: Path) -> None:
     earlier = _earlier(target)
     if os.path.lexists(target) or not earlier.exists():
         return
-    with contextlib.suppress(FileNotFoundError):
+    try:
         os.replace(earlier, target)
+    except OSError as error:
+        # Its writer has put the new one there by now, or another reader was first.
+        if error.errno not in OVERTAKEN:
+            raise
 
 
 def _earlier(target: Path) -> Path:
@@ -234,14 +240,26 @@ class PinnedFolder:
         if IS_WINDOWS:
             return
         place = Path(os.path.realpath(path))
-        locks = None
-        while locks is None:
-            locks = _pin(place, file)
-        folder, opened = locks
+        folder, opened = _pin_what_is_there(place, file)
         weakref.finalize(self, _unpin, folder, opened, place)
         # Other systems than Linux read whatever has the name, and checksums tell.
         if Path(f"/proc/self/fd/{folder}").is_dir():
             self.root = Path(f"/proc/self/fd/{folder}")
+
+
+def _pin_what_is_there(path: Path, file: str) -> tuple[int, contextlib.ExitStack]:
+    """Open a folder and lock a file in it, again while other processes replace the folder."""
+    missing = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    for _ in range(OPEN_ATTEMPTS):
+        restore(path)
+        try:
+            locks = _pin(path, file)
+        except FileNotFoundError as error:
+            missing = error
+        else:
+            if locks is not None:
+                return locks
+    raise missing
 
 
 def _pin(path: Path, file: str) -> tuple[int, contextlib.ExitStack] | None:
@@ -317,13 +335,13 @@ def _remove(temporary: Path, *, needs_lock: bool = False) -> None:
 
     With `needs_lock` it stays, too, if the file system has no locks.
     """
-    places = [temporary]
-    if temporary.is_dir():
-        places += filter(Path.is_file, temporary.iterdir())
     with contextlib.ExitStack() as locks:
         try:
             if not IS_WINDOWS:
-                for place in places:
+                locks.enter_context(_exclusive(temporary))
+                # Only now: until its writer has ended, the name may pass to the folder that it
+                # replaces, in which there are other files, and readers.
+                for place in _files_in(temporary):
                     locks.enter_context(_exclusive(place))
         except OSError as error:
             if needs_lock or isinstance(error, (BlockingIOError, FileNotFoundError)):
@@ -333,6 +351,13 @@ def _remove(temporary: Path, *, needs_lock: bool = False) -> None:
         else:
             with contextlib.suppress(PermissionError):
                 temporary.unlink(missing_ok=True)
+
+
+def _files_in(path: Path) -> list[Path]:
+    """The files directly in a folder; none if `path` is a file."""
+    if not path.is_dir():
+        return []
+    return [place for place in path.iterdir() if place.is_file()]
 
 
 @contextlib.contextmanager

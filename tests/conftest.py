@@ -113,7 +113,7 @@ def small_device(device: Device) -> Device:
     return small
 
 
-@pytest.fixture(scope="session", params=["cpu", "gpu"])
+@pytest.fixture(scope="session", params=["cpu", pytest.param("gpu", marks=pytest.mark.slow)])
 def shaped(request: pytest.FixtureRequest, device: Device) -> Device:
     """The same hardware; kernels are launched as on a CPU or as on a GPU."""
     return launched_as(device, request.param)

@@ -530,3 +530,8 @@ def hats_gather(grid: tuple[int, int]) -> np.ndarray:
         if max(height, width) <= 2:
             return np.array(hats)
         height, width, scale = height // 2 + 1, width // 2 + 1, 2 * scale
+
+
+def hats_spread(grid: tuple[int, int]) -> np.ndarray:
+    """W^T (N, nodes): pictures of hats, the transpose of hats_gather."""
+    return hats_gather(grid).T

@@ -43,6 +43,7 @@ def conclude(figures: Any, given: Any, *claims: Any) -> list[dict[str, Any]]:
     return json.loads(given.json.read_text())["claims"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("holds", "differs", "passed", "verdict"),
     [
@@ -88,6 +89,7 @@ def test_a_slope_is_that_above_the_launch_floor(load: Callable[[str], Any]) -> N
     np.testing.assert_allclose(found(pixels), 1e-3 + 1e-9 * pixels**1.5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any) -> None:
     at = load("fig7").problem(4)
     truth = at.l_out - dihedral(4, albedo=0.8).A @ at.l_out

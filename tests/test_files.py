@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from ltcl import files
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import PinnedFolder, fill_folder, input_file, replace_file, sweep
 
@@ -193,3 +194,41 @@ def test_a_folder_that_is_read_stays_until_its_last_reader_has_gone(
     assert len(list(tmp_path.iterdir())) == 2
     readers.clear()
     assert everything(tmp_path) == {"folder": None, "folder/file": b"newer"}
+
+
+def test_a_name_that_passes_to_a_folder_in_use_is_not_removed(tmp_path, monkeypatch):
+    """A sweep looks at a new folder; its writer exchanges it with one that somebody reads."""
+    path = tmp_path / "folder"
+    with fill_folder(path) as folder:
+        (folder / "file").write_text("read")
+    reader = PinnedFolder(path, "file")
+    locking = files._exclusive
+    with fill_folder(tmp_path / "other") as folder:
+        temporary = folder
+    temporary.mkdir()
+
+    def lock_late(place: Path) -> Any:
+        if place == temporary and not (place / "file").exists():
+            files.exchange(temporary, path)
+        return locking(place)
+
+    monkeypatch.setattr(files, "_exclusive", lock_late)
+    sweep(tmp_path)
+    assert (reader.root / "file").read_text() == "read"
+
+
+def test_a_folder_that_is_replaced_in_two_steps_is_opened(tmp_path, monkeypatch):
+    path = tmp_path / "folder"
+    path.mkdir()
+    (path / "file").write_text("read")
+    path.rename(files._earlier(path))
+    restoring = files.restore
+
+    def put_back(place: Path) -> None:
+        # Another writer takes it away once more before it is opened.
+        restoring(place)
+        monkeypatch.setattr(files, "restore", restoring)
+        path.rename(files._earlier(path))
+
+    monkeypatch.setattr(files, "restore", put_back)
+    assert (PinnedFolder(path, "file").root / "file").read_text() == "read"

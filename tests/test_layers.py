@@ -117,6 +117,7 @@ def test_imports_of_ltcl_point_down() -> None:
     TopologicalSorter(graph).prepare()  # raises for a circle
 
 
+@pytest.mark.slow
 def test_import_of_ltcl_is_light() -> None:
     code = "import sys, ltcl; print(*{'pyopencl', 'matplotlib', 'cv2'}.intersection(sys.modules))"
     run = subprocess.run(

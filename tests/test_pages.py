@@ -17,6 +17,8 @@ import pytest
 import ltcl
 from tests.json_schema import PAGES, SCHEMA
 
+pytestmark = pytest.mark.slow
+
 PACKAGE = Path(ltcl.__file__).parent
 FILES = [path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))]
 PYTHON, ERRORS, ENVIRONMENT = (

@@ -19,6 +19,8 @@ from ltcl.device import Device
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.solvers import Solution, Status
 
+pytestmark = pytest.mark.slow
+
 
 def solution(method: str, residuals: tuple[float, ...], products: int) -> Solution:
     status = Status.CONVERGED if residuals[-1] < 1e-2 else Status.DIVERGED
@@ -80,6 +82,7 @@ def figures(device: Device) -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 def test_notebooks_show_every_figure(figures, tmp_path: Path) -> None:
     for figure in figures:
         plots.save(figure, tmp_path / "saved.png")

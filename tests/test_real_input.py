@@ -24,6 +24,8 @@ import pytest
 
 import ltcl
 
+pytestmark = pytest.mark.slow
+
 ERROR_OF_F = {"diagonal": 0.0093, "exact": 0.0026}
 ALBEDO = 0.7
 NOISE_OF_T = 0.0015
@@ -80,6 +82,7 @@ def test_every_bounce_is_within_what_F_and_noise_allow(truth, errors, how):
     assert np.all(errors[how] <= bound(truth, ERROR_OF_F[how]))
 
 
+@pytest.mark.slow
 def test_the_exact_first_bounce_is_better_where_bias_dominates(truth, errors):
     noise = bound(truth, 0.0)
     biased = errors["diagonal"] > 1.5 * noise

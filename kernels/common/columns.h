@@ -93,21 +93,23 @@ INLINE local real *columns_totals(
 {
     const int me = get_local_id(0), items = get_local_size(0);
     local real *totals = scratch + items + first * s.width;
-    for (int start = 0; start < count * s.width; start += items) {
-        const int width = min(items, count * s.width - start), together = items / width;
-        const int entry = start + me % width;
+    const int entries = count * s.width, together = max(items / entries, 1);
+    // Several items for each entry, or several entries for each item.
+    local real *values = entries <= items ? scratch : totals;
+    for (int value = me; value < together * entries; value += items) {
+        const int entry = value % entries;
         real sum = 0;
-        for (int slice = me / width; slice < slices && me < together * width; slice += together) {
+        for (int slice = value / entries; slice < slices; slice += together) {
             const int row = slice * count + entry / s.width;
             const real partial = partials[row * k + s.origin + entry % s.width];
             sum = entry < largest * s.width ? sum + partial : fmax(sum, partial);
         }
-        scratch[me] = sum;
-        fold(scratch, items, width, largest * s.width - start);
-        if (me < width)
-            totals[start + me] = scratch[me];
-        barrier(CLK_LOCAL_MEM_FENCE);
+        values[value] = sum;
     }
+    fold(values, together * entries, entries, largest * s.width);
+    for (int entry = me; entry < entries; entry += items)
+        totals[entry] = values[entry];
+    barrier(CLK_LOCAL_MEM_FENCE);
     return totals;
 }
 

@@ -55,24 +55,35 @@ INLINE real sum8(real8 v)
     return (h.s0 + h.s1) + (h.s2 + h.s3);
 }
 
-// Sums, or maxima, over a work-group as a binary tree: the same order every time, for any size of
-// the group. All items call it.
+// values[j], j < stride, becomes the sum of values[j], values[j + stride], ...; see fold.
+INLINE void fold_step(local real *values, int count, int stride, int period, int largest)
+{
+    for (int j = get_local_id(0); j < min(stride, count); j += get_local_size(0)) {
+        real sum = values[j];
+        for (int i = j + stride; i < count; i += stride)
+            sum = j % period < largest ? sum + values[i] : fmax(sum, values[i]);
+        values[j] = sum;
+    }
+}
+
+// Sums, or maxima, over a work-group, in two steps of about the root of their terms each: the same
+// order every time. All items call it. A tree would take a barrier in a loop, of which PoCL compiles
+// many copies.
 //   values   values[j], j < period, becomes the sum of values[j], values[j + period], ...
 //   count    number of values
 //   period   number of results
 //   largest  from this result on, the largest value in place of the sum
 INLINE void fold(local real *values, int count, int period, int largest)
 {
+    const int rows = (count + period - 1) / period;
+    int parts = 1;
+    while (parts * parts < rows)
+        parts++;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int rows = (count + period - 1) / period; rows > 1; rows = (rows + 1) / 2) {
-        // Rounded up, so the rows need not be a power of two.
-        const int upper = (rows + 1) / 2 * period;
-        for (int j = get_local_id(0); j + upper < count; j += get_local_size(0))
-            values[j] = j % period < largest ? values[j] + values[j + upper]
-                                             : fmax(values[j], values[j + upper]);
-        count = upper;
-        barrier(CLK_LOCAL_MEM_FENCE);
-    }
+    fold_step(values, count, parts * period, period, largest);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    fold_step(values, min(count, parts * period), period, period, largest);
+    barrier(CLK_LOCAL_MEM_FENCE);
 }
 
 #endif

@@ -31,11 +31,10 @@ from ltcl.files import (
     fill_folder,
     input_file,
     locked,
-    restore,
     sweep,
 )
 from ltcl.store.array_log import ArrayLog
-from ltcl.store.document import StoreLayout, is_store, read_document, write_document
+from ltcl.store.document import DOCUMENT, StoreLayout, is_store, read_document, write_document
 from ltcl.store.final_store import (
     BINSPARSE,
     Block,
@@ -124,10 +123,6 @@ class BlockStore:
     def open(cls, path: str | os.PathLike[str]) -> BlockStore:
         """Open a store to read and to write; blocks are checked when they are read."""
         path = as_path(path)
-        with about(path):
-            restore(Path(os.path.realpath(path)))
-            if not path.exists():
-                raise FileError("no such folder")
         return cls(path)
 
     @property
@@ -332,18 +327,17 @@ class BlockStore:
 
     def _open(self) -> None:
         """Read the document again, and pin the folder of a final store."""
-        self._folder = None
+        with about(self.path, reading=True):
+            self._folder = pinned(self.path)
         self._read_document()
-        if self.final:
-            with about(self.path, reading=True):
-                self._folder = PinnedFolder(self.path, "zarr.json")
-            # It may be another store by now.
-            self._read_document()
+        if not self.final:
+            # Its files change their places while it grows.
+            self._folder = None
 
     def _read_document(self) -> None:
         """Read the document, which other processes may have changed."""
         with about(self.path, reading=True):
-            content = read_document(self._root / "zarr.json")
+            content = read_document(self._root / DOCUMENT)
             self.layout = StoreLayout(**content["ltcl"])
             self.provenance = content["provenance"]
             self.attributes: dict[str, Any] = content["state"]
@@ -515,13 +509,38 @@ def compressed_content(record: CompressedRecord) -> tuple[StoreLayout, FinalCont
 def check_place(path: Path, overwrite: bool) -> None:
     """Refuse at once, before there is anything to keep, a place where no store can be made."""
     with about(path):
-        target = Path(os.path.realpath(path))
-        restore(target)
-        if not target.exists():
-            return
-        if target.is_dir() and not any(target.iterdir()):
-            return
-        if not is_store(target):
+        if _is_store_at(path):
+            if not overwrite:
+                raise FileError("exists; give overwrite=True")
+        elif not _is_vacant(path):
             raise FileError("exists; it is no store of ltcl")
-        if not overwrite:
-            raise FileError("exists; give overwrite=True")
+
+
+def pinned(path: Path) -> PinnedFolder:
+    """The folder of a store, which stays whole while it is read; FileError if there is none."""
+    try:
+        return PinnedFolder(path, DOCUMENT)
+    except FileNotFoundError:
+        if path.is_dir():
+            raise FileError(
+                "is a folder without zarr.json (of a store) or acquisition.toml"
+            ) from None
+        raise FileError("no such folder") from None
+    except NotADirectoryError:
+        raise FileError("is a file; a store is a folder") from None
+
+
+def _is_store_at(path: Path) -> bool:
+    """True if a store is at `path`, even while other processes replace it."""
+    try:
+        folder = pinned(path)
+    except FileError:
+        return False
+    return is_store(folder.root)
+
+
+def _is_vacant(path: Path) -> bool:
+    """True if nothing is at `path`, or a folder in which nothing is."""
+    if path.is_dir():
+        return not any(path.iterdir())
+    return not path.exists()

@@ -22,7 +22,7 @@ DEFAULT_BLOCK_ENTRIES = 1 << 23  # 64 MiB where all entries of the rows are stor
 MAX_PIXELS = (1 << 31) - 1  # column indices have 32 bits
 MAX_BLOCKS = 1 << 20
 
-
+DOCUMENT = "zarr.json"
 BEGINNING = b'{"attributes": {"checksum": "'
 UNSEALED = b"0" * 64
 
@@ -110,7 +110,7 @@ def write_document(
     except (TypeError, ValueError) as error:
         raise InputError(f"attributes are not plain JSON: {str(error)!a:.150}") from None
     checksum = hashlib.sha256(raw).hexdigest().encode()
-    with replace_file(root / "zarr.json") as temporary:
+    with replace_file(root / DOCUMENT) as temporary:
         temporary.write_bytes(raw.replace(UNSEALED, checksum, 1))
 
 
@@ -127,5 +127,5 @@ def read_document(file: Path) -> dict[str, Any]:
 
 def is_store(folder: Path) -> bool:
     """True if a folder holds a store of ltcl, damaged or not."""
-    document = folder / "zarr.json"
+    document = folder / DOCUMENT
     return document.is_file() and document.read_bytes().startswith(BEGINNING)

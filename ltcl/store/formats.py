@@ -216,8 +216,6 @@ def read(
         )
     if suffix != ".zarr":
         input_file(path)
-    elif path.is_dir() and not (path / "zarr.json").exists():
-        raise FileError(f"{path}: is a folder without zarr.json (of a store) or acquisition.toml")
     with about(path, reading=True):
         if file_format.has_names:
             return file_format.read(path, variable)

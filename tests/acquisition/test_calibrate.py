@@ -61,6 +61,7 @@ def test_a_dark_room_around_the_picture_decides_no_exposure() -> None:
         measure(Shots(camera), exposures=[30.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("response", ["srgb", "film"])
 def test_colours_mix_and_have_one_unit(response: str) -> None:
     """Also a colour with an eighth of the light of another has that unit."""

@@ -62,6 +62,7 @@ def test_a_picture_is_transport_of_light_and_ambient(tmp_path: Path, channels: i
     assert max(setup.relative_error(scene, T)) < 0.02
 
 
+@pytest.mark.slow
 def test_codes_give_the_light_that_is_asked_for(tmp_path: Path) -> None:
     camera = rig(4, projector_response="gamma2.2", projector_black=0.02)
     _, setup = scanned(camera, tmp_path / "T.zarr")
@@ -76,6 +77,7 @@ def test_codes_give_the_light_that_is_asked_for(tmp_path: Path) -> None:
         setup.light(np.ones((4, 4)))
 
 
+@pytest.mark.slow
 def test_blocks_are_fed_to_the_pixels_of_the_projector(tmp_path: Path) -> None:
     camera = rig(4, **CLEAN)
     T, setup = scanned(camera, tmp_path / "T.zarr", "block", block=2, sigmas=0.0)

@@ -24,6 +24,8 @@ from tests.store.stores import contents
 
 from .stopping import acquire_and_end, set_up
 
+pytestmark = pytest.mark.slow
+
 random = np.random.default_rng()
 KILLS = int(os.environ.get("LTCL_KILLS", "3"))
 STATUS = {"SIGKILL": -signal.SIGKILL, "Ctrl-C": 2}

@@ -31,6 +31,7 @@ def run(rig: Any, store: Path, **settings: Any) -> None:
     acquire(rig, geometry="aligned", strategy="pixel", store=store, **settings)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_unplugged_again_and_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -136,6 +137,7 @@ class Terse(Plain):
         return {"kind": "terse"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "others"),
     [

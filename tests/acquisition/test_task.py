@@ -43,6 +43,7 @@ def camera(left: int = 1 << 30) -> Unplugged:
     return Unplugged(corner(), GRID, left=left, response="film", bits=8)
 
 
+@pytest.mark.slow
 def test_patterns_that_no_scan_has_seen(scanned: Any) -> None:
     """Curve of the camera, black, ambient light and noise are measured from photographs alone."""
     strategy, T, path = scanned
@@ -136,6 +137,7 @@ def test_progress(tmp_path: Path, strategy: str) -> None:
     assert (at_once > 0) == bool(earlier)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("other", "change", "text"),
     [
@@ -166,6 +168,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_another_rig_is_refused_after_the_end_too(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel"}
     path = tmp_path / "T.zarr"
@@ -239,6 +242,7 @@ def test_a_camera_of_its_own_pixels(
     assert 10 * np.log10(desired.max() ** 2 / np.mean(error**2)) > 30
 
 
+@pytest.mark.slow
 def test_pixels_that_every_exposure_saturates(tmp_path: Path) -> None:
     """They are masked, counted, and their entries of unknown variance; the others are right."""
     path = tmp_path / "T.zarr"

@@ -22,6 +22,8 @@ from ltcl.errors import ConvergenceError, FileError, InputError, InputTypeError
 from ltcl.images.frames import open_frames, write_video
 from tests.problems import lambertian
 
+pytestmark = pytest.mark.slow
+
 GRID = (8, 8)
 SCENE = lambertian(64, 0.8, seed=70)
 COUNT = 13

@@ -17,12 +17,15 @@ import ltcl
 from ltcl import errors
 from ltcl.errors import BatchError, ClusterError, FileError, InputTypeError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(params=[False, True], ids=["here", "on a cluster"])
 def where(request) -> Any:
     return request.getfixturevalue("client") if request.param else None
 
 
+@pytest.mark.slow
 def test_one_task_each_and_those_that_fail_are_named(where, tmp_path):
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(6), grid=(2, 3)))
     paths = [tmp_path / f"{name}.npz" for name in ("T", "none", "T", "nor")]

@@ -82,6 +82,7 @@ def test_photographs_become_a_transport_and_run_again_reports_it(program, acquir
         assert text in printed
 
 
+@pytest.mark.slow
 def test_plans_before_and_after_the_calibration(program, simulated, acquired):
     before = program("acquire", "plan", simulated, "--json").json
     after = program("acquire", "plan", acquired, "--json").json
@@ -114,6 +115,7 @@ def test_overhead_counts_for_each_photograph(program, simulated):
     assert more == pytest.approx(10 * slow["photographs"])
 
 
+@pytest.mark.slow
 def test_a_run_continues_from_each_state_of_the_folder(program, scan, acquired, monkeypatch):
     again = f"'ltcl acquire run {scan}' goes on"
     ends = [
@@ -155,6 +157,7 @@ def test_a_live_scan_with_all_photographs_opens_no_camera(program, finished):
     assert program("acquire", "run", finished).code == 1
 
 
+@pytest.mark.slow
 def test_a_scan_with_other_settings_is_refused(program, finished):
     """The table is named that the setting stands in."""
     change(finished, "bits = 12", "bits = 14")

@@ -82,6 +82,7 @@ def std_files(command: str, std: Any) -> dict[str, np.ndarray]:
     return deviations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "arguments", "printed"), CALLS)
 def test_a_command_does_what_the_library_does(
     program, transport, compressed, inverse, picture, tmp_path, line, arguments, printed
@@ -128,6 +129,7 @@ def test_a_command_does_what_the_library_does(
         np.testing.assert_allclose(codes / 255, expected, atol=0.6 / 255)
 
 
+@pytest.mark.slow
 def test_reports_have_every_option_as_it_was_resolved(results):
     _, reports = results
     shared = {"on_dark": "mask", "encoding": "linear", "grid": [5, 10], "resize": True}
@@ -205,6 +207,7 @@ def test_a_picture_for_viewing_is_the_linear_one_at_the_exposure_of_the_run(resu
             np.testing.assert_allclose(seen, expected, atol=1.1 / 255)
 
 
+@pytest.mark.slow
 def test_contact_sheets_have_all_panels(results):
     out, _ = results
     assert read_shown(out / "separate.png").shape[1] > 3 * PANEL_WIDTH

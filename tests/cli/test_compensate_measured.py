@@ -59,6 +59,7 @@ def relative_error(codes: np.ndarray, rig: Any) -> float:
     return float(np.linalg.norm(scale * seen - DESIRED) / np.linalg.norm(DESIRED))
 
 
+@pytest.mark.slow
 def test_the_scene_under_the_pattern_looks_like_the_picture(store, compensated, rig):
     """The room has light of its own; a pattern in sRGB would fail."""
     out, printed = compensated
@@ -85,6 +86,7 @@ def test_a_background_replaces_the_measured_one(program, store, waves, tmp_path,
     assert relative_error(read_codes(tmp_path / "waves_pattern.png"), rig) > 0.02
 
 
+@pytest.mark.slow
 def test_codes_of_a_pattern_are_relit_as_its_light(program, store, compensated, tmp_path):
     out, _ = compensated
     relit = {}
@@ -121,6 +123,7 @@ def test_a_copy_takes_the_calibration_of_its_store(program, store, waves, tmp_pa
     assert relative_error(codes, rig) < 0.04
 
 
+@pytest.mark.slow
 def test_a_wrong_calibration_is_refused(program, store, waves, transport, tmp_path):
     common = [waves, "--out", tmp_path / "no", "--calibration"]
     program("compensate", transport, *common, store).refused("(4, 8)", "(5, 10)")
@@ -128,6 +131,7 @@ def test_a_wrong_calibration_is_refused(program, store, waves, transport, tmp_pa
     program("compensate", transport, *common, nowhere).refused("none.zarr: ")
 
 
+@pytest.mark.slow
 def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
     """Nobody has to ask for it, since nobody could change it."""
     T = 0.5 * np.eye(32)

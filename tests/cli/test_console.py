@@ -84,6 +84,7 @@ def test_every_command_explains_itself(program, name):
     assert name.replace(" ", "-") in json_schema.SCHEMA["$defs"]
 
 
+@pytest.mark.slow
 def test_python_m_is_the_same_program_and_its_help_imports_nothing_heavy():
     words = [sys.executable, "-X", "importtime", "-m", "ltcl", "--help"]
     run = subprocess.run(words, capture_output=True, text=True)
@@ -214,6 +215,7 @@ def test_ctrl_c_at_any_moment_is_one_line():
     assert 130 in codes
 
 
+@pytest.mark.slow
 def test_who_imports_ltcl_keeps_the_handlers_of_signals():
     code = "import signal, ltcl; print(signal.getsignal(signal.SIGINT).__name__)"
     words = [sys.executable, "-c", code]
@@ -273,6 +275,7 @@ def test_devices_without_the_one_that_is_named(program, monkeypatch):
     program("devices").refused("no OpenCL device", "install")
 
 
+@pytest.mark.slow
 def test_ltcl_is_imported_whatever_the_words_of_the_process_are() -> None:
     """Processes of multiprocessing have the words of the program that started them."""
     code = "import sys; sys.argv = ['program'] * 50; import ltcl"

@@ -16,6 +16,8 @@ from tests import json_schema
 
 from .conftest import Outcome, Program
 
+pytestmark = pytest.mark.slow
+
 VIEWS = [
     "target",
     "uncompensated",
@@ -58,6 +60,7 @@ def test_the_pattern_is_bright_and_hardly_clipped(done):
     assert report["compensation"]["clipped"] < 0.05
 
 
+@pytest.mark.slow
 def test_files_are_listed(done):
     out, report, outcome = done
     files = {*SHEETS}

@@ -52,6 +52,7 @@ def test_info_of_dense_transports(program, transport, colour_transport, monkeypa
     assert room["stored"] == "dense"
 
 
+@pytest.mark.slow
 def test_info_of_compressed_transports_and_inverses(program, compressed, inverse):
     small = info(program, compressed)
     assert small["stored"] == "compressed"
@@ -179,6 +180,7 @@ def test_a_compressed_file_is_smaller_and_solves(program, colour_transport, tmp_
     assert np.linalg.norm(C @ pattern - seen) <= 0.1 * np.linalg.norm(seen)
 
 
+@pytest.mark.slow
 def test_compression_prints_its_error(program, colour_transport, tmp_path):
     out = tmp_path / "C.zarr"
     arguments = [*COMPRESSION, "--norm", "worst", "--out", out]

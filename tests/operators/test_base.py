@@ -160,6 +160,7 @@ def test_a_product_has_to_be_written(device):
         Operator(device, (1, 1))  # pyright: ignore[reportAbstractUsage]
 
 
+@pytest.mark.slow
 def test_products_and_steps_meet_their_twins(pair):
     A, matrix = pair
     helpers.meets_twin(A, matrix)

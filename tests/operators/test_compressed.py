@@ -48,6 +48,7 @@ def test_errors_of_compressed_operators_are_handed_on(device):
     assert ScaledColumns(A, masked).solution_error == 0.0
 
 
+@pytest.mark.slow
 def test_threads_share_an_operator(device):
     R = two_sided(device, gallery.bounces(N, 0.5))
     pictures = [gallery.vectors(N, 1 + seed % 3, seed) for seed in range(8)]

@@ -21,6 +21,8 @@ from ltcl.operators import MultiDevice
 from tests import gallery
 from tests.operators.large import GRID, PIXELS, Stored, transport
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def two(monkeypatch: pytest.MonkeyPatch, device: Device) -> list[discovery.Description]:

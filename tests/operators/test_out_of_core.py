@@ -22,6 +22,8 @@ from tests import gallery
 from tests.operators import helpers
 from tests.operators.large import GRID, PIXELS, Stored, mapped, transport
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def no_room(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:

@@ -57,6 +57,7 @@ def test_steps_of_every_launch_meet_their_twin(device, monkeypatch, make, launch
     helpers.steps_match(IdentityPlus(R, -1.0), np.eye(53) - R.to_dense(), (None, 3, 11))
 
 
+@pytest.mark.slow
 @formats
 @pytest.mark.parametrize("name", gallery.SPARSE)
 def test_default_products_transposes_and_facts(device, monkeypatch, name, make):
@@ -73,6 +74,7 @@ def test_default_products_transposes_and_facts(device, monkeypatch, name, make):
     helpers.norms_match(A, matrix)
 
 
+@pytest.mark.slow
 @formats
 def test_slabs_give_the_same_as_one_buffer(device, small_device, monkeypatch, make):
     monkeypatch.setattr(helpers, "COLUMNS", (None, 3))

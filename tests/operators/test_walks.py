@@ -179,6 +179,7 @@ def same(found: Sums, total: np.ndarray, squared: np.ndarray) -> None:
     np.testing.assert_array_equal(found.squares, squared.reshape(found.squares.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 5])
 @pytest.mark.parametrize("name", SCENES)
 def test_sums_are_those_of_the_twin_to_the_bit(shaped, name, k):
@@ -196,6 +197,7 @@ def test_sums_are_those_of_the_twin_to_the_bit(shaped, name, k):
 
 
 # Few items with a few walks each, or many with many.
+@pytest.mark.slow
 @pytest.mark.parametrize("copies", [1, 9])
 @pytest.mark.parametrize("units", [1, 5, 1 << 18])
 @pytest.mark.parametrize("name", ["positive", "alike"])
@@ -244,6 +246,7 @@ def test_the_twin_of_walks_draws_the_published_blocks(word, block):
     assert reference.philox(counters, word | word << 32)[0].tolist() == list(block)
 
 
+@pytest.mark.slow
 def test_entries_are_drawn_in_proportion(device):
     """Scores of a single step in a basis of pixels count where it went: eq. 25 with signs."""
     R = gallery.signed(19, 19, 3) * np.linspace(0.01, 1, 19)

@@ -81,6 +81,7 @@ def smooth(patches: Patches) -> np.ndarray:
     return np.stack([np.ones_like(x), 1 + np.sin(3 * x + 1) * np.cos(2 * y) + z, z**2], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("walls", "n"),
     [(WALLS, 1), (WALLS, 8), (WALLS[:3], 8), (WALLS[:2], 20)]

@@ -148,6 +148,7 @@ def test_first_bounce_approaches_an_integral_without_bins() -> None:
     assert errors[2] < 0.04
 
 
+@pytest.mark.slow
 def test_a_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
     cube = box(1, sides=3, occluder=Block(corner=(0.3, 0.3, 0.0), size=(0.3, 0.3, 0.4), albedo=0.5))
     gloss = [0.8 if wall.name.startswith("block") else 0.0 for wall in cube.walls]

@@ -99,6 +99,7 @@ def test_the_choice_and_its_reason(device, case):
     assert max(residual(S, x, b) for x in (first.x, s.x)) <= max(rtol, 1e-6) * (1 + 1e-3)
 
 
+@pytest.mark.slow
 def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device):
     """The products of a survey count in the solve that made it alone; factors live as long as S."""
     S = system(device, ring(0.5))

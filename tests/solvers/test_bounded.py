@@ -163,6 +163,7 @@ def test_it_finds_the_least_squares(rho, weighted, bright, seed):
     assert np.mean(s.saturated != (outside & (lower < upper)[:, None])) < 0.03
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
@@ -251,6 +252,7 @@ def test_a_column_that_float32_has_lost_is_not_certified(device, seed):
     assert (errors(T, s.x / F[:, None], b) <= s.least + s.gap * np.linalg.norm(b) + 1e-6).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [CSR, Dense, Tiles])
 @pytest.mark.parametrize("k", [1, 3])
 def test_a_step_is_six_launches(shaped: Device, form: Any, k: int) -> None:

@@ -29,6 +29,8 @@ from ltcl.solvers import auto
 from tests.problems import lambertian
 from tests.solvers.helpers import METHODS, READS_ROWS, by_products, failed
 
+pytestmark = pytest.mark.slow
+
 KINDS = {"array": np.asarray, "scipy": scipy.sparse.csr_array, "LinearOperator": aslinearoperator}
 # Rounded to float32 it is another S by far.
 THIRD = np.array([[1.0, 1.0 / 3.0], [3.0, 1.0 + 1e-6]])

@@ -62,6 +62,7 @@ def test_one_transform_at_each_end(device, method, monkeypatch):
     assert residual(truth, s.x, b) <= 1e-3 * (1 + 1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_residuals_are_relative_to_the_whole_of_b(device, method):
     """The last one is that of x in pixels, by float64; both tolerances are those of pixels."""
@@ -104,6 +105,7 @@ def ordered_wavelet(device, grid):
     return SubsetBasis(device, grid, np.arange(n)[::-1], of=Wavelet(device, grid, "haar"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "columns"), [(CSR, ()), (Tiles, (3,))])
 @pytest.mark.parametrize("basis", [Wavelet, ordered_wavelet])
 def test_auto_plans_in_pixels_and_runs_on_coefficients(device, basis, kind, columns, monkeypatch):

@@ -174,6 +174,7 @@ STEPS: dict[str, tuple[float, float, dict[str, Any]]] = {  # launches and waits 
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", STEPS)
 @pytest.mark.parametrize("k", [1, 3, 5])
 def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k):
@@ -219,6 +220,7 @@ SIZES = pytest.mark.parametrize(("rows", "k"), [(1, 1), (53, 5), (257, 3), (40, 
 GROUPS = pytest.mark.parametrize("group", [1, 100])  # sums in trees work for any size
 
 
+@pytest.mark.slow
 @SIZES
 @GROUPS
 def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, rows, k, group):
@@ -289,6 +291,7 @@ def test_inner_products_and_subtraction_meet_their_twins(device, monkeypatch, ro
     np.testing.assert_array_equal(on_device.get()[6], out.get().ravel())  # the next direction
 
 
+@pytest.mark.slow
 @SIZES
 @GROUPS
 def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):

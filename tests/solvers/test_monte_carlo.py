@@ -103,6 +103,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_mean_of_many_runs_is_the_solution_of_every_channel(device, name, variant):
@@ -278,6 +279,7 @@ def test_final_gather_lowers_the_error_as_theory_says(device):
     assert np.mean(factors) < 0.4
 
 
+@pytest.mark.slow
 def test_pixels_cost_and_get_the_same_alone(device):
     S, _ = system(device, "a scene")
     b = gallery.vectors(N, 3)
@@ -410,6 +412,7 @@ def test_the_mean_of_many_hybrid_runs_is_the_iterate_of_jacobi(device, form, M, 
     assert x.std(axis=0).max() > 0.01
 
 
+@pytest.mark.slow
 def test_noise_falls_with_samples_and_with_final_gather():
     b = np.random.default_rng(1).random((N, 3))
     exact = np.linalg.solve(SCENE.S, b)

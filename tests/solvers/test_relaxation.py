@@ -74,6 +74,7 @@ def test_they_converge_where_jacobi_diverges(device, make, rho):
         assert s.products == s.iterations + (1 if method == "southwell" else 2)
 
 
+@pytest.mark.slow
 @FORMS
 def test_what_one_sweep_solves(device, form):
     """Rows that need none below them, one block, and blocks that do not see each other."""

@@ -275,6 +275,7 @@ def damage_all_files(path: Path) -> None:
     BlockStore.open(path).verify()
 
 
+@pytest.mark.slow
 def test_any_damage_to_any_file_is_noticed(store: BlockStore) -> None:
     damage_all_files(store.path)
 
@@ -306,6 +307,7 @@ def test_hostile_layouts(store: BlockStore, name: str, value: Any, text: str) ->
     refused(store.path, text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("store", ["growing"], indirect=True)
 def test_a_huge_shape_is_only_a_list_of_missing_blocks(store: BlockStore) -> None:
     huge = (1 << 31) - 1

@@ -193,6 +193,7 @@ def test_one_is_not_the_other_and_each_has_its_grid(saved: Path, inverse: ltcl.I
     assert columns.systems[0] is columns.matrices[0].A
 
 
+@pytest.mark.slow
 def test_the_same_inverse_comes_back(saved: Path, inverse: ltcl.Inverse) -> None:
     again = ltcl.load_inverse(saved / "inverse.npz")
     for attribute in ("grid", "channels", "errors", "confidence"):

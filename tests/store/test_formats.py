@@ -464,6 +464,7 @@ def test_the_smallest_transports_come_back(
     same(loaded, record)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dense", "sparse", "compressed"])
 def test_a_flipped_bit_in_the_directory_of_an_archive_loses_nothing(
     tmp_path: Path, kind: str, device: Device

@@ -29,6 +29,8 @@ from ltcl.store import BlockStore, StoreRecord, formats
 
 from . import stores
 
+pytestmark = pytest.mark.slow
+
 random = np.random.default_rng()
 MOMENTS = int(os.environ.get("LTCL_KILLS", "8"))
 ENDS = {"SIGKILL": (stores.kill, -signal.SIGKILL), "Ctrl-C": (stores.interrupt, 2)}
@@ -191,6 +193,7 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(store.block(0, 1).matrix.toarray(), 2 * before.toarray())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("can_exchange", [True, False])
 def test_readers_see_one_store_while_writers_replace_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_exchange: bool

@@ -39,6 +39,7 @@ def off_diagonal(T: ltcl.Transport) -> np.ndarray:
     return T.to_numpy() * (1.0 - np.eye(T.shape[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "diffuse", "glossy"), CASES)
 @pytest.mark.parametrize("scene", SCENES)
 def test_entries_pictures_and_bounces_come_nearer_to_the_truth(
@@ -97,6 +98,7 @@ def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(
     assert left < min(most, share * share_left(errors, T, ltcl.denoise(other)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_reciprocity_is_restored_where_the_scene_has_it_and_left_out_where_not(scene: str) -> None:
     exact = truth(scene, 8)
@@ -136,6 +138,7 @@ def test_few_photons_an_entry_do_not_move_light_between_reciprocal_pairs(seed: i
     assert share_left(errors, T, ltcl.denoise(T)) < 0.75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_noise_of_the_result_is_that_of_its_pictures(scene: str) -> None:
     """The error of a white picture is within a factor 2 of what the noise says."""
@@ -157,6 +160,7 @@ def test_without_noise_nothing_changes() -> None:
     assert np.allclose(D.to_numpy(), exact.to_numpy(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_a_transport_carries_stays() -> None:
     exact = truth("corner", 6)
     entries = [measure(exact, noise_of(exact, 1e-3), seed).to_numpy() for seed in range(3)]
@@ -184,6 +188,7 @@ def test_what_a_transport_carries_stays() -> None:
     assert shares[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_a_rectangular_transport() -> None:
     exact = truth("box", 8).to_numpy()[:96]
     noisy = exact + np.random.default_rng(0).normal(0.0, 1e-2, exact.shape)
@@ -193,6 +198,7 @@ def test_a_rectangular_transport() -> None:
     assert np.linalg.norm(D.to_numpy() - exact) < 0.6 * np.linalg.norm(noisy - exact)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_denoised_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     T = measure(truth("corner", 6), noise_of(truth("corner", 6), 1e-3), 0)
     blocks: Any = [[T.to_numpy()] * 3] * 3
@@ -221,6 +227,7 @@ def texture(T: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return T * random.uniform(0.3, 0.9, len(T))[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [dead_entries, small_shadows, texture])
 @pytest.mark.parametrize("level", [1e-4, 1e-3])
 @pytest.mark.parametrize("scene", ["box", "corner", "glossy"])
@@ -316,6 +323,7 @@ def picture_error_ratio(light: np.ndarray, T: ltcl.Transport, D: ltcl.Transport)
     return float(np.sqrt(np.mean(np.square(ratios))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_no_random_scene_gets_worse(seed: int) -> None:
     light, T = random_measurement(seed)
@@ -332,6 +340,7 @@ def test_of_many_random_scenes_none_gets_worse_and_most_get_better() -> None:
     assert np.median(ratios) < 0.55
 
 
+@pytest.mark.slow
 def test_a_texture_that_hides_the_noise_leaves_a_transport_as_it_is(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -352,6 +361,7 @@ def test_unknown_noise_leaves_a_transport_as_it_is(caplog: pytest.LogCaptureFixt
     assert "noise" in caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", [(1, 64), (64, 1), (1, 3), (1, 1), (2, 40)])
 def test_a_grid_of_one_row_is_denoised(grid: tuple[int, int]) -> None:
     pixels = grid[0] * grid[1]

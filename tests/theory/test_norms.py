@@ -35,6 +35,7 @@ SPECTRA = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spectrum", SPECTRA)
 @settings(max_examples=12, deadline=None)
 @given(

@@ -26,6 +26,7 @@ def check(device, T, F, form=np.asarray):
     return diagnostics.check_energy(transport.matrices[0], F, transport.systems[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array, aslinearoperator])
 @pytest.mark.parametrize("rho", [0.2, 0.9, 4.0])
 def test_row_sums_are_those_of_A(device, form, rho):
@@ -144,6 +145,7 @@ def test_negative_light_is_that_of_the_dense_inverse(device):
     assert T.negative_bounces[0] == pytest.approx(expected, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_gloss_takes_more_the_more_there_is(device, caplog):
     shares = []
     projector = (2.0, 1.4, 1.2)

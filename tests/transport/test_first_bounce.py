@@ -102,6 +102,7 @@ def test_the_estimate_is_within_four_standard_errors(device, form, rho, options)
     assert np.sqrt(np.mean(deviations**2)) == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
     scenes = [lambertian(MANY, rho) for rho in (0.3, 0.9, 2.0)]
     matrices = [scene.T for scene in scenes]

@@ -355,6 +355,7 @@ def test_a_bare_operator_cannot_leave_its_device(device):
         pickle.dumps(transport(SCENE.T, device=device).interreflection)
 
 
+@pytest.mark.slow
 def test_a_compressed_transport_and_an_inverse_are_unpickled_without_a_device(device, monkeypatch):
     """Else a pool of processes would wait for ever for a worker that fails to unpickle its work."""
     T = ltcl.compress(ltcl.scenes.dihedral(4).transport(device=device), 0.05)

@@ -117,6 +117,7 @@ def test_frames_and_colours(mixing: Any) -> None:
         assert calibrated(each, 1.3), within(each)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["bounds", "rows", "blocks"])
 def test_patterns_of_least_squares(case: str) -> None:
     """Free pixels of clipped patterns, of twice as many camera pixels, and of coupled colours."""

@@ -322,6 +322,7 @@ def test_numbers_from_elsewhere_count(known):
     assert "7 %" in judged.text
 
 
+@pytest.mark.slow
 def test_reports_end_in_it(capsys, tmp_path):
     """`info` without a device, and `analyze`; their numbers are those of the library."""
     ltcl.save(tmp_path / "T.npz", truth("corner"))

@@ -13,6 +13,8 @@ import ltcl
 from ltcl.cli.main import main
 from ltcl.transport.verdict import Verdict, verdict
 
+pytestmark = pytest.mark.slow
+
 random = np.random.default_rng(11)
 SCENES = {
     "corner": ltcl.scenes.dihedral(12, albedo=0.7),

@@ -26,6 +26,8 @@ import ltcl
 from ltcl.viewer import client, server
 from tests.viewer.page import Page, question
 
+pytestmark = pytest.mark.slow
+
 GROWTH = 64 << 20  # bytes of memory that a suite of hostile requests may cost
 KEY = (
     "Upgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -161,6 +163,7 @@ def test_ways_out_of_the_table_of_files(running):
         assert status(response) in (400, 403), (path, response)
 
 
+@pytest.mark.slow
 def test_wrong_tokens_hosts_and_origins(running):
     token = running.token
     own = running.host

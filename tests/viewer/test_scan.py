@@ -129,6 +129,7 @@ def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
     assert len(warnings) == 3
 
 
+@pytest.mark.slow
 def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
     truth = ltcl.scenes.dihedral(4, albedo=0.6).transport()
     ltcl.save(tmp_path / "T.npz", truth)
@@ -165,6 +166,7 @@ class WatchedScan(Scan):
                 self.answer("column", {"pixel": [0, 0]}, lambda *_: None)
 
 
+@pytest.mark.slow
 def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.scenes.dihedral(4, albedo=0.6).transport())
     acquisition = project(tmp_path, VIRTUAL)
@@ -178,6 +180,7 @@ def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(tmp_path: Path) ->
     assert scan.grids[-1] == (4, 8)
 
 
+@pytest.mark.slow
 def test_batches_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.scenes.dihedral(6, albedo=0.6).transport())
     scan = project(tmp_path, VIRTUAL)

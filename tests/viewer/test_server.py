@@ -267,6 +267,7 @@ def test_projector_windows_show_what_is_relit_and_compensated(colour):
         )
 
 
+@pytest.mark.slow
 def test_a_measured_T_shows_the_codes_of_its_projector(device, tmp_path):
     from ltcl.acquisition import Setup, VirtualRig
 

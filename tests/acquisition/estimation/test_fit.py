@@ -135,6 +135,7 @@ def test_more_pairs_are_added(T, pairs, result):
     assert error_of(T, more.transport, unseen) < error_of(T, result.transport, unseen)
 
 
+@pytest.mark.slow
 def test_a_lamp_that_fades_is_corrected(T, pairs, device, caplog):
     patterns, photographs = pairs
     lamp = np.linspace(1.025, 0.975, FRAMES)
@@ -224,6 +225,7 @@ def test_photographs_of_other_patterns_are_named(pairs, late, words):
         ltcl.fit(patterns, np.roll(photographs, late, axis=0))
 
 
+@pytest.mark.slow
 def test_two_photographs_that_are_swapped_are_named(pairs):
     patterns, photographs = pairs
     swapped = photographs.copy()

@@ -15,6 +15,8 @@ import pytest
 
 from ltcl.acquisition.geometry import Correspondence, decode
 
+pytestmark = pytest.mark.slow
+
 GRID = (768, 1024)
 STEP = 2.0  # the authors' projector pixels in a step of the code
 
@@ -66,6 +68,7 @@ def test_the_board_is_a_plane(points):
     assert np.mean(distance > 1.0) < 0.001
 
 
+@pytest.mark.slow
 def test_the_calibration_of_the_authors_agrees(shared_data, points):
     """Triangulated points project back on their pixels, within its own residual of 0.86."""
     path = shared_data / "graycode-real" / "calibration_result.xml"

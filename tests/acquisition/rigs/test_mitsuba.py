@@ -79,6 +79,7 @@ def test_white_is_at_half_of_the_range() -> None:
     np.testing.assert_allclose(curves, on_the_wall(0.1 + 0.9 * from_srgb(codes)), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_one_bounce_is_that_of_quadrature() -> None:
     """White light is on the left wall, x = -z; the right wall shows its first bounce."""
     n = 8

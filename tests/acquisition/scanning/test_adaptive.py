@@ -123,6 +123,7 @@ def rough_scan(grid: tuple[int, int], channels: int) -> adaptive.Core:
     return scan(KnownScene(T, grid), threshold=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", [(1, 7), (5, 7), (8, 8)])
 def test_the_core_as_a_transport(device: Any, grid: tuple[int, int]) -> None:
     n = grid[0] * grid[1]

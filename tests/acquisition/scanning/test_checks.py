@@ -93,6 +93,7 @@ def repeated(order: np.ndarray, start: int, n: int) -> np.ndarray:
     return changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exposures", [(0.5,), (0.5, 2.0, 8.0)], ids=["one exposure", "three"])
 @pytest.mark.parametrize("change", [exchanged, late, missing, repeated])
 @pytest.mark.parametrize(

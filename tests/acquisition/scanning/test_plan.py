@@ -91,6 +91,7 @@ def test_auto_chooses_the_better_picture() -> None:
     assert error["auto"] <= 1.5 * min(error.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "strategy",
     [

@@ -131,6 +131,7 @@ def test_a_pattern_within_reach_is_found_again(device, kind, frames):
         assert isinstance(c.solution, tuple)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mixing", "blocks", "rectangular", "colour", "grey"])
 @pytest.mark.parametrize("weighted", [False, True])
 def test_within_bounds_the_colours_share_what_is_missing(device, kind, weighted):

@@ -259,6 +259,7 @@ def test_no_rounding_leaves_the_bounds(T, bounds, clamp):
     assert low <= pattern.min() < pattern.max() <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [0.0, 1e-3, 0.05])
 def test_the_tolerance_is_what_a_compressed_T_or_an_inverse_allows(device, error):
     S = IdentityPlus(Dense(device, SCENE.R), solution_error=error)

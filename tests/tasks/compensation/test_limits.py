@@ -34,6 +34,7 @@ def error(seen: np.ndarray, target: np.ndarray, weights: np.ndarray | float = 1.
     return float(np.linalg.norm(weights * (seen - target)) / np.linalg.norm(weights * target))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10_000),

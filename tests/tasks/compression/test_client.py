@@ -95,6 +95,7 @@ def test_rows_from_elsewhere_give_the_same_bits(holder, client, matrix, tmp_path
         np.testing.assert_array_equal(C.core.toarray(), serial)
 
 
+@pytest.mark.slow
 def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     options: dict[str, Any] = {"grid": GRID, "basis": "db2", "memory": SMALLEST}
     serial = ltcl.compress(matrix, 0.02, **options)
@@ -141,6 +142,7 @@ def test_a_transport_in_memory(client):
     np.testing.assert_array_equal(C.to_numpy(), serial.to_numpy())
 
 
+@pytest.mark.slow
 def test_what_workers_refuse_is_said_here(client, matrix):
     wrong = matrix.copy()
     wrong[100, 3] = np.nan

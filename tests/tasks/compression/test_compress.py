@@ -343,6 +343,7 @@ def test_what_float32_or_the_host_cannot_do_is_refused_at_once(command, corner):
         command(ltcl.Transport(operator, (8, 8), first_bounce=np.ones(64)))
 
 
+@pytest.mark.slow
 def test_every_stage_is_announced(corner):
     calls = []
     ltcl.invert(corner[0], 0.05, progress=lambda stage, share: calls.append((stage, share)))
@@ -399,6 +400,7 @@ def test_rows_may_be_dropped_where_no_memory_holds_them(basis, monkeypatch):
     assert np.linalg.norm(R - S) <= report.dropped + report.quantisation + 1e-6 * np.linalg.norm(S)
 
 
+@pytest.mark.slow
 def test_bases_are_compared_in_the_middle_of_a_large_picture():
     S = np.eye(512) + smooth((4, 128))
     T = ltcl.Transport(S, (4, 128), first_bounce=np.ones(512))
@@ -408,6 +410,7 @@ def test_bases_are_compared_in_the_middle_of_a_large_picture():
     assert worst_error(S, C.systems[0].to_dense()) <= C.error <= 0.02
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(n=st.integers(1, 60), size=st.sampled_from([0.1, 0.5, 0.9]), seed=st.integers(0, 999))
 def test_the_bound_is_never_below(device, n, size, seed):

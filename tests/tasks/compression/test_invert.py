@@ -54,6 +54,7 @@ def smooth():
     return T, ltcl.invert(T, 1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basis", ["db2", "pixels"])
 @pytest.mark.parametrize("rtol", [0.1, 1e-3])
 @pytest.mark.parametrize("name", SCENES)
@@ -87,6 +88,7 @@ def test_colours_have_their_own(forms):
     assert c.error <= 0.1
 
 
+@pytest.mark.slow
 def test_clamping_is_quick_and_says_what_it_costs(smooth):
     T, inverse = smooth
     desired = random.uniform(0.0, 1.0, T.grid)
@@ -101,6 +103,7 @@ def test_clamping_is_quick_and_says_what_it_costs(smooth):
     np.testing.assert_array_equal(clamped.pattern, inverse.pattern(desired))
 
 
+@pytest.mark.slow
 def test_masked_pixels_stay_dark():
     T = ltcl.Transport(SCENES["rho 0.8"].T * (np.arange(N) != 3), GRID, on_dark="mask")
     inverse = ltcl.invert(T, 1e-2)
@@ -109,6 +112,7 @@ def test_masked_pixels_stay_dark():
     assert ltcl.compensate(T, desired, inverse=inverse, clamp=True).pattern.ravel()[3] == 0.0
 
 
+@pytest.mark.slow
 def test_mixing_of_colours_is_undone():
     T = ltcl.Transport(
         [lambertian(N, 0.4, seed=seed).T for seed in range(3)], GRID, mixing=np.eye(3) + 0.1
@@ -143,6 +147,7 @@ def test_a_transport_of_any_form_is_inverted(form, basis):
     assert inverse.confidence > 0.999
 
 
+@pytest.mark.slow
 def test_another_first_bounce_or_somebodys_operator(device):
     """S of neither has numbers at hand: F / F' stands between, or products are all there are."""
     scene = lambertian(N, 0.8, seed=7)
@@ -154,6 +159,7 @@ def test_another_first_bounce_or_somebodys_operator(device):
             assert error_of(inverse, scene.T / F) <= inverse.error <= 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basis", ["db2", "pixels"])
 @pytest.mark.parametrize("rtol", [9e-7, 1e-6])
 def test_a_tolerance_below_float32_is_refused_with_what_it_does(rtol, basis):
@@ -241,6 +247,7 @@ def test_the_error_of_coefficients_is_a_bound_and_within_the_tolerance(name, und
     assert error_of_coefficients(C, inverse.D) <= inverse.error <= rtol
 
 
+@pytest.mark.slow
 def test_thresholds_leave_few_numbers_of_what_is_smooth(monkeypatch):
     # Orthonormal; smooth pictures have few coefficients.
     W = scipy.linalg.hadamard(512) / np.sqrt(512)
@@ -258,6 +265,7 @@ def test_nothing_to_invert(n):
     assert (inverse.status, inverse.D.nnz, inverse.products) == (Status.CONVERGED, 0, 0)
 
 
+@pytest.mark.slow
 def test_what_takes_too_many_products_is_refused_with_what_there_is(monkeypatch):
     C = rooms(-enclosure(25, 0.998).A, "iteration")
     monkeypatch.setattr(checks, "host_memory", lambda: 0)

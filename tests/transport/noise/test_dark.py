@@ -18,6 +18,8 @@ from ltcl.images import read, write
 from ltcl.transport.noise import Noise
 from tests.cli.conftest import program  # noqa: F401
 
+pytestmark = pytest.mark.slow
+
 random = np.random.default_rng()
 n = 32
 GRID = (n, n)
@@ -61,6 +63,7 @@ def corner() -> Corner:
     return Corner(true, scene, measured, np.sort(pixels))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
 @pytest.mark.parametrize("first_bounce", ["diagonal", "exact", "estimate", "given"])
 def test_they_are_masked_with_one_warning_or_refused(caplog, form, first_bounce) -> None:
@@ -74,6 +77,7 @@ def test_they_are_masked_with_one_warning_or_refused(caplog, form, first_bounce)
         ltcl.Transport(form(case.measured), GRID, F, on_dark="raise")
 
 
+@pytest.mark.slow
 def test_direct_light_is_right() -> None:
     """Against the albedo, of the light of the photograph of the scene as it is."""
     case = corner()

@@ -147,6 +147,7 @@ def test_estimate_of_a_transport_without_noise_is_next_to_nothing(grid: tuple[in
     assert np.max(exact.noise.diagonal(exact.first_bounce)) < 1e-4 * np.median(exact.first_bounce)
 
 
+@pytest.mark.slow
 def test_estimate_refuses_what_shows_no_entries() -> None:
     T = truth("corner", 8)
     operator = scipy.sparse.linalg.aslinearoperator(T.to_numpy())
@@ -155,6 +156,7 @@ def test_estimate_refuses_what_shows_no_entries() -> None:
             closed.noise  # noqa: B018
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photons", [0.0, 300.0])
 @pytest.mark.parametrize("layout", [np.asarray, scipy.sparse.csr_array])
 def test_second_measurement_shows_the_noise(layout: Any, photons: float) -> None:
@@ -193,6 +195,7 @@ def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) 
         ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
 
 
+@pytest.mark.slow
 def test_a_compressed_second_measurement_is_refused() -> None:
     T = truth("corner", 8)
     with pytest.raises(InputError, match=r"noise.*compressed"):
@@ -317,6 +320,7 @@ def test_noise_is_kept_unless_it_is_an_estimate(
     assert estimated.measured_noise is None
 
 
+@pytest.mark.slow
 def test_second_measurement_on_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -331,6 +335,7 @@ def test_second_measurement_on_the_command_line(
     assert "noise is a T of grid (8, 8)" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strategy", "least"),
     [

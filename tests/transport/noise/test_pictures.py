@@ -113,6 +113,7 @@ def test_noise_is_dropped_and_no_more(name: str) -> None:
     assert C.compression.rtol == "noise"
 
 
+@pytest.mark.slow
 def test_both_errors_are_in_files_pickles_and_requests(tmp_path: Any) -> None:
     T, C = compressed("corner", 0.02)
     ltcl.save(tmp_path / "C.npz", C)
