@@ -181,7 +181,7 @@ def measure_memory(client: Client, folder: Path, frames: int, is_smoke: bool) ->
 
     T = Transport(np.eye(64), (8, 8))
     small = Film(T=T, source=film(T, folder / "small", frames), frames=frames)
-    small.compensate(folder / "many", client=client, progress=weigh, resize=True)
+    small.compensate(folder / "many", client=client, progress=weigh, resize="stretch")
     quarter = max(1, len(megabytes) // 4)
     early = np.median(megabytes[:quarter])
     late = np.median(megabytes[-quarter:])

@@ -155,7 +155,7 @@ ltcl.save(folder / "T.npz", better)
 #    ltcl analyze T.npy --grid 12x24
 #    # from one format to another; .npz keeps the grid, and no further command needs it
 #    ltcl convert T.mat T.npz --grid 12x24
-#    ltcl compensate T.npz picture.png --resize --out out
+#    ltcl compensate T.npz picture.png --resize crop --out out
 #    # a photograph of the scene in linear light, or what 'compensate' has made
 #    ltcl separate T.npz out/picture_appearance.exr --out out
 #

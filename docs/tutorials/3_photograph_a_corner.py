@@ -75,7 +75,7 @@ small simulated corner in place of yours, and then makes every mistake, to show 
 #
 # .. code-block:: sh
 #
-#    ltcl compensate scan/transport.zarr picture.png --resize --out shown
+#    ltcl compensate scan/transport.zarr picture.png --resize crop --out shown
 #    ltcl show shown/picture_pattern.png
 #    ltcl separate scan/transport.zarr shown/picture_appearance.exr --out shown
 #

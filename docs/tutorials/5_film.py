@@ -91,9 +91,9 @@ for record in done.records[::4]:
 #
 # .. code-block:: sh
 #
-#    ltcl film T.npz film.mp4 --gain auto --resize --out patterns
+#    ltcl film T.npz film.mp4 --gain auto --resize crop crop --out patterns
 #    # after it was stopped: the same, and --resume
-#    ltcl film T.npz film.mp4 --gain auto --resize --out patterns --resume
+#    ltcl film T.npz film.mp4 --gain auto --resize crop crop --out patterns --resume
 #    # on the projector, 24 a second (extra projector)
 #    ltcl show patterns --every 0.0417
 #    # or compensated while it plays, in a window for the projector (extra view)

@@ -135,7 +135,7 @@ class FilmRun:
         settings = self.head["settings"]
         self.batch_size: int = settings["batch"]
         self.format: str = settings["format"]
-        self.needs_resize: bool = settings["resize"]
+        self.resize: str | None = settings["resize"]
 
     @property
     def count(self) -> int | None:
@@ -249,8 +249,8 @@ class FilmRun:
             return []
         self.read_count += 1
         grid = self.solver.T.camera_grid
-        if picture.shape[:2] != grid:
-            picture = images.resize(picture, grid)
+        if self.resize is not None:
+            picture = images.resize(picture, grid, self.resize)
         return [ReadFrame(frame, digest, picture)]
 
     def _is_done(self, frame: Frame, digest: str, place: str) -> bool:
@@ -267,10 +267,10 @@ class FilmRun:
 
     def _check_size(self, picture: np.ndarray, place: str) -> None:
         h, w = self.solver.T.camera_grid
-        if self.needs_resize or picture.shape[:2] == (h, w):
+        if self.resize is not None or picture.shape[:2] == (h, w):
             return
         size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
-        advice = "give resize=True (--resize) to scale all frames"
+        advice = "give resize='crop', 'letterbox' or 'stretch' (--resize) to scale all frames"
         raise InputError(f"{place} is {size}; {advice}")
 
     def patterns(self) -> Iterator[np.ndarray]:

@@ -30,6 +30,7 @@ from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.files import as_path, locked
 from ltcl.images.encoding import Encoding
 from ltcl.images.frames import Source, check_video, open_frames, write_video
+from ltcl.images.pictures import RESIZES
 from ltcl.tasks.compensation import compensate
 from ltcl.tasks.compensation.inputs import check_gain
 from ltcl.tasks.report import versions
@@ -102,7 +103,7 @@ def compensate_frames(
     video: str | os.PathLike[str] | None = None,
     fps: float | None = None,
     encoding: Encoding = "auto",
-    resize: bool = False,
+    resize: str | None = None,
     gain: float | str = 1.0,
     loss: float | None = None,
     progress: Callable[[str, int, int | None], object] | None = None,
@@ -138,8 +139,8 @@ def compensate_frames(
         rate, or 25.
     encoding : str
         Encoding of the frames, as `ltcl.images.read` takes it.
-    resize : bool
-        Scale frames to the camera's grid.
+    resize : "crop", "letterbox" or "stretch", optional
+        Scale frames to the camera's grid, as `ltcl.images.resize` does; None: they have its size.
     gain : float or "auto"
         The gain of all frames; "auto" finds the largest for a sample of `batch` frames, evenly
         spread. A frame that needs more light is clipped, and its record tells how much.
@@ -194,6 +195,8 @@ def compensate_frames(
     _check_functions(codes=codes, progress=progress)
     if video is not None:
         check_video(video, T.grid)
+    if resize is not None:
+        checks.one_of("resize", resize, RESIZES)
     source_frames = open_frames(source, encoding=encoding)
     folder = as_path(out)
     _check_places(source_frames, out=out, video=video)

@@ -250,9 +250,12 @@ def solve_options(
 
 def picture_options(
     resize: Annotated[
-        bool,
-        picture_option("Scale pictures of another size to the grid.", "--resize"),
-    ] = False,
+        Literal["crop", "letterbox", "stretch"] | None,
+        picture_option(
+            "Scale pictures of another size to the grid. With other proportions, cut off what is "
+            "too much, add black bars, or distort them."
+        ),
+    ] = None,
     encoding: Annotated[
         Literal["auto", "srgb", "linear"],
         picture_option("Encoding of input pictures; auto: integers are sRGB, floats linear."),

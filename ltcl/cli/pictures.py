@@ -58,14 +58,14 @@ def read(
         projector = setup
         encoding = "linear"
     picture = images.read(path, encoding=encoding, upright=upright)
-    if context.options["resize"]:
-        picture = images.resize(picture, grid)
+    how = context.options["resize"]
+    if how is not None:
+        picture = images.resize(picture, grid, how)
     elif picture.shape[:2] != grid:
         size = "{} x {}".format(*picture.shape[:2])
         needed = "{} x {}".format(*grid)
-        raise InputError(
-            f"{path}: has {size} pixels, but {owner} has {needed}; --resize scales the picture"
-        )
+        advice = "--resize crop, letterbox or stretch scales it"
+        raise InputError(f"{path}: has {size} pixels, but {owner} has {needed}; {advice}")
     return picture if projector is None else projector.light(picture)
 
 

@@ -29,8 +29,8 @@ def play(
 ) -> Answer:
     """Play FILM in a projector window of the browser, compensated for TRANSPORT.
 
-    Ctrl-C ends it. Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT,
-    makes it fast.
+    A film of other proportions lies between black bars. Ctrl-C ends it. Frames that would be late
+    are dropped. An --inverse, or a compressed TRANSPORT, makes it fast.
     """
     from ltcl.images.frames import open_frames
     from ltcl.show.player import play as run_film

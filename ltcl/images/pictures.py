@@ -18,6 +18,8 @@ from ltcl.images.decoders import Decoded, decode_file, decoding, turn_upright
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
 from ltcl.images.exr import write_exr
 
+# Ways to bring a picture of other proportions onto a grid.
+RESIZES = ("crop", "letterbox", "stretch")
 # Bits that a format can be written with, by its extension; the default first.
 BITS: dict[str, tuple[int, ...]] = {
     ".png": (8, 16),
@@ -176,7 +178,7 @@ def write(
         temporary.write_bytes(data.tobytes())
 
 
-def resize(image: ArrayLike, grid: tuple[int, int]) -> np.ndarray:
+def resize(image: ArrayLike, grid: tuple[int, int], how: str = "stretch") -> np.ndarray:
     """Resample a linear picture to another grid.
 
     Areas are averaged where the picture shrinks; values are interpolated linearly where it grows.
@@ -187,6 +189,9 @@ def resize(image: ArrayLike, grid: tuple[int, int]) -> np.ndarray:
         (h, w) or (h, w, 3).
     grid : (int, int)
         Height and width of the result.
+    how : "crop", "letterbox" or "stretch"
+        What becomes of a picture of other proportions: its middle fills the grid; all of it lies
+        between black bars; or it is distorted.
 
     Returns
     -------
@@ -196,15 +201,56 @@ def resize(image: ArrayLike, grid: tuple[int, int]) -> np.ndarray:
     Raises
     ------
     InputError
-        The image has another shape, NaN or Inf, or the grid is not two positive integers.
+        The image has another shape, NaN or Inf, the grid is not two positive integers, or there is
+        no such way.
 
     Examples
     --------
     >>> resize(np.array([[0.0, 1.0], [2.0, 3.0]]), (1, 1))
     array([[1.5]], dtype=float32)
+    >>> resize(np.ones((2, 2)), (2, 4), "letterbox")
+    array([[0., 1., 1., 0.],
+           [0., 1., 1., 0.]], dtype=float32)
     """
     picture = as_picture("image", image)
     h, w = checks.grid("grid", grid)
+    checks.one_of("how", how, RESIZES)
+    if how == "crop":
+        return _stretched(_middle(picture, (h, w)), (h, w))
+    if how == "letterbox":
+        return _between_bars(picture, (h, w))
+    return _stretched(picture, (h, w))
+
+
+def _middle(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """The largest part of a picture, around its middle, that has the proportions of a grid."""
+    height, width = picture.shape[:2]
+    h, w = grid
+    scale = min(height / h, width / w)
+    rows = min(max(round(scale * h), 1), height)
+    columns = min(max(round(scale * w), 1), width)
+    top = (height - rows) // 2
+    left = (width - columns) // 2
+    return np.ascontiguousarray(picture[top : top + rows, left : left + columns])
+
+
+def _between_bars(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """A whole picture in the middle of a black grid."""
+    height, width = picture.shape[:2]
+    h, w = grid
+    scale = min(h / height, w / width)
+    rows = min(max(round(scale * height), 1), h)
+    columns = min(max(round(scale * width), 1), w)
+    top = (h - rows) // 2
+    left = (w - columns) // 2
+    result = np.zeros((h, w, *picture.shape[2:]), np.float32)
+    result[top : top + rows, left : left + columns] = _stretched(picture, (rows, columns))
+    return result
+
+
+def _stretched(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """A picture on a grid, whatever its proportions."""
+    h, w = grid
     # One axis at a time: OpenCV averages areas only where no axis grows, and one may grow as the
     # other shrinks.
     for rows, columns in ((h, picture.shape[1]), (h, w)):

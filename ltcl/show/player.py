@@ -130,7 +130,7 @@ class _FrameCompensator:
         grid = self._T.camera_grid
         if light.shape[:2] == grid:
             return light
-        return images.resize(light, grid)
+        return images.resize(light, grid, "letterbox")
 
 
 @dataclass(kw_only=True)

@@ -153,7 +153,7 @@ def test_background_and_weights_serve_all_frames_and_sizes_are_scaled_when_asked
     wide = fill(tmp_path / "in", [np.full((4, 16), 0.2)])
     with pytest.raises(InputError, match=r"frame 1 \(f0\.exr\).* 4 x 16 .* 8 x 8"):
         compensate_frames(T, wide, tmp_path / "wide")
-    done = compensate_frames(T, wide, tmp_path / "wide", resize=True, format="exr")
+    done = compensate_frames(T, wide, tmp_path / "wide", resize="stretch", format="exr")
     np.testing.assert_allclose(seen(patterns(done)[0][None])[0], 0.2, rtol=0.02)
 
 

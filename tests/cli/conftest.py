@@ -148,7 +148,17 @@ def results(
         "separate": [*solving, "--bounces", 2],
         "relight": [],
     }
-    common = ["--on-dark", "mask", "--encoding", "linear", "--grid", "5x10", "--resize", "--json"]
+    common = [
+        "--on-dark",
+        "mask",
+        "--encoding",
+        "linear",
+        "--grid",
+        "5x10",
+        "--resize",
+        "stretch",
+        "--json",
+    ]
     reports = {}
     for command, more in options.items():
         arguments = [transport, picture, large_picture, *common, *more, "--out", out]

@@ -43,7 +43,7 @@ COMPENSATE = [
     ("compensate {transport} {large} --out {out}", ["20 x 30", "5 x 10", "--resize"]),
     ("compensate {inverse} {picture} --out {out}", ["inverse.npz: "]),
     (
-        "compensate {dark} {picture} --resize --on-dark raise --out {out}",
+        "compensate {dark} {picture} --resize stretch --on-dark raise --out {out}",
         ["dark.npz", "2 of 6", "on_dark"],
     ),
     (
@@ -72,7 +72,10 @@ OTHERS = [
     ("film {transport} {picture} --out {out}", ["FILM is ", "sky.exr", "ltcl compensate"]),
     ("film {transport} {film} --workers 2 --out {out}", ["--workers is 2", "--cluster"]),
     ("acquire run {empty}", ["acquisition.toml: ", "ltcl simulate"]),
-    ("compensate {store} {picture} --resize --high 2 --out {out}", ["--high is 2", "0 to 1"]),
+    (
+        "compensate {store} {picture} --resize stretch --high 2 --out {out}",
+        ["--high is 2", "0 to 1"],
+    ),
     ("compensate --transports {nan} {film} --out {out}", ["film.avi: holds frames"]),
     ("compensate --transports {nan} {empty} --out {out}", ["empty: holds frames"]),
     (

@@ -132,7 +132,7 @@ def test_a_command_does_what_the_library_does(
 @pytest.mark.slow
 def test_reports_have_every_option_as_it_was_resolved(results):
     _, reports = results
-    shared = {"on_dark": "mask", "encoding": "linear", "grid": [5, 10], "resize": True}
+    shared = {"on_dark": "mask", "encoding": "linear", "grid": [5, 10], "resize": "stretch"}
     solving = {**shared, "first_bounce": "exact", "rtol": 1e-4, "method": "chebyshev"}
     expected = {
         "compensate": {**solving, "low": 0, "high": 1, "gain": 1},

@@ -193,3 +193,26 @@ def test_shrinking_averages_areas_per_axis_and_growing_interpolates():
     np.testing.assert_array_equal(images.resize(image, (4, 31)), images.resize(columns, (4, 31)))
     with pytest.raises(InputError, match="grid"):
         images.resize(image, (0, 4))
+
+
+def test_other_proportions_are_cut_off_or_lie_between_bars():
+    """A wide picture, bright in the middle, and a tall one, onto a square."""
+    wide = np.zeros((4, 8), np.float32)
+    wide[:, 2:6] = np.arange(4)[:, None] + 1.0
+    middle = wide[:, 2:6]
+    np.testing.assert_array_equal(images.resize(wide, (4, 4), "crop"), middle)
+    np.testing.assert_array_equal(images.resize(wide.T, (4, 4), "crop"), middle.T)
+    colours = np.stack([wide, 2 * wide, 3 * wide], axis=2)
+    np.testing.assert_array_equal(images.resize(colours, (4, 4), "crop")[..., 2], 3 * middle)
+
+    between = images.resize(wide, (8, 8), "letterbox")
+    np.testing.assert_array_equal(between[2:6], wide)
+    assert not between[:2].any()
+    assert not between[6:].any()
+    np.testing.assert_array_equal(images.resize(wide.T, (8, 8), "letterbox"), between.T)
+    for how in ("crop", "letterbox", "stretch"):
+        np.testing.assert_array_equal(images.resize(wide, (4, 8), how), wide)
+        # One row or column, however far the proportions are from those of the grid.
+        assert images.resize(np.ones((1, 50), np.float32), (7, 2), how).shape == (7, 2)
+    with pytest.raises(InputError, match="how is 'fill'"):
+        images.resize(wide, (4, 4), "fill")
