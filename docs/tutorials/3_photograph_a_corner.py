@@ -33,14 +33,18 @@ small simulated corner in place of yours, and then makes every mistake, to show 
 #
 #    [rig]
 #    kind = "folder"
-#    projector_grid = [4, 8]   # height, width
+#    projector_grid = [8, 16]  # height, width
 #    projector = [1080, 1920]  # the pixels of your projector
 #    exposures = [
 #        0.001, 0.002, 0.004, 0.008, 0.0167, 0.0333,
 #        0.0667, 0.125, 0.25, 0.5, 1, 2, 4, 8, 15, 30,
 #    ]
 #
-# ``ltcl acquire plan scan`` says how many photographs that takes, and how long.
+#    [acquire]
+#    strategy = "sketch"       # some tens of patterns, from which T is estimated
+#
+# ``ltcl acquire plan scan`` says how many photographs that takes, and how long: fewer than 80 by a
+# sketch, which :doc:`states its own error <../guide/photographs>`.
 #
 # How it goes
 # -----------
@@ -104,11 +108,11 @@ from ltcl.acquisition import FolderRig, Report, Setup, VirtualRig, camera_map
 from ltcl.errors import LtclError, PhotographMissing
 from ltcl.plots import pictures
 
-corner = ltcl.scenes.dihedral(4, albedo=0.7)
+corner = ltcl.scenes.dihedral(8, albedo=0.7)
 # 4 of its pixels to one.
-place = camera_map(lambda x, y: ((x - 4) / 4, (y - 3) / 4), (22, 38), corner.grid)
+place = camera_map(lambda x, y: ((x - 4) / 4, (y - 3) / 4), (38, 70), corner.grid)
 camera = VirtualRig(
-    corner.transport(), corner.grid, camera_grid=(22, 38), camera_map=place, ambient=0.01
+    corner.transport(), corner.grid, camera_grid=(38, 70), camera_map=place, ambient=0.01
 )
 
 
@@ -126,7 +130,7 @@ def scan(folder, photographer=None):
     while True:
         rig = FolderRig(folder, corner.grid)
         try:
-            return ltcl.acquire(rig, store=folder / "T.zarr", strategy="pixel", frames=4)
+            return ltcl.acquire(rig, store=folder / "T.zarr", strategy="sketch")
         except PhotographMissing as missing:
             if photographer is None:
                 raise
@@ -141,11 +145,11 @@ folder = Path(tempfile.mkdtemp()) / "scan"
 T = scan(folder, photographer)
 
 # %%
-# These are some of the photographs. The small dots of light are single pixels of the projector; the
-# dim light around them has bounced, and is what the scan is about.
+# These are some of the photographs. The dim light where a pattern is black has bounced, and is what
+# the scan is about.
 
 names = sorted((folder / "photographs").iterdir())
-shown = {"white": 1, "stripes, to find places": 20, "one pixel, short": 60, "one pixel, long": 61}
+shown = {"white": 1, "stripes, to find places": 12, "a coarse pattern": 45, "a fine one": 60}
 figure = pictures({name: ltcl.images.read(names[k]) for name, k in shown.items()})
 figure
 
@@ -168,7 +172,7 @@ print(f"pictures by T are wrong by {error:.2%}")
 # measured response.
 
 wanted = np.full(corner.grid, 0.35) * T.first_bounce.mean()
-wanted[1:3] *= 2
+wanted[2:6] *= 2
 result = ltcl.compensate(T, wanted, background=setup.ambient, gain="auto")
 print(f"error {result.error:.2%}")
 
@@ -233,7 +237,7 @@ def auto_exposure(files):
     Image.open(files[70]).save(files[70], exif=exif)
 
 
-LAMP = np.linspace(20, 90, 38)
+LAMP = np.linspace(20, 90, 70)
 MISTAKES = {
     "a photograph is missing": lambda files: files[70].unlink(),
     "two photographs exchanged": exchange,

@@ -15,7 +15,14 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.acquisition.estimation.pairs import Pairs
-from ltcl.acquisition.estimation.regression import ROUNDS, Prior, Rows, learn_prior, solve_rows
+from ltcl.acquisition.estimation.regression import (
+    PRIOR_STEP,
+    ROUNDS,
+    Prior,
+    Rows,
+    learn_prior,
+    solve_rows,
+)
 from ltcl.acquisition.estimation.windows import (
     Windows,
     functions_of_row,
@@ -58,8 +65,6 @@ class Estimator:
         progress: Callable[[str, int, int], object] | None,
         solves: int = 1,
     ) -> None:
-        # Rounds that learn the prior, and as many times as rows are solved at least.
-        self._solves = ROUNDS + solves
         self.grid = grid
         check_memory(grid, channels)
         self.windows = Windows.of(grid)
@@ -72,6 +77,9 @@ class Estimator:
         self.rows: list[Rows] = []
         self._progress = progress
         self._done = 0
+        # Rows that are solved: some in each round that learns the prior, and all.
+        some, _ = self.windows.every(PRIOR_STEP)
+        self._expected = ROUNDS * len(some.nodes) + solves * len(self.windows.nodes)
 
     def learn(self, pairs: Pairs) -> None:
         """Learn the priors, and the mixing of the colours if it is asked for; solve the rows."""
@@ -230,7 +238,7 @@ class Estimator:
         """Tell the progress that some rows were solved."""
         self._done += rows
         if self._progress is not None:
-            expected = self._solves * self.channels * len(self.windows.nodes)
+            expected = self._expected * self.channels
             self._progress("fit", self._done, max(self._done, expected))
 
 

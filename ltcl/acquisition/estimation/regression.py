@@ -27,9 +27,11 @@ import scipy.ndimage
 from ltcl.acquisition.estimation.windows import Windows
 
 # Rounds in which prior and noise are learned.
-ROUNDS = 4
+ROUNDS = 8
 # Pixels over which the prior is averaged: standard deviation of a Gaussian.
 NEIGHBOURHOOD = 2.0
+# Pixels along both sides from one that the prior is learned at to the next.
+PRIOR_STEP = 2
 # Light of a function before anything is learned, as a share of the pixel's light: its own, others.
 OWN_SHARE = 1.0
 FIRST_SHARE = 0.01
@@ -39,7 +41,7 @@ LEAST_NOISE = 1e-5
 # Variance of a picture from which on it is unknown.
 UNKNOWN_NOISE = 1e9
 # Numbers of B at once.
-CHUNK_NUMBERS = 1 << 22
+CHUNK_NUMBERS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -89,14 +91,22 @@ def learn_prior(
 ) -> Prior:
     """The prior under which pictures (N, patterns) are likely; `sums` are those under all hats.
 
+    It varies so slowly that every `PRIOR_STEP`-th pixel along both sides shows it.
     `variance` is that of the pictures by the noise of the camera, if it is known; `progress` is
     called with the number of rows that were solved since its last call.
     """
-    prior = Prior.first(windows, light)
+    some, chosen = windows.every(PRIOR_STEP)
+    prior = Prior.first(some, light[chosen])
+    variance_of_some = None if variance is None else variance[chosen]
     for _ in range(ROUNDS):
-        rows = solve_rows(windows, sums, pictures, prior, progress, variance)
-        prior = _more_likely(windows, rows, prior)
-    return prior
+        rows = solve_rows(some, sums, pictures[chosen], prior, progress, variance_of_some)
+        prior = _more_likely(some, rows, prior)
+    coefficients = [_between(group, some.grid, windows.grid) for group in prior.coefficients.T]
+    return Prior(
+        light=light,
+        coefficients=np.stack(coefficients, axis=1),
+        noise=_between(prior.noise, some.grid, windows.grid),
+    )
 
 
 def solve_rows(
@@ -139,25 +149,38 @@ def _solve(
 
     B is (rows, q, patterns), `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
     """
-    q = B.shape[1]
-    precision_of_pictures = 1.0 / np.sqrt(noise)
-    scaled = B * deviation[:, :, None] * precision_of_pictures[:, None, :]
-    whitened = pictures * precision_of_pictures
-    precision = scaled @ scaled.transpose(0, 2, 1)
-    diagonal = np.arange(q)
-    precision[:, diagonal, diagonal] += 1.0
-    covariance = np.linalg.inv(precision)
-    unscaled = (covariance @ (scaled @ whitened[:, :, None]))[:, :, 0]
-    left = whitened - (unscaled[:, None, :] @ scaled)[:, 0, :]
-    shrunk = covariance[:, diagonal, diagonal]
+    whitening = 1.0 / np.sqrt(noise)
+    # (rows, functions, patterns): what a standard deviation of x changes, in those of the noise.
+    S = B * deviation[:, :, None] * whitening[:, None, :]
+    y = pictures * whitening
+    mean, variance = _posterior(S, y)
+    left = y - (mean[:, None, :] @ S)[:, 0, :]
     # Coefficients that the pictures determine, and not the prior.
-    determined = q - shrunk.sum(axis=1)
+    determined = S.shape[1] - variance.sum(axis=1)
     known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
     freedom = np.maximum(known - determined, 1.0)
-    mean = deviation * unscaled
-    variance = deviation**2 * shrunk
     misfit = (left**2).sum(axis=1) / freedom
-    return mean, variance, misfit
+    return deviation * mean, deviation**2 * variance, misfit
+
+
+def _posterior(S: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variances, (rows, q), of coefficients of unit variance that y shows.
+
+    y = S^T x + noise of unit variance. With few pictures the system of the pictures is the smaller
+    one: (I + S S^T)^-1 = I - S (I + S^T S)^-1 S^T.
+    """
+    _, q, patterns = S.shape
+    transposed = S.transpose(0, 2, 1)
+    if patterns < q:
+        inverse = np.linalg.inv(np.eye(patterns) + transposed @ S)
+        product = S @ inverse
+        mean = (product @ y[:, :, None])[:, :, 0]
+        variance = np.maximum(1.0 - (product * S).sum(axis=2), 0.0)
+    else:
+        covariance = np.linalg.inv(np.eye(q) + S @ transposed)
+        mean = (covariance @ (S @ y[:, :, None]))[:, :, 0]
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return mean, variance
 
 
 def _more_likely(windows: Windows, rows: Rows, prior: Prior) -> Prior:
@@ -182,6 +205,13 @@ def _more_likely(windows: Windows, rows: Rows, prior: Prior) -> Prior:
 
 
 def _nearby(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """Means over pixels nearby, (N,)."""
-    smooth = scipy.ndimage.gaussian_filter(values.reshape(grid), NEIGHBOURHOOD, mode="nearest")
-    return smooth.ravel()
+    """Means over pixels nearby, (N,), of values at every `PRIOR_STEP`-th one."""
+    sigma = NEIGHBOURHOOD / PRIOR_STEP
+    return scipy.ndimage.gaussian_filter(values.reshape(grid), sigma, mode="nearest").ravel()
+
+
+def _between(values: np.ndarray, some: tuple[int, int], grid: tuple[int, int]) -> np.ndarray:
+    """Values at every `PRIOR_STEP`-th pixel, interpolated to all pixels of a grid, (N,)."""
+    places = np.indices(grid) / PRIOR_STEP
+    shown = values.reshape(some)
+    return scipy.ndimage.map_coordinates(shown, places, order=1, mode="nearest").ravel()

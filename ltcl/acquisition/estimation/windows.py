@@ -13,7 +13,7 @@ sum of hat functions (`ltcl.operators.Hats`), of each level only those around th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -107,6 +107,13 @@ class Windows:
     def groups(self) -> int:
         """Number of groups."""
         return len(self.area)
+
+    def every(self, step: int) -> tuple[Windows, np.ndarray]:
+        """The windows of every `step`-th pixel along both sides, and their numbers."""
+        height, width = self.grid
+        numbers = np.arange(height * width).reshape(self.grid)[::step, ::step]
+        chosen = numbers.ravel()
+        return replace(self, grid=numbers.shape, nodes=self.nodes[chosen]), chosen
 
 
 class _Builder:
