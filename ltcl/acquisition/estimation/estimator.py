@@ -32,6 +32,7 @@ from ltcl.acquisition.estimation.windows import (
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.noise import Noise
+from ltcl.transport.noise.fit import noise_step
 
 # Change of an entry of the mixing after which rows are solved once more.
 NOTABLE_MIXING = 0.002
@@ -43,8 +44,6 @@ BASIS = "hats"
 FIRST_BOUNCE_SIGMAS = 5.0
 # Least factor of the variances of entries.
 LEAST_SCALE = 1e-4
-# Rows of T that are looked at together.
-ENTRY_ROWS = 256
 # Bytes of a function of a row while it is learned: mean, variance, node, and what is made of them.
 ROW_BYTES = 40
 # Light of a function that is left out, relative to that of the camera pixel.
@@ -157,16 +156,20 @@ class Estimator:
         return self._transport_arrays() | noise.to_arrays()
 
     def _entries(self, channel: int, scale: float) -> Iterator[tuple[np.ndarray, ...]]:
-        """Rows, columns, light and variances of entries of T, some rows at a time."""
+        """Rows, columns, light and variances of the entries of T that `Noise.fit` looks at."""
         C: Any = self._core(channel)
         V: Any = self._variances(channel) * scale
-        for start in range(0, C.shape[0], ENTRY_ROWS):
-            rows = slice(start, start + ENTRY_ROWS)
-            light = (C[rows] @ self.W).toarray()
-            variance = (V[rows] @ self.W_squared).toarray()
+        pixels = C.shape[0]
+        step = noise_step((pixels, pixels))
+        by_column = self.W.tocsc()
+        squares_by_column = self.W_squared.tocsc()
+        for first in range(step):
+            chosen = np.arange(first, pixels, step)
+            light = (C[chosen] @ by_column[:, chosen]).toarray()
+            variance = (V[chosen] @ squares_by_column[:, chosen]).toarray()
             # A pixel that the camera does not see has none.
             i, j = np.nonzero(variance)
-            yield i + start, j, light[i, j], variance[i, j]
+            yield chosen[i], chosen[j], light[i, j], variance[i, j]
 
     def _transport_arrays(self) -> dict[str, np.ndarray]:
         cores = []

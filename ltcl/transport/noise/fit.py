@@ -78,10 +78,14 @@ class ChannelNoise:
     is_known: bool = True
 
 
+def noise_step(shape: tuple[int, int]) -> int:
+    """Of T (M, N), the entries count whose row and column differ by a multiple of this."""
+    return max(1, min(shape) // SAMPLES_PER_ROW)
+
+
 def fit_channel(shape: tuple[int, int], parts: Samples, is_exact: bool) -> ChannelNoise:
     """The noise of a channel of T (M, N)."""
-    stride = max(1, min(shape) // SAMPLES_PER_ROW)
-    samples = EntrySamples.from_parts(parts, stride)
+    samples = EntrySamples.from_parts(parts, noise_step(shape))
     is_direct = (samples.i == samples.j) & (shape[0] == shape[1])
     direct_samples = samples.select(is_direct)
     if not is_exact:
