@@ -24,8 +24,9 @@ ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 # A table of tests with so many cases is long; the default run takes one case in TABLE_STEP of it.
 LONG_TABLE = 4
 TABLE_STEP = 8
-# "2/4": of long tables, also of slow ones, only the cases 2, 6, 10, ... are run, counted from 0. CI
-# does so, and goes on by one at each commit, so that four landings run all.
+# "2/4": of long tables, also of slow ones, and of all rare tests together, only the cases 2, 6, 10,
+# ... are run, counted from 0. CI does so, and goes on by one at each commit, so that four landings
+# run all.
 TABLE_PART = os.environ.get("LTCL_TABLE_PART", "0/1")
 
 
@@ -38,7 +39,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Count most cases of a long table as slow: without `-m ''` every eighth is run.
+    """Count rare tests, and most cases of long tables, as slow: without `-m ''` every eighth runs.
 
     Whoever chooses tests by ``-k`` or by the name of a case gets all of them.
     """
@@ -49,6 +50,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     tables: dict[str, list[pytest.Item]] = {}
     for item in items:
         function, _, _ = item.nodeid.partition("[")
+        if item.get_closest_marker("rare"):
+            item.add_marker(pytest.mark.slow)
+            function = "rare"
         tables.setdefault(function, []).append(item)
     for cases in tables.values():
         if len(cases) < LONG_TABLE:

@@ -167,7 +167,7 @@ def test_a_broken_command_is_named(modules, scenes, method, lines, reason) -> No
     assert re.search(reason, scores["failed"]), scores
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_broken_command_fails_alone(modules, scenes, tmp_path, monkeypatch, capsys) -> None:
     field = importlib.import_module("field")
     found = tmp_path / "found.json"

@@ -127,7 +127,7 @@ def test_import_of_ltcl_is_light() -> None:
     assert run.stdout.split() == []
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_ways_of_data_stay_short() -> None:
     for name, way in house.ways().items():
         assert way.length <= way.limit, (

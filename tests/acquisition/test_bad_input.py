@@ -221,7 +221,7 @@ class Disk:
         return real(*arguments, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("strategy", ["pixel", "adaptive", "sketch"])
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str) -> None:
     """It is full at random places of all stages; each time there is room again later."""

@@ -47,7 +47,7 @@ def committed(path: Path) -> tuple[bool, bool, int]:
     return False, False, calibration_photographs(path)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(
     "strategy",
     [

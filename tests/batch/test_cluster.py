@@ -106,6 +106,7 @@ def test_an_error_is_raised_at_the_place_of_its_item(client):
         next(results)
 
 
+@pytest.mark.rare
 def test_what_was_killed_is_done_by_others_and_joins_again(client):
     def slow(number: int) -> tuple[int, int]:
         time.sleep(0.05)
@@ -236,6 +237,7 @@ def test_frames_have_the_bytes_of_a_serial_run(client, film, device, tmp_path, s
     assert [count for _, count, _ in calls] == [8, 12, 16, 20, 24, 28, 32, 33]
 
 
+@pytest.mark.rare
 def test_killed_workers_leave_every_frame_once_and_whole(client, film, tmp_path):
     T = ltcl.load(film / "T.npz")
     counts = []
@@ -278,6 +280,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
+@pytest.mark.rare
 def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path):
     words = [
         "film",
@@ -352,6 +355,7 @@ def test_a_lost_scheduler_is_one_line_and_the_next_run_goes_on(film, device, tmp
     assert everything(tmp_path) == everything(film / "serial")
 
 
+@pytest.mark.rare
 def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_path, capsys):
     desired = tmp_path / "desired.png"
     images.write(desired, np.full(GRID, 0.2))
@@ -413,6 +417,7 @@ def test_a_name_of_no_machine_is_refused_at_once(monkeypatch):
         connect("nonsense.invalid:8786").__enter__()
 
 
+@pytest.mark.rare
 def test_local_workers_have_the_compute_units_of_a_serial_run():
     """Else sums are rounded in another order, and codes of large patterns differ."""
     units = ltcl.open_device().compute_units

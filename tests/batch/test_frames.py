@@ -316,7 +316,7 @@ ltcl.batch.compensate_frames(
 """
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_killed_run_goes_on_to_the_same_bytes(T, tmp_path):
     np.save(tmp_path / "T.npy", SCENE.T)
     source = fill(tmp_path / "in", seen(random.uniform(0.2, 0.9, (60, *GRID))))

@@ -50,7 +50,7 @@ def test_every_error_comes_back_from_a_worker(kind):
     assert (type(copy), str(copy), vars(copy)) == (kind, "a file", vars(kind("a file")))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_scene_that_ends_its_workers_is_named_and_the_rest_goes_on(client):
     def end(scene: str) -> str:
         if scene in ("b", "c"):

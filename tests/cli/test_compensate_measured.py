@@ -86,7 +86,7 @@ def test_a_background_replaces_the_measured_one(program, store, waves, tmp_path,
     assert relative_error(read_codes(tmp_path / "waves_pattern.png"), rig) > 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_codes_of_a_pattern_are_relit_as_its_light(program, store, compensated, tmp_path):
     out, _ = compensated
     relit = {}

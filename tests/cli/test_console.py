@@ -196,7 +196,7 @@ def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
         assert json.loads(run.stdout)["exit_code"] == 130
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_ctrl_c_at_any_moment_is_one_line():
     """From the moment at which Python imports ltcl, to the end; after that all is printed."""
     words = [sys.executable, "-m", "ltcl", "devices"]

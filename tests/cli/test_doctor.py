@@ -30,7 +30,7 @@ def failed_checks(program: Program, *arguments: str) -> list[dict[str, Any]]:
     return [check for check in outcome.document["checks"] if not check["passed"]]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_doctor_tries_every_solver_and_product(program, device):
     report = program("doctor", "--json").json
     assert report["passed"] is True
@@ -39,7 +39,7 @@ def test_doctor_tries_every_solver_and_product(program, device):
     assert {"solve, bounded", "product, sparse", "product, dense", "product, wavelet"} <= names
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_trials_launch_every_kernel(shaped: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     # Variants are launched to be timed.
     monkeypatch.delenv("LTCL_TUNE")

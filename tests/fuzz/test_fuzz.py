@@ -18,7 +18,7 @@ TARGETS = ("pictures", "films", "stores")
 SECONDS = float(os.environ.get("LTCL_FUZZ_SECONDS", "6"))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("target", TARGETS)
 def test_changed_files_are_read_or_refused(tmp_path, target):
     arguments = ["--seconds", str(SECONDS / len(TARGETS)), "--folder", str(tmp_path)]

@@ -49,14 +49,14 @@ def run_cases(folder: Path, *names: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_all_cases_in_one_run(tmp_path):
     """Starting takes longer than what they do."""
     run = run_cases(tmp_path, *CASES)
     assert run.stdout.splitlines() == [f"passed {case}" for case in CASES], run.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("case", ENDINGS)
 def test_a_rank_that_ends_alone_ends_the_other(tmp_path, case):
     run = run_cases(tmp_path, case)

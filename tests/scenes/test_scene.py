@@ -276,7 +276,7 @@ def test_a_wrong_grid_is_found(scene, tmp_path, caplog):
     assert [str((h, w)) in message for message in caplog.messages] == [True, True]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_to_numpy_is_T(tmp_path):
     scene = scenes.dihedral(4).transport()
     T = scene.to_numpy()

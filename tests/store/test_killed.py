@@ -83,7 +83,7 @@ def check_committed(path: Path, reported: set[tuple[int, int]]) -> None:
         np.testing.assert_array_equal(store.block(channel, block).matrix.toarray(), columns)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("end", ENDS)
 def test_an_acquisition_that_ends_at_any_line(
     tmp_path: Path, finished: dict[str, str], end: str

@@ -118,7 +118,7 @@ def write_samples(folder: Path, device: Device) -> None:
     ltcl.save_inverse(folder / "inverse.npz", ltcl.invert(T, 1e-2))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_damaged_files_of_every_format(tmp_path: Path, device: Device) -> None:
     write_samples(tmp_path, device)
     command = [sys.executable, "-m", "tests.store.test_mutants", str(tmp_path), str(COUNT)]

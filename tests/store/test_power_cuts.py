@@ -49,7 +49,7 @@ def test_compensate_frames(appearance: bool) -> None:
     assert_safe(survey_of(works.patterns(appearance=appearance)))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
 def test_acquire(strategy: str) -> None:
     assert_safe(survey_of(works.acquisition(strategy)))

@@ -330,7 +330,7 @@ def test_no_random_scene_gets_worse(seed: int) -> None:
     assert picture_error_ratio(light, T, ltcl.denoise(T)) < 1.0001
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_of_many_random_scenes_none_gets_worse_and_most_get_better() -> None:
     ratios = []
     for seed in range(6, 26):

@@ -390,7 +390,7 @@ def film(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_play_and_show_run(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
     for command, *more in (["play", tmp_path / "T.npz", "--no-browser"], ["show", "--browser"]):
@@ -402,7 +402,7 @@ def test_play_and_show_run(tmp_path: Path) -> None:
         assert len(shown) >= 2
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
     project(tmp_path, BY_HAND)
     with running("view", tmp_path, "--no-browser") as (process, url), Page(url) as page:

@@ -34,6 +34,8 @@ from ltcl.store import BlockStore, CompressedRecord
 WALSH = ((0, 0, 1, 1), (0, 1, 1, 0), (0, 1, 0, 1))
 # Probability with which the error of other pictures is below the bound that is stated.
 CONFIDENCE = 0.95
+# Pictures that judge.
+JUDGES = 8
 # Fields of the checkerboard, and lit patches, along the shorter side.
 CHECKERBOARD_FIELDS = 6
 PATCH_SHARE = 8
@@ -49,23 +51,27 @@ def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     >>> len(patterns((4, 4))), len(patterns((64, 64)))
     (13, 53)
     """
-    row, column = np.indices(grid)
-    chosen: list[np.ndarray] = []
-    known: set[bytes] = set()
+    return [np.bitwise_xor.outer(down, across).astype(np.float32) for down, across in _sides(grid)]
+
+
+def _sides(grid: tuple[int, int]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Bits (h,) and (w,) of each pattern, which is their exclusive or; the first of each is 0."""
+    row = np.arange(grid[0])
+    column = np.arange(grid[1])
+    chosen: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     for level in reversed(range((max(grid) - 1).bit_length())):
         down = row >> level
         across = column >> level
-        of_level = [_gray(down), _gray(across)]
+        of_level = [(_gray(down), 0 * column), (0 * row, _gray(across))]
         for w in WALSH:
             for v in WALSH:
-                of_level.append(np.take(w, down % 4) ^ np.take(v, across % 4))
-        for pattern in of_level:
-            # Complements show the same, as white is known.
-            key = (pattern ^ pattern[0, 0]).astype(np.uint8).tobytes()
-            if pattern.any() and not pattern.all() and key not in known:
-                known.add(key)
-                chosen.append(pattern.astype(np.float32))
-    return chosen
+                of_level.append((np.take(w, down % 4), np.take(v, across % 4)))
+        for of_rows, of_columns in of_level:
+            # A complement shows the same, as white is known.
+            bits = of_rows ^ of_rows[0], of_columns ^ of_columns[0]
+            if bits[0].any() or bits[1].any():
+                chosen.setdefault(np.concatenate(bits).astype(np.uint8).tobytes(), bits)
+    return list(chosen.values())
 
 
 def _gray(number: np.ndarray) -> np.ndarray:
@@ -137,7 +143,7 @@ def text(grid: tuple[int, int]) -> np.ndarray:
 
 def count_patterns(grid: tuple[int, int]) -> int:
     """Patterns of a sketch, with those that judge it."""
-    return len(patterns(grid)) + len(judges(grid))
+    return len(_sides(grid)) + JUDGES
 
 
 def most_patterns(grid: tuple[int, int]) -> int:
@@ -184,7 +190,7 @@ def scan(
     for start in range(0, len(shown), BATCH_SIZE):
         pictures += log.take(shown[start : start + BATCH_SIZE])
     pairs = _pairs(grid, shown, pictures)
-    is_judge = np.arange(len(pairs)) >= len(pairs) - len(judges(grid.grid))
+    is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
     mixing = grid.calibration.mixing
     estimator = Estimator(grid.grid, grid.channels, _known_mixing(mixing, grid.channels), progress)
     estimator.learn(pairs.select(~is_judge))

@@ -80,7 +80,7 @@ def test_auto_weighs_the_noise(
     assert chosen == strategy
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_auto_chooses_the_better_picture() -> None:
     """T p of a dihedral, scanned with every strategy: none is far better than that of auto."""
     error = {}

@@ -173,7 +173,7 @@ def test_solves_run_on_coefficients_and_refuse_what_is_not_in_them(corner):
     assert np.linalg.norm(refined - x) <= 1e-4 * np.linalg.norm(x)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("scene", ["dihedral", "colour"])
 def test_a_budget_is_kept_or_refused_with_what_it_takes(scene):
     T = SCENES[scene]()

@@ -103,7 +103,7 @@ def test_gain_is_that_without_these_pixels(picture) -> None:
     assert np.linalg.norm(missing) < 0.015 * np.linalg.norm(c.target)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_command_line_does_the_same_and_shows_them(program, tmp_path: Path) -> None:  # noqa: F811
     case = corner()
     grey = tmp_path / "grey.exr"

@@ -156,7 +156,7 @@ def test_unknown_noise_is_kept_in_files(tmp_path: Path) -> None:
     assert ltcl.load(tmp_path / "T.npz").noise.source == "unknown"
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_errors_of_few_pixels_do_not_seem_to_cancel() -> None:
     """Row sums of a small T may have little detail by chance."""
     exact = truth("box", 6)
