@@ -61,7 +61,7 @@ def scans(
     return paths, np.array(transports)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_scans_deviate_by_their_noise(scans: Any) -> None:
     """More than 90 % of the pixels are within two deviations, and errors are not far smaller."""
     paths, _ = scans
@@ -82,7 +82,7 @@ def test_scans_deviate_by_their_noise(scans: Any) -> None:
     assert ((ratio > 0.4) & (ratio < 1.25)).all(), ratio
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_noise_in_a_report_is_that_of_many_scans(scans: Any) -> None:
     """It is the median spread of first bounces and row sums over scans, relative to their mean."""
     paths, transports = scans
