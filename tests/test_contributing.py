@@ -44,7 +44,7 @@ def test_issue_templates_have_a_name_and_say_what_they_are_for() -> None:
         assert "ltcl doctor" in body or page.stem == "question"
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_rig_of_the_page_scans(device, tmp_path, monkeypatch) -> None:
     """The rig of the page, with a projector and a camera that are one virtual rig."""
     monkeypatch.chdir(tmp_path)

@@ -185,7 +185,7 @@ def test_a_broken_command_fails_alone(modules, scenes, tmp_path, monkeypatch, ca
     assert "NOT TRACED" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(
     ("name", "scene", "most"),
     [

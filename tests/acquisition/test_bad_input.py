@@ -148,7 +148,7 @@ def test_some_black_pixels_are_masked(strategy: str) -> None:
     assert np.std(picture) < 10 ** (-30 / 20) * np.mean(picture)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_hot_pixels_decide_nothing(tmp_path: Path) -> None:
     """They are masked; exposures, response and so T are the same without them."""
     hot = np.isin(np.arange(64).reshape(GRID), [9, 10, 40])

@@ -182,7 +182,7 @@ def test_resampling_in_strips(monkeypatch: pytest.MonkeyPatch, size: tuple[int, 
     np.testing.assert_allclose(strips.coverage, whole.coverage, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_calibration_in_parts_is_read_as_it_was(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -78,7 +78,7 @@ class Steps:
         return [done for step, done, _ in self.steps if step == kind]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_photographs_are_enough_for_the_transport(
     tmp_path: Path, scanned: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,7 +191,7 @@ def test_stores_of_others_are_refused(tmp_path: Path) -> None:
             read(tmp_path / "nowhere.zarr")
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(
     ("by_hand", "response", "bits", "strategy", "largest_error"),
     [

@@ -115,7 +115,7 @@ def test_overhead_counts_for_each_photograph(program, simulated):
     assert more == pytest.approx(10 * slow["photographs"])
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_run_continues_from_each_state_of_the_folder(program, scan, acquired, monkeypatch):
     again = f"'ltcl acquire run {scan}' goes on"
     ends = [
@@ -206,7 +206,7 @@ def photograph(truth: Path, folder: Path, missing: list[int], card: Path | None)
         cv2.imwrite(str(target), picture.astype(np.uint16) * 16)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, tmp_path, simulated):
     """Pattern, exposure and name are on stdout, with an exit code of its own."""
     folder = tmp_path / "my scan"

@@ -113,7 +113,7 @@ def test_a_failed_check_has_a_fix(program, monkeypatch, tmp_path):
     assert "LTCL_CACHE" in cache["fix"]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_an_unknown_device_fails_a_check(program):
     printed = program("doctor", "--device", "nonsense").out
     for word in ("FAILED", "nonsense", "fix: ", "ltcl devices", "1 of "):

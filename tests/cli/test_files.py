@@ -160,7 +160,7 @@ def test_analysis_shows_divergence_and_draws(program, transport, tmp_path):
 COMPRESSION = ["--rtol", "0.05", "--basis", "haar", "--basis", "pixels"]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_compressed_file_is_smaller_and_solves(program, colour_transport, tmp_path):
     out = tmp_path / "C.npz"
     arguments = [*COMPRESSION, "--budget", "1.5GiB", "--out", out, "--json"]
@@ -197,7 +197,7 @@ def test_compression_down_to_the_noise(program, colour_transport, tmp_path):
     assert report["compression"]["rtol"] == "noise"
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_a_transport_with_less_noise(program, tmp_path):
     noisy = tmp_path / "noisy.npz"
     out = tmp_path / "D.zarr"

@@ -27,7 +27,7 @@ def run_command(command: list[str], variables: dict[str, str]) -> tuple[int, str
     return run.returncode, run.stdout, run.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("tools", [[], ["ld"]])
 def test_kernels_are_linked_where_gcc_is_missing(tmp_path, tools):
     """A child that gets no more than PATH links, too."""

@@ -74,6 +74,7 @@ def test_products_transposes_and_facts(tmp_path, device, monkeypatch, make, shap
     helpers.norms_match(A, matrix.astype(np.float64))
 
 
+@pytest.mark.rare
 @pytest.mark.parametrize("make", [mapped_rows, stored_rows])
 def test_rows_that_are_larger_than_a_buffer_are_cut(tmp_path, small_device, make):
     matrix = gallery.signed(53, 53)

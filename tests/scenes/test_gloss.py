@@ -137,7 +137,7 @@ def first_bounce_by_integration(gloss: float, exponent: float) -> float:
     return float((lit * seen).sum() / len(u))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_first_bounce_approaches_an_integral_without_bins() -> None:
     expected = first_bounce_by_integration(0.8, 8)
     errors = []

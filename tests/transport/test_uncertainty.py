@@ -149,7 +149,7 @@ def test_patterns_of_least_squares(case: str) -> None:
     assert calibrated(np.concatenate(ratios)), within(np.concatenate(ratios))
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_compressed_inverted_and_masked_transports_have_the_same_deviations() -> None:
     T = truth("box", 8)
     noise = noise_of(T, 1e-3)

@@ -753,7 +753,7 @@ def test_phone(browser: Browser, viewer: Any) -> None:
         page.get_by_text("row 0, column 0").first.wait_for()
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("width", [1280, 360])
 def test_nothing_serious_stands_in_the_way_of_access(
     browser: Browser, viewer: Any, width: int

@@ -467,7 +467,7 @@ def read_all(connection: ClientConnection) -> None:
         connection.recv(timeout=10)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_one_that_does_not_read_delays_nobody_and_is_closed(monkeypatch, device):
     monkeypatch.setattr(client, "READ_SECONDS", 4.0)
     pixels = 1 << 20  # a picture of 4 MB, more than what lies in sockets

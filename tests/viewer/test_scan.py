@@ -298,7 +298,7 @@ def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) 
     np.testing.assert_allclose(shown[0].astype(int), exact.astype(int), atol=1)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("is_grey", [False, True])
 def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey: bool) -> None:
     T = ltcl.scenes.dihedral(4, albedo=0.6 if is_grey else (0.7, 0.5, 0.3)).transport()

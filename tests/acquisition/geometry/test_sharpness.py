@@ -118,7 +118,7 @@ def test_advice_is_what_can_help(
     assert ("closer" in text, "focus" in text) == (closer, focus)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_it_is_stored_and_reported(tmp_path: Path) -> None:
     """Out of focus: the store has it, and the report says it."""
     path = tmp_path / "T.zarr"

@@ -91,7 +91,7 @@ def test_auto_chooses_the_better_picture() -> None:
     assert error["auto"] <= 1.5 * min(error.values())
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(
     "strategy",
     [
@@ -113,7 +113,7 @@ def test_photographs_by_hand_are_all_counted(strategy: str) -> None:
     assert plan.photographs == pytest.approx(camera.count, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("strategy", ["pixel", "hadamard", "block"])
 def test_photographs_of_an_aligned_camera_in_colour_are_all_counted(strategy: str) -> None:
     grid = (8, 16)

@@ -95,7 +95,7 @@ def test_rows_from_elsewhere_give_the_same_bits(holder, client, matrix, tmp_path
         np.testing.assert_array_equal(C.core.toarray(), serial)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     options: dict[str, Any] = {"grid": GRID, "basis": "db2", "memory": SMALLEST}
     serial = ltcl.compress(matrix, 0.02, **options)
@@ -115,7 +115,7 @@ def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize(
     "limits", [{"threshold": 1e-3, "first": 2e-4}, {"drop": 0.1}, {"drop": 0.1, "most": 900}]
 )

@@ -107,7 +107,7 @@ def test_solutions_are_within_the_bound_and_the_bound_within_the_tolerance(scene
         np.testing.assert_allclose(compressed.R.diagonal(), np.diagonal(S) - 1, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @settings(max_examples=16, deadline=None)
 @given(
     basis=st.sampled_from(["db2", "haar", "db4 rows", "pixels", "sym4"]),
@@ -127,7 +127,7 @@ def test_the_bound_holds_for_random_matrices(basis, h, w, rtol, noise, strength,
     assert worst_error(S, C.systems[0].to_dense()) <= C.error <= rtol
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("tuned", ["0", "1"])
 @pytest.mark.parametrize("basis", [None, "db2 rows"])
 def test_the_same_transport_gives_the_same_bits(basis, tuned, monkeypatch):
@@ -199,7 +199,7 @@ def test_smooth_light_is_written_in_wavelets_and_sharp_light_in_pixels(scene, ba
     assert report.nbytes <= 1.3 * min(trial.nbytes for trial in report.trials if not trial.left)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_masked_pixels_stay_masked_and_mixed_colours_mixed():
     F = np.ones(64)
     F[[3, 40]] = 0.0
@@ -317,7 +317,7 @@ def test_refusals(corner, T, options, kind, words):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("scene", ["sparse", "open box"])
 @pytest.mark.parametrize("basis", ["db2", "pixels"])
 def test_what_float32_does_not_keep_is_refused_with_what_it_does(scene, basis):

@@ -66,7 +66,7 @@ def test_the_error_is_a_bound_and_within_the_tolerance(name, rtol, basis):
     assert np.linalg.norm(A.to_dense() - scene.A, 2) <= A.error
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.parametrize("forms", [(None,) * 3, ("db2", "db2 rows", "haar")])
 def test_colours_have_their_own(forms):
     """Channels that were compressed in several forms are written in one basis."""
@@ -147,7 +147,7 @@ def test_a_transport_of_any_form_is_inverted(form, basis):
     assert inverse.confidence > 0.999
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_another_first_bounce_or_somebodys_operator(device):
     """S of neither has numbers at hand: F / F' stands between, or products are all there are."""
     scene = lambertian(N, 0.8, seed=7)
