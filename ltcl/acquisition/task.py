@@ -48,6 +48,8 @@ logger = logging.getLogger(__name__)
 
 # Strategies whose pictures are kept until T is made of all of them.
 PICTURE_STRATEGIES = ("sketch", "adaptive")
+# Error of a sketch from which on its light is too rough for one.
+NOTABLE_ERROR = 0.02
 # Mean difference of black or white, relative to full scale, of the cells of a digest: lamps and
 # exposures vary less.
 MAX_VIEW_DIFFERENCE = 0.03
@@ -450,8 +452,24 @@ def _run_pictures(
         sketched = sketch.scan(grid, log, progress)
         store.update(patterns=log.done)
         sketch.finish(store, sketched)
+        if sketched.error > NOTABLE_ERROR:
+            _advise_another_scan(grid, sketched.error)
     else:
         core = adaptive.scan(grid, log, settings.threshold, settings.sigmas)
         store.update(patterns=log.done)
         adaptive.finish(store, grid, core, grid.calibration.mixing, settings.sigmas)
     progress("scan", log.done, log.done)
+
+
+def _advise_another_scan(grid: ScanGrid, error: float) -> None:
+    """Say what a scan costs that divides the picture where there is light."""
+    known = grid.calibration
+    candidates = plan.plans(
+        grid.grid, known.exposures, known.noise, plan.measured(known), channels=grid.channels
+    )
+    logger.warning(
+        "pictures T p by this sketch are off by %.1f %%: light changes abruptly in this scene; "
+        "strategy 'adaptive' finds where, with up to %d photographs",
+        100 * error,
+        candidates["adaptive"].photographs,
+    )

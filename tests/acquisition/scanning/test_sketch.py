@@ -123,7 +123,9 @@ def test_a_person_takes_at_most_80_photographs() -> None:
 
 
 @pytest.mark.slow
-def test_where_light_is_not_smooth_the_error_says_so(tmp_path: Path) -> None:
+def test_where_light_is_not_smooth_the_error_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """A mirror sends light of each pixel to the other side of the picture."""
     n = 16
     mirror = np.eye(n * n)[::-1]
@@ -133,6 +135,7 @@ def test_where_light_is_not_smooth_the_error_says_so(tmp_path: Path) -> None:
     T = acquire(rig, geometry="aligned", strategy="sketch", store=path)
     report = Report.of(path)
     assert report.judged_error > 0.05
+    assert "strategy 'adaptive' finds where" in caplog.text
     assert relative_error(dense(T), truth, (n, n)) < 2.0 * report.judged_bound
 
 
