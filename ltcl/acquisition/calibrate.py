@@ -179,12 +179,22 @@ THOROUGH = Effort(
     ramp_pixels=1 << 14,
     codes=tuple((np.arange(16) + 0.3) / 16),
 )
-SPARING = Effort(
+BY_HAND = Effort(
     is_sparing=True,
     exposures=5,
     ramp_pixels=1 << 10,
     codes=(0.07, 0.2, 0.38, 0.68, 0.9),
 )
+
+
+# An automatic rig before a scan of few patterns: its camera may have few pixels.
+SPARING = replace(BY_HAND, exposures=THOROUGH.exposures, ramp_pixels=1 << 12)
+
+
+def _effort(by_hand: bool, sparing: bool) -> Effort:
+    if by_hand:
+        return BY_HAND
+    return SPARING if sparing else THOROUGH
 
 
 def expected_photographs(
@@ -203,7 +213,7 @@ def expected_photographs(
     >>> expected_photographs((8, 16)), expected_photographs((8, 16), by_hand=True)
     (149, 39)
     """
-    effort = SPARING if by_hand or sparing else THOROUGH
+    effort = _effort(by_hand, sparing)
     if sparing:
         frames = min(frames, MAX_SPARING_REPEATS)
     camera_pixels = 1 if aligned else EXPECTED_CAMERA_PIXELS
@@ -243,7 +253,7 @@ def measure(
     >>> bool(abs(calibration.white.value - 0.5).max() < 0.02), calibration.resampling.seen.all()
     (True, np.True_)
     """
-    effort = SPARING if shots.keeps_photographs or sparing else THOROUGH
+    effort = _effort(shots.keeps_photographs, sparing)
     if sparing:
         frames = min(frames, MAX_SPARING_REPEATS)
     expected = expected_photographs(

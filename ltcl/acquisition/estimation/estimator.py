@@ -123,6 +123,14 @@ class Estimator:
         return np.stack(channels, axis=2)
 
     @property
+    def surprise(self) -> np.ndarray:
+        """By how much each picture differs from what all others foretell, (frames,); 1 as expected.
+
+        The mean square over rows and channels, in units of the variance that is expected.
+        """
+        return np.mean([rows.surprise for rows in self.rows], axis=0)
+
+    @property
     def noise(self) -> float:
         """The median of what rows leave of a photograph, relative to the light of the pixel."""
         return float(np.sqrt(np.median([prior.noise for prior in self.priors])))

@@ -40,6 +40,8 @@ FIRST_NOISE = 0.01
 LEAST_NOISE = 1e-5
 # Variance of a picture from which on it is unknown.
 UNKNOWN_NOISE = 1e9
+# Most that a row counts in the surprise of a picture.
+MAX_SURPRISE = 1e4
 # Numbers of B at once.
 CHUNK_NUMBERS = 1 << 20
 
@@ -73,12 +75,15 @@ class Prior:
 class Rows:
     """Coefficients of rows of T and their variances, (N, q), and the residuals of pictures.
 
-    `residual` is the mean square that the rows leave, (N,), by degrees of freedom.
+    `residual` is the mean square that the rows leave, (N,), by degrees of freedom. `surprise` is
+    that of each picture if it were foretold from all others, (patterns,): about 1, in units of the
+    variance that is expected then; the mean over rows.
     """
 
     mean: np.ndarray
     variance: np.ndarray
     residual: np.ndarray
+    surprise: np.ndarray
 
 
 def learn_prior(
@@ -123,6 +128,7 @@ def solve_rows(
     uncertainty = np.zeros((pixels, q))
     residual = np.zeros(pixels)
     patterns = sums.shape[1]
+    surprise = np.zeros(patterns)
     chunk = max(CHUNK_NUMBERS // (q * (patterns + q)), 1)
     for start in range(0, pixels, chunk):
         part = slice(start, start + chunk)
@@ -131,43 +137,50 @@ def solve_rows(
         noise = np.broadcast_to(left, (len(light), patterns))
         if variance is not None:
             noise = noise + variance[part]
-        mean[part], uncertainty[part], misfit = _solve(
+        mean[part], uncertainty[part], misfit, surprise_of_rows = _solve(
             sums[windows.nodes[part]],
             pictures[part],
             np.sqrt(prior.coefficients[part][:, windows.group]) * light,
             noise,
         )
         residual[part] = misfit * left[:, 0]
+        surprise += np.minimum(surprise_of_rows, MAX_SURPRISE).sum(axis=0)
         progress(len(light))
-    return Rows(mean=mean, variance=uncertainty, residual=residual)
+    return Rows(
+        mean=mean, variance=uncertainty, residual=residual, surprise=surprise / max(pixels, 1)
+    )
 
 
 def _solve(
     B: np.ndarray, pictures: np.ndarray, deviation: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Mean and variance of some rows, and the mean square of what they leave, relative to noise.
 
-    B is (rows, q, patterns), `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
+    Last comes the surprise of each of their pictures, (rows, patterns). B is (rows, q, patterns),
+    `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
     """
     whitening = 1.0 / np.sqrt(noise)
     # (rows, functions, patterns): what a standard deviation of x changes, in those of the noise.
     S = B * deviation[:, :, None] * whitening[:, None, :]
     y = pictures * whitening
-    mean, variance = _posterior(S, y)
+    mean, variance, precision = _posterior(S, y)
     left = y - (mean[:, None, :] @ S)[:, 0, :]
     # Coefficients that the pictures determine, and not the prior.
     determined = S.shape[1] - variance.sum(axis=1)
     known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
     freedom = np.maximum(known - determined, 1.0)
     misfit = (left**2).sum(axis=1) / freedom
-    return deviation * mean, deviation**2 * variance, misfit
+    # Of y given all others the residual is left / precision, its variance 1 / precision.
+    surprise = left**2 / np.maximum(precision, np.finfo(float).tiny)
+    return deviation * mean, deviation**2 * variance, misfit, surprise
 
 
-def _posterior(S: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _posterior(S: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean and variances, (rows, q), of coefficients of unit variance that y shows.
 
-    y = S^T x + noise of unit variance. With few pictures the system of the pictures is the smaller
-    one: (I + S S^T)^-1 = I - S (I + S^T S)^-1 S^T.
+    y = S^T x + noise of unit variance. Last comes the precision of each y given all others, (rows,
+    patterns): the diagonal of (I + S^T S)^-1. With few pictures the system of the pictures is the
+    smaller one: (I + S S^T)^-1 = I - S (I + S^T S)^-1 S^T.
     """
     _, q, patterns = S.shape
     transposed = S.transpose(0, 2, 1)
@@ -176,11 +189,13 @@ def _posterior(S: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         product = S @ inverse
         mean = (product @ y[:, :, None])[:, :, 0]
         variance = np.maximum(1.0 - (product * S).sum(axis=2), 0.0)
+        precision = np.diagonal(inverse, axis1=1, axis2=2)
     else:
         covariance = np.linalg.inv(np.eye(q) + S @ transposed)
         mean = (covariance @ (S @ y[:, :, None]))[:, :, 0]
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-    return mean, variance
+        precision = 1.0 - (S * (covariance @ S)).sum(axis=1)
+    return mean, variance, precision
 
 
 def _more_likely(windows: Windows, rows: Rows, prior: Prior) -> Prior:

@@ -25,6 +25,7 @@ import numpy as np
 from ltcl.acquisition import anchor
 from ltcl.acquisition.agreement import ADVICE, Deviation, find_deviation, spread
 from ltcl.acquisition.calibration import Calibration, Setup
+from ltcl.acquisition.estimation.pairs import standardised
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiance import (
     RadiancePicture,
@@ -56,6 +57,12 @@ MAX_RELATIVE_NOISE = 0.25
 # many standard deviations.
 PATTERN_RATIO = 4.0
 PATTERN_SIGMAS = 6.0
+# Pixels that a pattern must light, and leave dark, to be told by its picture; and their share.
+TELLING_PIXELS = 16
+TELLING_SHARE = 0.25
+# Correlation of a picture with its pattern, at least, and by how much that of another is clearer.
+LEAST_RESEMBLANCE = 0.2
+CLEAR_RESEMBLANCE = 0.2
 # Relative systematic error of pictures, and the largest mean z^2 of pictures of the same light.
 PICTURE_ERROR = 0.02
 MAX_SAME_Z2 = 2.5
@@ -290,8 +297,12 @@ class ScanCamera(ScanGrid):
         pictures: Sequence[Picture],
         exposed: Sequence[_ExposedPattern],
     ) -> None:
-        """Raise AcquisitionError if a picture shows the pattern of another one of its batch."""
+        """Raise AcquisitionError if a picture shows another pattern than its own."""
         comparison = _BatchComparison(self.white, patterns, pictures)
+        unlike = comparison.unlike_their_patterns()
+        if len(unlike):
+            names = ", ".join(self._names(exposed[a]) for a in unlike.tolist())
+            raise AcquisitionError(f"{names} shows another pattern than its own; {ADVICE}")
         for a, b in comparison.mixed_up():
             first = self._names(exposed[a])
             second = self._names(exposed[b])
@@ -422,6 +433,28 @@ class _BatchComparison:
         self.variance = variances[:, is_clear] / light**2
         self.known = self.variance < MAX_RELATIVE_NOISE**2
         self.lit = flat_patterns[:, is_clear] > 0
+
+    def unlike_their_patterns(self) -> np.ndarray:
+        """Numbers of pictures that resemble their own pattern hardly, or another one far more.
+
+        By correlation over pixels, with direct light, of pictures relative to white. Only patterns
+        that light many pixels, and leave as many dark, tell.
+        """
+        patterns = self.lit.astype(np.float64)
+        pixels = patterns.shape[1]
+        share = patterns.mean(axis=1) if pixels else np.zeros(len(patterns))
+        tells = np.minimum(share, 1.0 - share) * pixels >= TELLING_PIXELS
+        tells &= np.minimum(share, 1.0 - share) >= TELLING_SHARE
+        tells &= self.known.all(axis=1)
+        numbers = np.flatnonzero(tells)
+        if not len(numbers):
+            return numbers
+        seen = standardised(self.value[numbers].T).T
+        shown = standardised(patterns[numbers].T).T
+        resemblance = seen @ shown.T / pixels
+        own = np.diagonal(resemblance)
+        best = resemblance.max(axis=1)
+        return numbers[(own < LEAST_RESEMBLANCE) | (best > own + CLEAR_RESEMBLANCE)]
 
     def mixed_up(self) -> Iterator[tuple[int, int]]:
         """Pairs a, b of pictures of which a shows the pattern of b.
