@@ -15,7 +15,7 @@ from ltcl.acquisition import Report, VirtualRig, acquire, camera_map
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.plan import choose, plans
-from ltcl.errors import MemoryLimitError
+from ltcl.errors import MemoryLimitError, ScanRefused
 
 from ..stopping import Unplugged
 from .helpers import corner, dense, relative_error
@@ -77,7 +77,8 @@ def test_photographs_are_as_planned_and_few(scanned: Any) -> None:
     plan = plans((16, 32), (0.5, 8.0), aligned=True)["sketch"]
     assert plan.patterns == report.patterns
     assert plan.photographs == pytest.approx(rig.count, abs=3)
-    assert rig.count < 100
+    # A camera of 512 pixels needs four ramps for its curve, where others need one.
+    assert rig.count < 110
 
 
 def test_it_is_compensated_with(scanned: Any) -> None:
@@ -153,3 +154,21 @@ def test_auto_sketches_many_pixels(grid: tuple[int, int], strategy: str) -> None
     chosen, reason = choose(plans(grid, (0.5, 8.0)))
     assert chosen == strategy
     assert strategy == "adaptive" or "more than 2048" in reason
+
+
+def dimmer(image: np.ndarray) -> np.ndarray:
+    """A photograph of a lamp, or an exposure, that is a quarter too weak."""
+    return (0.75 * image).astype(image.dtype)
+
+
+@pytest.mark.slow
+def test_a_picture_that_all_others_contradict_is_refused(tmp_path: Path) -> None:
+    """One exposure alone shows no deviation; all pictures together do."""
+    clean = Unplugged(corner(16), (16, 32))
+    acquire(clean, geometry="aligned", strategy="sketch")
+    # In the second batch of three.
+    wrong = clean.count - 30
+    rig = Unplugged(corner(16), (16, 32))
+    rig.fault = lambda codes, image: dimmer(image) if rig.count == wrong else image
+    with pytest.raises(ScanRefused, match="contradicts those of all others"):
+        acquire(rig, geometry="aligned", strategy="sketch", store=tmp_path / "T.zarr")
