@@ -25,8 +25,8 @@ ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 LONG_TABLE = 4
 TABLE_STEP = 8
 # "2/4": of long tables, also of slow ones, and of all rare tests together, only the cases 2, 6, 10,
-# ... are run, counted from 0. CI does so, and goes on by one at each commit, so that four landings
-# run all.
+# ... are run, counted from 0; of other slow tests every second one. CI does so, and goes on by one
+# at each commit, so that four landings run all.
 TABLE_PART = os.environ.get("LTCL_TABLE_PART", "0/1")
 
 
@@ -62,9 +62,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 case.add_marker(pytest.mark.slow)
             if number % parts != part % parts:
                 left_out.append(case)
+    if parts > 1:
+        left_out += _second_halves(tables, part % 2)
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
+
+
+def _second_halves(tables: dict[str, list[pytest.Item]], half: int) -> list[pytest.Item]:
+    """The cases of every second slow test that is no long table."""
+    slow = []
+    for cases in tables.values():
+        if len(cases) < LONG_TABLE and any(case.get_closest_marker("slow") for case in cases):
+            slow.append(cases)
+    return [case for cases in slow[1 - half :: 2] for case in cases]
 
 
 @pytest.fixture(scope="session", autouse=True)

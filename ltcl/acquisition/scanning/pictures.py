@@ -301,8 +301,9 @@ class ScanCamera(ScanGrid):
         comparison = _BatchComparison(self.white, patterns, pictures)
         unlike = comparison.unlike_their_patterns()
         if len(unlike):
-            names = ", ".join(self._names(exposed[a]) for a in unlike.tolist())
-            raise AcquisitionError(f"{names} shows another pattern than its own; {ADVICE}")
+            names = " and ".join(self._names(exposed[a]) for a in unlike.tolist())
+            problem = "does not show the pattern of its place in the list"
+            raise AcquisitionError(f"{names} {problem}; {ADVICE}")
         for a, b in comparison.mixed_up():
             first = self._names(exposed[a])
             second = self._names(exposed[b])
