@@ -131,7 +131,7 @@ def test_a_proxy_may_keep_the_path(served: Served) -> None:
 def test_without_the_token_nothing_is_told(
     served: Served, caplog: pytest.LogCaptureFixture
 ) -> None:
-    served.token = "x" + served.token[1:]
+    served.token += "x"
     assert served.get("hub.example.org") == (403, "forbidden")
     assert caplog.text == ""
 
