@@ -478,3 +478,10 @@ def _first_change(light: LinearLight) -> int:
         if not light.select(range(k + 1)).agrees():
             return k
     return last
+
+
+def standardised(values: np.ndarray) -> np.ndarray:
+    """Values (frames, pixels) less their mean over frames, in units of its deviation."""
+    centred = values - values.mean(axis=0)
+    deviation = centred.std(axis=0)
+    return centred / np.where(deviation > 0, deviation, 1.0)

@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from ltcl import checks
+from ltcl.acquisition.agreement import standardised
 from ltcl.acquisition.geometry import Resampling
 from ltcl.errors import AcquisitionError, InputError
 
@@ -199,10 +200,3 @@ def _frames(name: str, value: Any) -> np.ndarray:
     checks.finite(name, array)
     light = array.astype(np.float64)
     return light if is_colour else light[..., None]
-
-
-def standardised(values: np.ndarray) -> np.ndarray:
-    """Values (frames, pixels) less their mean over frames, in units of its deviation."""
-    centred = values - values.mean(axis=0)
-    deviation = centred.std(axis=0)
-    return centred / np.where(deviation > 0, deviation, 1.0)

@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.ndimage
 
-from ltcl.acquisition.estimation.pairs import Pairs, standardised
+from ltcl.acquisition.agreement import standardised
+from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.errors import AcquisitionError
 

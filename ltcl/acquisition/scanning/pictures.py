@@ -23,9 +23,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ltcl.acquisition import anchor
-from ltcl.acquisition.agreement import ADVICE, Deviation, find_deviation, spread
+from ltcl.acquisition.agreement import (
+    ADVICE,
+    Deviation,
+    find_deviation,
+    spread,
+    standardised,
+)
 from ltcl.acquisition.calibration import Calibration, Setup
-from ltcl.acquisition.estimation.pairs import standardised
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiance import (
     RadiancePicture,
