@@ -37,7 +37,7 @@ from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 
 # Pixels from which one at a time, or as many patterns, take too long.
 MAX_SINGLE_PIXELS = 2048
-# Pixels from which "auto" makes no sketch, which takes some milliseconds of computing for each.
+# Pixels from which "auto" makes no sketch, which takes a millisecond and 30 kB for each of them.
 MAX_SKETCHED_PIXELS = 1 << 15
 # Indirect share of a camera pixel's light under white, unless it is measured: a white corner.
 INDIRECT_SHARE = 0.25
