@@ -215,37 +215,26 @@ def resize(image: ArrayLike, grid: tuple[int, int], how: str = "stretch") -> np.
     picture = as_picture("image", image)
     h, w = checks.grid("grid", grid)
     checks.one_of("how", how, RESIZES)
+    size = picture.shape[0], picture.shape[1]
     if how == "crop":
-        return _stretched(_middle(picture, (h, w)), (h, w))
+        picture = np.ascontiguousarray(picture[_middle(size, (h, w))])
     if how == "letterbox":
-        return _between_bars(picture, (h, w))
+        between_bars = np.zeros((h, w, *picture.shape[2:]), np.float32)
+        inside = between_bars[_middle((h, w), size)]
+        inside[...] = _stretched(picture, (inside.shape[0], inside.shape[1]))
+        return between_bars
     return _stretched(picture, (h, w))
 
 
-def _middle(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """The largest part of a picture, around its middle, that has the proportions of a grid."""
-    height, width = picture.shape[:2]
-    h, w = grid
-    scale = min(height / h, width / w)
-    rows = min(max(round(scale * h), 1), height)
-    columns = min(max(round(scale * w), 1), width)
-    top = (height - rows) // 2
-    left = (width - columns) // 2
-    return np.ascontiguousarray(picture[top : top + rows, left : left + columns])
-
-
-def _between_bars(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """A whole picture in the middle of a black grid."""
-    height, width = picture.shape[:2]
-    h, w = grid
-    scale = min(h / height, w / width)
-    rows = min(max(round(scale * height), 1), h)
-    columns = min(max(round(scale * width), 1), w)
-    top = (h - rows) // 2
-    left = (w - columns) // 2
-    result = np.zeros((h, w, *picture.shape[2:]), np.float32)
-    result[top : top + rows, left : left + columns] = _stretched(picture, (rows, columns))
-    return result
+def _middle(frame: tuple[int, int], proportions: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the largest part of a frame, in its middle, with other proportions."""
+    h, w = proportions
+    scale = min(frame[0] / h, frame[1] / w)
+    rows = min(max(round(scale * h), 1), frame[0])
+    columns = min(max(round(scale * w), 1), frame[1])
+    top = (frame[0] - rows) // 2
+    left = (frame[1] - columns) // 2
+    return slice(top, top + rows), slice(left, left + columns)
 
 
 def _stretched(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
