@@ -24,10 +24,12 @@ ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 # A table of tests with so many cases is long; the default run takes one case in TABLE_STEP of it.
 LONG_TABLE = 4
 TABLE_STEP = 8
-# "2/4": of long tables, also of slow ones, and of all rare tests together, only the cases 2, 6, 10,
-# ... are run, counted from 0; of other slow tests every second one. CI does so, and goes on by one
-# at each commit, so that four landings run all.
+# "2/8": of long tables, also of slow ones, and of all rare tests together, only the cases 2, 10,
+# 18, ... are run, counted from 0; of other slow tests every fourth one. CI does so, and goes on by
+# one at each commit, so that eight landings run all.
 TABLE_PART = os.environ.get("LTCL_TABLE_PART", "0/1")
+# How many landings it takes to run every slow test that is neither rare nor a long table.
+SLOW_PARTS = 4
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -63,19 +65,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if number % parts != part % parts:
                 left_out.append(case)
     if parts > 1:
-        left_out += _second_halves(tables, part % 2)
+        left_out += _others_turn(tables, part)
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
 
 
-def _second_halves(tables: dict[str, list[pytest.Item]], half: int) -> list[pytest.Item]:
-    """The cases of every second slow test that is no long table."""
+def _others_turn(tables: dict[str, list[pytest.Item]], part: int) -> list[pytest.Item]:
+    """The cases of slow tests, long tables aside, whose turn is not at this `part`."""
     slow = []
     for cases in tables.values():
         if len(cases) < LONG_TABLE and any(case.get_closest_marker("slow") for case in cases):
             slow.append(cases)
-    return [case for cases in slow[1 - half :: 2] for case in cases]
+    waiting: list[pytest.Item] = []
+    for number, cases in enumerate(slow):
+        if number % SLOW_PARTS != part % SLOW_PARTS:
+            waiting += cases
+    return waiting
 
 
 @pytest.fixture(scope="session", autouse=True)
