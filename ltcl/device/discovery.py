@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ltcl.device import driver_errors
+from ltcl.device import driver_errors, pocl_processor
 from ltcl.device import pocl_linker as linker
 from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
@@ -98,6 +98,7 @@ def _platform_devices(platform_number: int, platform: Any) -> Iterator[Descripti
     """Descriptions of the devices of one platform."""
     brand = platform.name.strip()
     for number, handle in enumerate(platform.get_devices()):
+        pocl_processor.provide(brand, handle)
         yield Description(
             index=f"{platform_number}:{number}",
             name=handle.name.strip(),
