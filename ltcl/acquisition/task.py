@@ -23,7 +23,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
-from ltcl.acquisition.estimation.estimator import check_memory
+from ltcl.acquisition.estimation.refinement import check_memory
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
