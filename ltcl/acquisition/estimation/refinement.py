@@ -62,7 +62,7 @@ CHUNK_NODES = 512
 # Pixels between which the noise of entries is looked at, about.
 NOISE_PIXELS = 4096
 # Light of a near function that is left out, relative to that of the camera pixel.
-NEGLIGIBLE_SHARE = 1e-4
+NEGLIGIBLE_SHARE = 5e-4
 # Light under white of pixels that the camera does not see, relative to the brightest.
 UNSEEN_LIGHT = 1e-6
 # Variance relative to the square of white from which on a value is unknown, and that of such.
