@@ -201,20 +201,21 @@ def scan(
     known_mixing = _known_mixing(mixing, grid.channels)
     estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
     estimator.learn(pairs.select(~is_judge))
-    _check_surprise(estimator.surprise)
+    check_surprise(estimator.surprise)
     return _judged(estimator, pairs.select(is_judge))
 
 
-def _check_surprise(surprise: np.ndarray) -> None:
+def check_surprise(surprise: np.ndarray, most: float = MAX_SURPRISE_RATIO) -> None:
     """Refuse a picture that all others contradict, such as one of another lamp or exposure.
 
-    `surprise` is that of the estimator, white first, which no pattern is like.
+    `surprise` is that of each picture, (frames,), white first, which no pattern is like; `most` is
+    the largest one relative to that of the median picture.
     """
     of_patterns = surprise[1:]
     if not len(of_patterns):
         return
     number = int(of_patterns.argmax())
-    if of_patterns[number] > MAX_SURPRISE_RATIO * np.median(of_patterns):
+    if of_patterns[number] > most * np.median(of_patterns):
         raise ScanRefused(
             f"the picture of pattern {number + 1} of {len(of_patterns)} contradicts those of all "
             "others: another exposure, another light, or something moved; the scan must be repeated"
@@ -256,16 +257,19 @@ def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
     energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
     squares = np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy
     error = math.sqrt(squares.mean())
-    degrees = len(squares)
-    bound = error * math.sqrt(degrees / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, degrees))
     scales = estimator.scale_of_variance(pairs.patterns, left)
     return Sketch(
         arrays=estimator.arrays(scales),
         own_variance=estimator.own_variance() * scales[:, None],
         errors=np.sqrt(squares),
         error=error,
-        bound=bound,
+        bound=error_bound(error, len(squares)),
     )
+
+
+def error_bound(error: float, judges: int) -> float:
+    """Bound of the error of other pictures, by the root mean square of that of some judges."""
+    return error * math.sqrt(judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges))
 
 
 def finish(store: BlockStore, sketch: Sketch) -> None:

@@ -15,7 +15,7 @@ GRIDS = [(1, 1), (1, 7), (5, 5), (9, 16), (33, 20)]
 @pytest.mark.parametrize("grid", GRIDS)
 def test_hats_are_those_of_all_levels(grid: tuple[int, int]) -> None:
     hats = HatLevels(grid)
-    W = hat_matrix(grid).toarray()
+    W: np.ndarray = hat_matrix(grid).toarray()
     pixels = np.arange(grid[0] * grid[1])
     assert hats.nodes == len(W)
     np.testing.assert_allclose(hats.at_pixels(pixels).toarray(), W.T, atol=1e-15)
@@ -36,6 +36,6 @@ def test_interpolation_goes_through_levels_between(grid: tuple[int, int]) -> Non
         at_once = hats.between(level, 0, pixels).toarray()
         np.testing.assert_allclose(at_once.sum(axis=1), 1.0)
         for middle in range(level):
-            first = hats.between(level, middle, np.arange(hats.nodes_of(middle)))
-            then = hats.between(middle, 0, pixels)
-            np.testing.assert_allclose((then @ first).toarray(), at_once, atol=1e-15)
+            first = hats.between(level, middle, np.arange(hats.nodes_of(middle))).toarray()
+            then = hats.between(middle, 0, pixels).toarray()
+            np.testing.assert_allclose(then @ first, at_once, atol=1e-15)
