@@ -135,8 +135,9 @@ class Estimator:
     def scale_of_variance(self, patterns: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Factors of the variances of all entries, under which T p errs as it did, (channels,).
 
-        `left` is what T left of photographs, (frames, N, channels). Errors of entries in a row go
-        together, which their variances do not tell.
+        `left` are the squares that T left of photographs of patterns, summed up over them and all
+        pixels, (channels,). Errors of entries in a row go together, which their variances do not
+        tell.
         """
         scales = []
         for channel in range(self.channels):
@@ -145,7 +146,7 @@ class Estimator:
             sums = self.W_squared @ squares.T
             expected = (self.variances(channel) @ sums).sum()
             noise = len(patterns) * (prior.noise * prior.light**2).sum()
-            measured = max((left[:, :, channel] ** 2).sum() - noise, 0.0)
+            measured = max(left[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
 

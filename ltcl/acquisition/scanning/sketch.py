@@ -28,7 +28,8 @@ from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
-from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, ScanGrid
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore, CompressedRecord
 
@@ -192,17 +193,15 @@ def scan(
     """
     shown = [*patterns(grid.grid), *judges(grid.grid)]
     log.announce(shown)
-    pictures: list[Picture] = []
-    for start in range(0, len(shown), BATCH_SIZE):
-        pictures += log.take(shown[start : start + BATCH_SIZE])
-    pairs = _pairs(grid, shown, pictures)
-    is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
+    pairs = _photograph(grid, shown, log)
+    fitted = slice(0, len(pairs) - JUDGES)
+    judging = slice(len(pairs) - JUDGES, None)
     mixing = grid.calibration.mixing
     known_mixing = _known_mixing(mixing, grid.channels)
     estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-    estimator.learn(pairs.select(~is_judge))
+    estimator.learn(pairs.select(fitted))
     check_surprise(estimator.surprise)
-    return _judged(estimator, pairs.select(is_judge))
+    return _judged(estimator, pairs.select(judging))
 
 
 def check_surprise(surprise: np.ndarray, most: float = MAX_SURPRISE_RATIO) -> None:
@@ -228,34 +227,49 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
     return mixing
 
 
-def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> Pairs:
+def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
     """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
-    white = grid.white
-    seen = [white, *pictures]
-    variances = [white.variance]
-    for picture in pictures:
-        variances.append(np.where(picture.known, picture.variance + grid.ambient, UNKNOWN))
-    lit = np.stack([np.ones(grid.grid), *shown]).astype(np.uint8)
-    patterns_of_channels = np.repeat(lit.reshape(len(lit), -1, 1), grid.channels, axis=2)
+    frames = len(shown) + 1
+    shape = (frames, len(grid.seen), grid.channels)
+    photographs = scratch_array(shape, np.float32)
+    variance = scratch_array(shape, np.float32)
+    photographs[0] = grid.white.value.T
+    variance[0] = grid.white.variance.T
+    frame = 1
+    for start in range(0, len(shown), BATCH_SIZE):
+        for picture in log.take(shown[start : start + BATCH_SIZE]):
+            photographs[frame] = picture.value.T
+            noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
+            variance[frame] = noise.T
+            frame += 1
+    lit = np.ones((frames, *grid.grid), np.uint8)
+    for number, pattern in enumerate(shown):
+        lit[number + 1] = pattern
     return Pairs(
         grid=grid.grid,
         camera_grid=grid.grid,
-        patterns=patterns_of_channels,
-        photographs=np.stack([picture.value.T for picture in seen]),
-        variance=np.stack([variance.T for variance in variances]),
+        patterns=np.broadcast_to(lit.reshape(frames, -1, 1), shape),
+        photographs=photographs,
+        variance=variance,
     )
 
 
 def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
-    variance: Any = pairs.variance
-    is_known = variance < KNOWN_VARIANCE
-    explained = estimator.explain(pairs.patterns)
-    left = np.where(is_known, pairs.photographs - explained, 0.0)
-    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
-    light = np.where(is_known, pairs.photographs, 0.0)
-    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
-    squares = np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy
+    squares = np.zeros(len(pairs))
+    left = np.zeros(estimator.channels)
+    for number in range(len(pairs)):
+        judge = pairs.select(slice(number, number + 1))
+        variance: Any = judge.variance
+        is_known = variance < KNOWN_VARIANCE
+        explained = estimator.explain(judge.patterns)
+        unexplained = np.where(is_known, judge.photographs - explained, 0.0)
+        of_channels = (unexplained**2).sum(axis=(0, 1))
+        noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
+        light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
+        energy = max((light**2).sum(), np.finfo(float).tiny)
+        squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        left += of_channels
     error = math.sqrt(squares.mean())
     scales = estimator.scale_of_variance(pairs.patterns, left)
     return Sketch(
