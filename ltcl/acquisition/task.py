@@ -73,6 +73,8 @@ def acquire(
     order: int = ScanSettings.order,
     threshold: float = ScanSettings.threshold,
     sigmas: float = ScanSettings.sigmas,
+    rtol: float | None = ScanSettings.rtol,
+    photographs: int | None = ScanSettings.photographs,
     device: Any = None,
 ) -> Transport:
     """Measure the transport between a projector and a camera, or go on where that was stopped.
@@ -111,6 +113,12 @@ def acquire(
         Share of a camera pixel's light under white, above which a cell is divided by "adaptive";
         standard deviations above which an entry or a sum of entries is light and not noise, 0 keeps
         all.
+    rtol : float, optional
+        Relative error of T p, for pictures that judge it, down to which a sketch goes on with
+        rounds of 16 more patterns, as long as they help.
+    photographs : int, optional
+        Photographs that a sketch takes at most, those of the set-up included; without `rtol` it
+        takes them all.
     device : Device or str, optional
         As in `Transport`; opened before the first photograph.
 
@@ -161,6 +169,8 @@ def acquire(
         order=order,
         threshold=threshold,
         sigmas=sigmas,
+        rtol=rtol,
+        photographs=photographs,
     ).for_rig(shots)
     if device is not None:
         device = open_device(device)
