@@ -18,8 +18,10 @@ from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import (
     PRIOR_STEP,
     ROUNDS,
+    Foretold,
     Prior,
     Rows,
+    foretell,
     learn_prior,
     solve_rows,
 )
@@ -122,13 +124,24 @@ class Estimator:
             channels.append((self._core(channel) @ sums[:-1]).T)
         return np.stack(channels, axis=2)
 
-    @property
-    def surprise(self) -> np.ndarray:
-        """By how much each picture differs from what all others foretell, (frames,); 1 as expected.
+    def foretell(self, pairs: Pairs, channel: int, step: int) -> tuple[np.ndarray, Foretold]:
+        """Compare each photograph with all others, by the priors that were learned.
 
-        The mean square over rows and channels, in units of the variance that is expected.
+        At every `step`-th pixel along both sides, whose numbers come first.
         """
-        return np.mean([rows.surprise for rows in self.rows], axis=0)
+        some, chosen = self.windows.every(step)
+        variance = _of_channel(pairs.variance, channel)
+        if variance is not None:
+            variance = variance[chosen]
+        foretold = foretell(
+            some,
+            self._sums(pairs.patterns, channel),
+            pairs.photographs[:, chosen, channel].T,
+            self.priors[channel].select(chosen),
+            self._count,
+            variance,
+        )
+        return chosen, foretold
 
     @property
     def noise(self) -> float:

@@ -7,7 +7,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import scipy.sparse
@@ -51,6 +51,8 @@ class Report:
     judged_error, judged_bound : float
         Relative error of T p for the pictures that judge a sketch, to which it was not fitted; and
         what that of others is below, with a probability of 95 %. NaN of another scan.
+    left_out : list of int
+        Patterns of a sketch, from 1 on, whose pictures contradict all others, and are not used.
 
     Examples
     --------
@@ -83,6 +85,7 @@ class Report:
     sum_deviation: float
     judged_error: float = math.nan
     judged_bound: float = math.nan
+    left_out: list[int] = field(default_factory=list)
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Report:
@@ -129,6 +132,7 @@ class Report:
             sum_deviation=sum_deviation,
             judged_error=judgement.get("error", math.nan),
             judged_bound=judgement.get("bound", math.nan),
+            left_out=judgement.get("left_out", []),
         )
 
     def to_json(self) -> str:
@@ -168,6 +172,8 @@ class Report:
                 f"error of T p {self.judged_error:.2%} for pictures that it was not fitted to; for "
                 f"others at most {self.judged_bound:.2%}, with a probability of 95 %"
             )
+        for number in self.left_out:
+            lines.append(f"the picture of pattern {number} contradicts all others: it is left out")
         if not math.isnan(self.sum_deviation):
             photographs = f"single {self.strategy}s"
             if self.strategy == "hadamard":

@@ -11,12 +11,15 @@ off, so that the curve of the projector does not matter. Of each scale s = 2^l t
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
 that of T.
+
+A picture that all others contradict is left out (`estimation.contradiction`); several are refused.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +27,7 @@ import cv2
 import numpy as np
 import scipy.stats
 
+from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
@@ -37,10 +41,6 @@ WALSH = ((0, 0, 1, 1), (0, 1, 1, 0), (0, 1, 0, 1))
 CONFIDENCE = 0.95
 # Pictures that judge.
 JUDGES = 8
-# Surprise of a picture, relative to that of the median one, from which on it is refused. In clean
-# scans of corners and boxes at random it is 2 to 7, once 14; of a picture that is a tenth too dark
-# 18 to 37.
-MAX_SURPRISE_RATIO = 20.0
 # Fields of the checkerboard, and lit patches, along the shorter side.
 CHECKERBOARD_FIELDS = 6
 PATCH_SHARE = 8
@@ -48,6 +48,10 @@ PATCH_SHARE = 8
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
 SEED = 0
+# Why a picture contradicts all others.
+CAUSES = "another light was on, the exposure was another one, or something moved"
+
+logger = logging.getLogger(__name__)
 
 
 def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
@@ -172,6 +176,8 @@ class Sketch:
         Their root mean square.
     bound : float
         What that of other pictures is below, with a probability of 95 %.
+    left_out : list of int
+        Numbers of patterns, from 1 on, whose pictures contradict all others.
     """
 
     arrays: dict[str, np.ndarray]
@@ -179,6 +185,7 @@ class Sketch:
     errors: np.ndarray
     error: float
     bound: float
+    left_out: list[int]
 
 
 def scan(
@@ -196,27 +203,36 @@ def scan(
         pictures += log.take(shown[start : start + BATCH_SIZE])
     pairs = _pairs(grid, shown, pictures)
     is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
-    mixing = grid.calibration.mixing
-    estimator = Estimator(grid.grid, grid.channels, _known_mixing(mixing, grid.channels), progress)
-    estimator.learn(pairs.select(~is_judge))
-    _check_surprise(estimator.surprise)
-    return _judged(estimator, pairs.select(is_judge))
+    mixing = _known_mixing(grid.calibration.mixing, grid.channels)
+
+    def learn(numbers: np.ndarray) -> Estimator:
+        estimator = Estimator(grid.grid, grid.channels, mixing, progress)
+        estimator.learn(pairs.select(numbers[~is_judge[numbers]]))
+        return estimator
+
+    wrong, estimator = find_wrong_pictures(pairs, learn)
+    _report_wrong([log.names[number - 1] for number in wrong], len(shown))
+    is_good = np.ones(len(pairs), bool)
+    is_good[wrong] = False
+    return _judged(estimator, pairs.select(is_judge & is_good), wrong)
 
 
-def _check_surprise(surprise: np.ndarray) -> None:
-    """Refuse a picture that all others contradict, such as one of another lamp or exposure.
-
-    `surprise` is that of the estimator, white first, which no pattern is like.
-    """
-    of_patterns = surprise[1:]
-    if not len(of_patterns):
+def _report_wrong(names: Sequence[str], patterns: int) -> None:
+    """Warn of a picture that contradicts all others, and is left out; refuse several."""
+    if not names:
         return
-    number = int(of_patterns.argmax())
-    if of_patterns[number] > MAX_SURPRISE_RATIO * np.median(of_patterns):
+    pictures = " and of ".join(names)
+    if len(names) > 1:
         raise ScanRefused(
-            f"the picture of pattern {number + 1} of {len(of_patterns)} contradicts those of all "
-            "others: another exposure, another light, or something moved; the scan must be repeated"
+            f"the pictures of {pictures}, of {patterns} patterns, contradict all others: "
+            f"{CAUSES}; the scan must be repeated"
         )
+    logger.warning(
+        "the picture of %s, of %d patterns, contradicts all others, and is left out: %s",
+        pictures,
+        patterns,
+        CAUSES,
+    )
 
 
 def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
@@ -243,7 +259,7 @@ def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> 
     )
 
 
-def _judged(estimator: Estimator, pairs: Pairs) -> Sketch:
+def _judged(estimator: Estimator, pairs: Pairs, left_out: list[int]) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
     variance: Any = pairs.variance
     is_known = variance < KNOWN_VARIANCE
@@ -263,6 +279,7 @@ def _judged(estimator: Estimator, pairs: Pairs) -> Sketch:
         errors=np.sqrt(squares),
         error=error,
         bound=bound,
+        left_out=left_out,
     )
 
 
@@ -274,6 +291,7 @@ def finish(store: BlockStore, sketch: Sketch) -> None:
             "error": sketch.error,
             "bound": sketch.bound,
             "errors": sketch.errors.tolist(),
+            "left_out": sketch.left_out,
         }
     )
     store.finalize(compressed=CompressedRecord(sketch.arrays))

@@ -127,6 +127,9 @@ class ScanReport(FolderReport):
     judged_bound: Annotated[
         float | None, "That of other pictures is below, with a probability of 95 %; else null."
     ]
+    left_out: Annotated[
+        list[int], "Patterns of a sketch, from 1 on, whose pictures contradict all others."
+    ]
     verdict: VerdictReport
     error: Annotated[list[float] | None, "Relative error of T p by channel; virtual rigs only."] = (
         None
