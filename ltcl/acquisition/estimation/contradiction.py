@@ -3,20 +3,20 @@
 
 All others foretell a picture y_m up to an error e of variance v (`regression.foretell`). A clean
 picture errs where light is not as smooth as the rows of T: some pixels are too bright, some too
-dark. Another light in one picture adds to all of it, and another exposure scales it. So with a picture t of that light,
-white or the one that is foretold,
+dark. Another light in one picture adds to all of it, and another exposure scales it. So with a
+picture t of that light, white or the one that is foretold,
 
     strength   |<t, e>| / (|t| |white|)
     share      <t, e>^2 / (|t|^2 |e|^2), of the error
     surprise   mean of e^2 / v over pixels, relative to the median of all pictures
 
 Where light jumps, many pictures contradict each other in this way. A picture that is wrong stands
-alone: without it the rest agrees.
+alone: without it the rest agrees. Many pixels are compared at the nodes of the coarsest stage
+(`refinement`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,11 +24,12 @@ import numpy as np
 
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
+from ltcl.acquisition.estimation.refinement import RefinedEstimator
 from ltcl.acquisition.estimation.regression import UNKNOWN_NOISE
 
-# Pixels at which pictures are compared, about; and fewest: errors of less have a light's shape by
-# chance.
-MAX_PIXELS = 1 << 12
+AnyEstimator = Estimator | RefinedEstimator
+
+# Fewest pixels at which pictures are compared: errors of less have a light's shape by chance.
 MIN_PIXELS = 64
 # Strength of another light that matters.
 MIN_STRENGTH = 0.01
@@ -62,20 +63,20 @@ class Comparison:
 
 
 def find_wrong_pictures(
-    pairs: Pairs, learn: Callable[[np.ndarray], Estimator]
-) -> tuple[list[int], Estimator]:
+    pairs: Pairs, learn: Callable[[list[int]], AnyEstimator]
+) -> tuple[list[int], AnyEstimator]:
     """Numbers of the pairs, at most `MAX_WRONG`, whose pictures are wrong, the worst first.
 
-    With the estimator of all others, which `learn` makes of the pairs with some numbers. `pairs`
+    With the estimator of all others, which `learn` makes without the pairs of some numbers. `pairs`
     begin with white, which no other picture is like, and which is not judged.
     """
-    numbers = np.arange(len(pairs))
-    of_all = learn(numbers)
+    of_all = learn([])
     estimator = of_all
     wrong: list[int] = []
     least = np.inf
-    while len(numbers) > 1:
-        contradiction = compare_pictures(estimator, pairs.select(numbers)).contradiction()
+    while len(wrong) < len(pairs) - 1:
+        comparison = compare_pictures(*estimator.coarsest(pairs.without(wrong)))
+        contradiction = comparison.contradiction()
         worst = int(contradiction.argmax())
         largest = float(contradiction[worst])
         if wrong and least > MIN_RATIO * largest:
@@ -83,23 +84,21 @@ def find_wrong_pictures(
         if largest <= 1.0 or len(wrong) == MAX_WRONG:
             break
         least = min(least, largest)
-        wrong.append(int(numbers[worst + 1]))
-        numbers = np.delete(numbers, worst + 1)
-        estimator = learn(numbers)
+        numbers = np.setdiff1d(np.arange(1, len(pairs)), wrong)
+        wrong.append(int(numbers[worst]))
+        estimator = learn(wrong)
     return [], of_all
 
 
 def compare_pictures(estimator: Estimator, pairs: Pairs) -> Comparison:
     """Compare pictures, white first, with what all others foretell, by the priors of T."""
-    height, width = pairs.grid
-    step = max(round(math.sqrt(height * width / MAX_PIXELS)), 1)
     sums = _Sums(len(pairs))
     for channel in range(pairs.channels):
-        pixels, foretold = estimator.foretell(pairs, channel, step)
-        seen = pairs.photographs[:, pixels, channel]
+        foretold = estimator.foretell(pairs, channel)
+        seen = pairs.photographs[:, :, channel]
         is_known = np.ones(seen.shape, bool)
         if pairs.variance is not None:
-            is_known = pairs.variance[:, pixels, channel] < UNKNOWN_NOISE
+            is_known = pairs.variance[:, :, channel] < UNKNOWN_NOISE
             is_known = is_known & is_known[0]
         sums.add(seen, foretold.error.T, foretold.variance.T, is_known)
     return sums.comparison()

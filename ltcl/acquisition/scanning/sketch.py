@@ -30,8 +30,10 @@ import scipy.stats
 from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
+from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
-from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, ScanGrid
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore, CompressedRecord
 
@@ -176,7 +178,7 @@ class Sketch:
         Their root mean square.
     bound : float
         What that of other pictures is below, with a probability of 95 %.
-    left_out : list of int
+    wrong_patterns : list of int
         Numbers of patterns, from 1 on, whose pictures contradict all others.
     """
 
@@ -185,7 +187,7 @@ class Sketch:
     errors: np.ndarray
     error: float
     bound: float
-    left_out: list[int]
+    wrong_patterns: list[int]
 
 
 def scan(
@@ -198,23 +200,22 @@ def scan(
     """
     shown = [*patterns(grid.grid), *judges(grid.grid)]
     log.announce(shown)
-    pictures: list[Picture] = []
-    for start in range(0, len(shown), BATCH_SIZE):
-        pictures += log.take(shown[start : start + BATCH_SIZE])
-    pairs = _pairs(grid, shown, pictures)
-    is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
-    mixing = _known_mixing(grid.calibration.mixing, grid.channels)
+    pairs = _photograph(grid, shown, log)
+    first_judge = len(pairs) - JUDGES
+    known_mixing = _known_mixing(grid.calibration.mixing, grid.channels)
 
-    def learn(numbers: np.ndarray) -> Estimator:
-        estimator = Estimator(grid.grid, grid.channels, mixing, progress)
-        estimator.learn(pairs.select(numbers[~is_judge[numbers]]))
+    def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
+        estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
+        # A slice copies no pictures.
+        fitted = pairs.select(slice(0, first_judge))
+        estimator.learn(fitted.without([number for number in wrong if number < first_judge]))
         return estimator
 
     wrong, estimator = find_wrong_pictures(pairs, learn)
     _report_wrong([log.names[number - 1] for number in wrong], len(shown))
-    is_good = np.ones(len(pairs), bool)
-    is_good[wrong] = False
-    return _judged(estimator, pairs.select(is_judge & is_good), wrong)
+    judging = pairs.select(slice(first_judge, None))
+    wrong_judges = [number - first_judge for number in wrong if number >= first_judge]
+    return _judged(estimator, judging.without(wrong_judges), wrong)
 
 
 def _report_wrong(names: Sequence[str], patterns: int) -> None:
@@ -241,46 +242,66 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
     return mixing
 
 
-def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> Pairs:
+def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
     """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
-    white = grid.white
-    seen = [white, *pictures]
-    variances = [white.variance]
-    for picture in pictures:
-        variances.append(np.where(picture.known, picture.variance + grid.ambient, UNKNOWN))
-    lit = np.stack([np.ones(grid.grid, np.float32), *shown])
-    patterns_of_channels = np.repeat(lit.reshape(len(lit), -1, 1), grid.channels, axis=2)
+    frames = len(shown) + 1
+    shape = (frames, len(grid.seen), grid.channels)
+    photographs = scratch_array(shape, np.float32)
+    variance = scratch_array(shape, np.float32)
+    photographs[0] = grid.white.value.T
+    variance[0] = grid.white.variance.T
+    frame = 1
+    for start in range(0, len(shown), BATCH_SIZE):
+        for picture in log.take(shown[start : start + BATCH_SIZE]):
+            photographs[frame] = picture.value.T
+            noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
+            variance[frame] = noise.T
+            frame += 1
+    lit = np.ones((frames, *grid.grid), np.uint8)
+    for number, pattern in enumerate(shown):
+        lit[number + 1] = pattern
     return Pairs(
         grid=grid.grid,
         camera_grid=grid.grid,
-        patterns=patterns_of_channels.astype(np.float64),
-        photographs=np.stack([picture.value.T for picture in seen]).astype(np.float64),
-        variance=np.stack([variance.T for variance in variances]).astype(np.float64),
+        patterns=np.broadcast_to(lit.reshape(frames, -1, 1), shape),
+        photographs=photographs,
+        variance=variance,
     )
 
 
-def _judged(estimator: Estimator, pairs: Pairs, left_out: list[int]) -> Sketch:
+def _judged(
+    estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
+) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
-    variance: Any = pairs.variance
-    is_known = variance < KNOWN_VARIANCE
-    explained = estimator.explain(pairs.patterns)
-    left = np.where(is_known, pairs.photographs - explained, 0.0)
-    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
-    light = np.where(is_known, pairs.photographs, 0.0)
-    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
-    squares = np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy
+    squares = np.zeros(len(pairs))
+    left = np.zeros(estimator.channels)
+    for number in range(len(pairs)):
+        judge = pairs.select(slice(number, number + 1))
+        variance: Any = judge.variance
+        is_known = variance < KNOWN_VARIANCE
+        explained = estimator.explain(judge.patterns)
+        unexplained = np.where(is_known, judge.photographs - explained, 0.0)
+        of_channels = (unexplained**2).sum(axis=(0, 1))
+        noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
+        light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
+        energy = max((light**2).sum(), np.finfo(float).tiny)
+        squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        left += of_channels
     error = math.sqrt(squares.mean())
-    degrees = len(squares)
-    bound = error * math.sqrt(degrees / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, degrees))
     scales = estimator.scale_of_variance(pairs.patterns, left)
     return Sketch(
         arrays=estimator.arrays(scales),
         own_variance=estimator.own_variance() * scales[:, None],
         errors=np.sqrt(squares),
         error=error,
-        bound=bound,
-        left_out=left_out,
+        bound=error_bound(error, len(squares)),
+        wrong_patterns=wrong_patterns,
     )
+
+
+def error_bound(error: float, judges: int) -> float:
+    """Bound of the error of other pictures, by the root mean square of that of some judges."""
+    return error * math.sqrt(judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges))
 
 
 def finish(store: BlockStore, sketch: Sketch) -> None:
@@ -291,7 +312,7 @@ def finish(store: BlockStore, sketch: Sketch) -> None:
             "error": sketch.error,
             "bound": sketch.bound,
             "errors": sketch.errors.tolist(),
-            "left_out": sketch.left_out,
+            "wrong_patterns": sketch.wrong_patterns,
         }
     )
     store.finalize(compressed=CompressedRecord(sketch.arrays))

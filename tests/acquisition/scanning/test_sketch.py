@@ -191,7 +191,7 @@ def test_one_picture_that_all_others_contradict_is_left_out(
 ) -> None:
     """One exposure alone shows no deviation; all pictures together do."""
     T, report = scan_with_fault(tmp_path / "T.zarr", fault, [number])
-    assert report.left_out == [number]
+    assert report.wrong_patterns == [number]
     assert f"pattern {number} (photograph" in caplog.text
     assert f"pattern {number} contradicts" in str(report)
     assert relative_error(T, corner(), SMALL) < min(report.judged_bound, 0.03)
