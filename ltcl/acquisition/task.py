@@ -23,7 +23,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
-from ltcl.acquisition.estimation import estimator
+from ltcl.acquisition.estimation import refinement
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
@@ -333,7 +333,7 @@ def _calibrate(
     if settings.strategy == "direct":
         direct.check_memory(shots.grid, shots.channels)
     elif plan.is_sketched(settings.strategy, shots.grid):
-        estimator.check_memory(shots.grid, shots.channels)
+        refinement.check_memory(shots.grid, shots.channels)
     calibration = calibrate.measure(
         shots,
         sparing=plan.is_sparing(settings.strategy, shots.grid),

@@ -28,6 +28,7 @@ import numpy as np
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.estimation.neighbours import OFFSETS
+from ltcl.acquisition.estimation.refinement import numbers_of_row
 from ltcl.acquisition.estimation.windows import functions_of_row
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiance import valid_values
@@ -38,8 +39,8 @@ from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 
 # Pixels from which one at a time, or as many patterns, take too long.
 MAX_SINGLE_PIXELS = 2048
-# Pixels from which "auto" makes no sketch, which takes a millisecond and 30 kB for each of them.
-MAX_SKETCHED_PIXELS = 1 << 15
+# Pixels from which "auto" makes no sketch, whose pictures are all in memory.
+MAX_SKETCHED_PIXELS = 1 << 18
 # Indirect share of a camera pixel's light under white, unless it is measured: a white corner.
 INDIRECT_SHARE = 0.25
 # Relative error of T p by the calibration: response and white.
@@ -252,7 +253,7 @@ def _sketch_outlook(grid: tuple[int, int], merged: _MergedNoise, light: Light) -
     return _Outlook(
         patterns=patterns,
         batches=-(-patterns // BATCH_SIZE),
-        entries=math.prod(grid) * (patterns + functions),
+        entries=math.prod(grid) * (patterns + numbers_of_row(grid)),
         variance=noise + (SKETCH_ERROR * white) ** 2,
     )
 

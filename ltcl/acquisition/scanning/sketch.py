@@ -26,6 +26,7 @@ import scipy.stats
 
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
+from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
 from ltcl.errors import ScanRefused
@@ -197,7 +198,8 @@ def scan(
     pairs = _pairs(grid, shown, pictures)
     is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
     mixing = grid.calibration.mixing
-    estimator = Estimator(grid.grid, grid.channels, _known_mixing(mixing, grid.channels), progress)
+    known_mixing = _known_mixing(mixing, grid.channels)
+    estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
     estimator.learn(pairs.select(~is_judge))
     check_surprise(estimator.surprise)
     return _judged(estimator, pairs.select(is_judge))
@@ -233,18 +235,18 @@ def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> 
     variances = [white.variance]
     for picture in pictures:
         variances.append(np.where(picture.known, picture.variance + grid.ambient, UNKNOWN))
-    lit = np.stack([np.ones(grid.grid, np.float32), *shown])
+    lit = np.stack([np.ones(grid.grid), *shown]).astype(np.uint8)
     patterns_of_channels = np.repeat(lit.reshape(len(lit), -1, 1), grid.channels, axis=2)
     return Pairs(
         grid=grid.grid,
         camera_grid=grid.grid,
-        patterns=patterns_of_channels.astype(np.float64),
-        photographs=np.stack([picture.value.T for picture in seen]).astype(np.float64),
-        variance=np.stack([variance.T for variance in variances]).astype(np.float64),
+        patterns=patterns_of_channels,
+        photographs=np.stack([picture.value.T for picture in seen]),
+        variance=np.stack([variance.T for variance in variances]),
     )
 
 
-def _judged(estimator: Estimator, pairs: Pairs) -> Sketch:
+def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
     variance: Any = pairs.variance
     is_known = variance < KNOWN_VARIANCE
