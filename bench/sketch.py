@@ -16,7 +16,8 @@ on the pixel grid, and five in perspective, as a projector sees them (`scenes.pe
 
 Of these, at 32 x 32 pixels, a picture like nature is separated into bounces, with T of a sketch and
 with T of a scan one pixel at a time, and compared with the true bounces. The errors with the true T
-are given, too: pixels are no points, and surfaces that the projector does not light bounce light.
+are given, too: pixels are no points, and surfaces that the projector does not light bounce light. A
+scan of direct light alone is compared with that, and the light that it says it left out.
 
 Baselines, on the corner of 64 x 64 pixels: an adaptive scan; pairs of pictures like nature with
 `ltcl.fit`, with linear regression of all of T on them (least squares of least norm, with the best
@@ -63,6 +64,8 @@ SMOKE_SIDE = 8
 # Bounces that are compared, and largest error relative to that with all of T.
 BOUNCES = 3
 MAX_BOUNCE_RATIO = 1.3
+# Largest error of the direct light that a scan of it alone finds, and of the share it leaves out.
+MAX_DIRECT_ERROR = 0.05
 # Noise of the pictures of the baselines, relative to white.
 NOISE = 0.002
 RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
@@ -213,9 +216,10 @@ class BounceErrors:
     true: np.ndarray
 
 
-def compare_bounces(name: str, scene: PerspectiveTransport, options: Options) -> BounceErrors:
+def compare_bounces(
+    name: str, scene: PerspectiveTransport, truth: Transport, options: Options
+) -> BounceErrors:
     """Separate a picture with measured transports, and compare with its true bounces."""
-    truth = transport_of(scene, options)
     pattern = pictures(truth.grid)["nature"][0]
     exact = scene.bounces(pattern, BOUNCES)
     picture = shown(truth, pattern)
@@ -238,6 +242,39 @@ def compare_bounces(name: str, scene: PerspectiveTransport, options: Options) ->
     return BounceErrors(
         name=name, sketched=measured["sketch"], scanned=measured["pixel"], true=errors(truth)
     )
+
+
+def direct_claims(
+    name: str, scene: PerspectiveTransport, truth: Transport, options: Options
+) -> list[Claim]:
+    """Check a scan of direct light alone."""
+    white = np.ones(truth.grid)
+    exact = scene.bounces(white, 0)[0]
+    left_out = float(np.median(1.0 - exact.sum(axis=1) / shown(truth, white).sum(axis=1)))
+    rig = make_rig(truth, "12 bits")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "T.zarr"
+        T = acquire(rig, geometry="aligned", strategy="direct", store=path, device=options.device)
+        report = Report.of(path)
+        own = np.atleast_2d(T.first_bounce).T
+    # The camera's unit of light in each channel.
+    scale = (own * exact).sum(axis=0) / (own**2).sum(axis=0)
+    error = float(np.linalg.norm(own * scale - exact) / np.linalg.norm(exact))
+    size = f"{BOUNCES_SIDE} x {BOUNCES_SIDE}"
+    return [
+        Claim(
+            text=f"{name}, {size}: direct light, {rig.count} photographs",
+            measured=f"{error:.2%}, stated {report.judged_error:.2%}",
+            wanted=f"at most {MAX_DIRECT_ERROR:.0%}",
+            holds=error <= MAX_DIRECT_ERROR,
+        ),
+        Claim(
+            text=f"{name}, {size}: indirect light that a scan of direct light says it left out",
+            measured=f"{report.left_out:.1%}, true {left_out:.1%}",
+            wanted=f"within {MAX_DIRECT_ERROR:.0%}",
+            holds=abs(report.left_out - left_out) <= MAX_DIRECT_ERROR,
+        ),
+    ]
 
 
 def bounce_claims(errors: BounceErrors) -> list[Claim]:
@@ -395,11 +432,14 @@ def main() -> None:
     square = Transport(corner(side), (side, side), device=options.device)
     results = scan_with_cameras(f"corner {side} x {side}", square, options)
     bounces = []
+    direct: list[Claim] = []
     for name in SCENES:
         truth = transport_of(PerspectiveTransport(name, (side, side)), options)
         results += scan_with_cameras(name, truth, options)
         smaller = PerspectiveTransport(name, (bounces_side, bounces_side))
-        bounces.append(compare_bounces(name, smaller, options))
+        truth = transport_of(smaller, options)
+        bounces.append(compare_bounces(name, smaller, truth, options))
+        direct += direct_claims(name, smaller, truth, options)
 
     adaptive = run_scan(f"corner {side} x {side}, adaptive", square, "12 bits", "adaptive", options)
     curves = {
@@ -431,6 +471,7 @@ def main() -> None:
         listed = ", ".join(f"{error:.2%}" for error in errors.true)
         facts[f"{errors.name}: bounces 0 to {BOUNCES} with the true T, off"] = listed
         checked += bounce_claims(errors)
+    checked += direct
     if options.smoke:
         # So few pixels show that it runs, not how few photographs a larger scene takes.
         checked = []
