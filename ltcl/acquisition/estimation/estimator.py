@@ -17,8 +17,10 @@ from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import (
     PRIOR_STEP,
     ROUNDS,
+    Foretold,
     Prior,
     Rows,
+    foretell,
     learn_prior,
     solve_rows,
 )
@@ -119,13 +121,20 @@ class Estimator:
             channels.append((self.coefficients(channel) @ sums[:-1]).T)
         return np.stack(channels, axis=2)
 
-    @property
-    def surprise(self) -> np.ndarray:
-        """By how much each picture differs from what all others foretell, (frames,); 1 as expected.
+    def coarsest(self, pairs: Pairs) -> tuple[Estimator, Pairs]:
+        """Return itself, and the pairs at its pixels, which `RefinedEstimator` averages."""
+        return self, pairs
 
-        The mean square over rows and channels, in units of the variance that is expected.
-        """
-        return np.mean([rows.surprise for rows in self.rows], axis=0)
+    def foretell(self, pairs: Pairs, channel: int) -> Foretold:
+        """Compare each photograph with all others, by the priors that were learned."""
+        return foretell(
+            self.windows,
+            self._sums(pairs.patterns, channel),
+            pairs.photographs[:, :, channel].T,
+            self.priors[channel],
+            self._count,
+            _of_channel(pairs.variance, channel),
+        )
 
     @property
     def noise(self) -> float:
@@ -135,8 +144,9 @@ class Estimator:
     def scale_of_variance(self, patterns: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Factors of the variances of all entries, under which T p errs as it did, (channels,).
 
-        `left` is what T left of photographs, (frames, N, channels). Errors of entries in a row go
-        together, which their variances do not tell.
+        `left` are the squares that T left of photographs of patterns, summed up over them and all
+        pixels, (channels,). Errors of entries in a row go together, which their variances do not
+        tell.
         """
         scales = []
         for channel in range(self.channels):
@@ -145,7 +155,7 @@ class Estimator:
             sums = self.W_squared @ squares.T
             expected = (self.variances(channel) @ sums).sum()
             noise = len(patterns) * (prior.noise * prior.light**2).sum()
-            measured = max((left[:, :, channel] ** 2).sum() - noise, 0.0)
+            measured = max(left[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
 

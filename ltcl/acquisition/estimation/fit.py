@@ -233,7 +233,8 @@ def _fit(
     errors = _norms(left) / np.maximum(_norms(steady.photographs[judges]), np.finfo(float).tiny)
 
     error = float(np.sqrt(np.mean(errors**2)))
-    scales = estimator.scale_of_variance(pairs.patterns[judges], left)
+    squares = (left**2).sum(axis=(0, 1))
+    scales = estimator.scale_of_variance(pairs.patterns[judges], squares)
 
     # 3. The transport, from all pairs.
     estimator.solve(steady)

@@ -47,19 +47,25 @@ class HatLevels:
 
     def sums(self, level: int, picture: np.ndarray, power: int = 1) -> np.ndarray:
         """Sums of a picture (h, w) under the hats of a level, or under a power of them."""
+        if level == 0:
+            return picture
         down, across = self._sides(level)
         if power != 1:
             down = down.power(power)
             across = across.power(power)
         return down @ (across @ picture.T).T
 
-    def sums_from(self, level: int, pictures: np.ndarray, power: int = 1) -> np.ndarray:
+    def sums_from(
+        self, level: int, pictures: np.ndarray, power: int = 1, dtype: Any = np.float64
+    ) -> np.ndarray:
         """Sums of pictures (frames, h, w) under all hats from a level on, (nodes, frames)."""
-        levels = []
+        first = self.first[level]
+        sums = np.empty((self.nodes - first, len(pictures)), dtype)
         for coarser in range(level, len(self.sizes)):
-            of_level = [self.sums(coarser, picture, power).ravel() for picture in pictures]
-            levels.append(np.stack(of_level, axis=1))
-        return np.concatenate(levels)
+            nodes = slice(self.first[coarser] - first, self.first[coarser + 1] - first)
+            for number, picture in enumerate(pictures):
+                sums[nodes, number] = self.sums(coarser, picture, power).ravel()
+        return sums
 
     def area(self, level: int) -> np.ndarray:
         """Pixels under each hat of a level, (rows, columns); fewer at the rim."""

@@ -173,7 +173,10 @@ def _with_zero(hats: HatLevels, level: int, patterns: np.ndarray) -> np.ndarray:
 
     The last is 0: that of number -1.
     """
-    sums = np.zeros((hats.nodes_of(level) + 1, len(patterns)), np.float32)
+    # Pixels of patterns that are on or off fit a byte.
+    is_small = level == 0 and patterns.dtype.itemsize < np.dtype(np.float32).itemsize
+    dtype = patterns.dtype if is_small else np.float32
+    sums = np.zeros((hats.nodes_of(level) + 1, len(patterns)), dtype)
     for number, pattern in enumerate(patterns):
         sums[:-1, number] = hats.sums(level, pattern).ravel()
     return sums

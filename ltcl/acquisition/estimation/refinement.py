@@ -54,8 +54,10 @@ from ltcl.transport.noise.fit import noise_step
 MAX_WHOLE_PIXELS = 1 << 13
 # Bytes of a channel of a pixel while a transport is refined, but for its pictures.
 PIXEL_BYTES = 1000
-# Nodes of the coarsest stage, at most, and levels from one stage to the next.
+# Nodes of the coarsest stage, and of the one before the pixels, at most.
 MAX_COARSE_NODES = 2500
+MAX_MIDDLE_NODES = 1 << 18
+# Levels from one stage to the next, but for the pixels.
 LEVELS_OF_STAGE = 2
 # Nodes that are solved, or pixels that are looked at, at once.
 CHUNK_NODES = 512
@@ -65,6 +67,8 @@ NOISE_PIXELS = 4096
 NEGLIGIBLE_SHARE = 5e-4
 # Light under white of pixels that the camera does not see, relative to the brightest.
 UNSEEN_LIGHT = 1e-6
+# Change of light by the mixing of colours up to which it is the same.
+SAME_LIGHT = 1e-6
 # Variance relative to the square of white from which on a value is unknown, and that of such.
 MAX_RELATIVE_VARIANCE = 1e3
 UNKNOWN_VARIANCE = 1e12
@@ -110,17 +114,25 @@ def stage_levels(grid: tuple[int, int]) -> list[int]:
     """The levels of the stages for a grid, the coarsest first; the last is 0, the pixels.
 
     >>> stage_levels((256, 512)), stage_levels((1080, 1920))
-    ([3, 1, 0], [5, 3, 1, 0])
+    ([3, 1, 0], [5, 3, 2, 0])
     """
     hats = HatLevels(grid)
+    coarsest = _first_level(hats, MAX_COARSE_NODES)
+    if coarsest == 0:
+        return [0]
+    before_pixels = max(_first_level(hats, MAX_MIDDLE_NODES), 1)
+    levels = [coarsest]
+    while levels[-1] > before_pixels:
+        levels.append(max(levels[-1] - LEVELS_OF_STAGE, before_pixels))
+    return [*levels, 0]
+
+
+def _first_level(hats: HatLevels, nodes: int) -> int:
+    """The finest level of at most so many nodes."""
     level = 0
-    while hats.nodes_of(level) > MAX_COARSE_NODES:
+    while hats.nodes_of(level) > nodes:
         level += 1
-    levels = [level]
-    while level > 0:
-        level = max(level - LEVELS_OF_STAGE, 0)
-        levels.append(level)
-    return levels
+    return level
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -184,11 +196,6 @@ class RefinedEstimator:
         return self.coarse.mixing
 
     @property
-    def surprise(self) -> np.ndarray:
-        """As `Estimator.surprise`, of pictures averaged under the coarsest hats."""
-        return self.coarse.surprise
-
-    @property
     def noise(self) -> float:
         """As `Estimator.noise`, of the pixels."""
         return float(np.sqrt(np.median(self.stages[-1].noise)))
@@ -206,6 +213,10 @@ class RefinedEstimator:
         self.coarse.solve(self._averaged(pairs))
         self._solve_stages(pairs)
 
+    def coarsest(self, pairs: Pairs) -> tuple[Estimator, Pairs]:
+        """The estimator of the coarsest stage, and the pairs at its nodes, relative to white."""
+        return self.coarse, self._averaged(pairs)
+
     def explain(self, patterns: np.ndarray) -> np.ndarray:
         """T p of patterns, (frames, N, channels)."""
         explained = np.empty((len(patterns), self.pixels, self.channels))
@@ -219,13 +230,13 @@ class RefinedEstimator:
         """As `Estimator.scale_of_variance`."""
         scales = []
         for channel in range(self.channels):
-            squares = self._pictures(patterns, channel) ** 2
+            squares = self._pictures(patterns, channel).astype(np.float64) ** 2
             sums = self.hats.sums_from(0, squares, power=2)
             shares = self._at_pixels(sums, [stage.variance[channel] for stage in self.stages])
             light = self.light[:, channel] ** 2
             expected = (light[:, None] * shares).sum()
             noise = len(patterns) * (self.stages[-1].noise * light).sum()
-            measured = max((left[:, :, channel] ** 2).sum() - noise, 0.0)
+            measured = max(left[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
 
@@ -296,7 +307,9 @@ class RefinedEstimator:
         for level in self.levels[1:]:
             before = self.stages[-1]
             self.stages[-1] = before.without_own(self.hats.first[before.level])
-            parts = [self._solve_near(pairs, level, c) for c in self._alike_channels(pairs)]
+            parts = [
+                self._solve_near(pairs, level, c) for c in self._alike_channels(pairs.patterns)
+            ]
             mean: list[Any] = []
             variance: list[Any] = []
             for part in parts:
@@ -325,11 +338,10 @@ class RefinedEstimator:
         shape = (csr.shape[0], self.hats.nodes)
         return scipy.sparse.csr_array((csr.data, columns, csr.indptr), shape=shape)
 
-    def _alike_channels(self, pairs: Pairs) -> list[list[int]]:
+    def _alike_channels(self, patterns: np.ndarray) -> list[list[int]]:
         """Channels that see the same patterns: all, if patterns are grey."""
-        is_grey = all(np.ptp(pattern, axis=1).max() == 0 for pattern in pairs.patterns)
         channels = list(range(self.channels))
-        return [channels] if is_grey else [[channel] for channel in channels]
+        return [channels] if _are_grey(patterns) else [[channel] for channel in channels]
 
     def _solve_near(self, pairs: Pairs, level: int, channels: list[int]) -> Stage:
         """The rows of some channels at the nodes of a level; coarser stages are solved."""
@@ -356,13 +368,13 @@ class RefinedEstimator:
         """What the rows of each stage say of patterns, (nodes, frames) of each channel."""
         first_level = self.stages[-1].level
         first = self.hats.first[first_level]
-        sums = self.hats.sums_from(first_level, patterns)
+        sums = self.hats.sums_from(first_level, patterns, dtype=np.float32)
         answers = []
         for stage in self.stages:
             of_channels = []
             for channel in channels:
                 coefficients: Any = stage.mean[channel]
-                of_channels.append(coefficients[:, first:] @ sums)
+                of_channels.append(coefficients[:, first:].astype(np.float32) @ sums)
             answers.append(of_channels)
         return answers
 
@@ -395,6 +407,8 @@ class RefinedEstimator:
                 light = np.abs(mean) * near.area[near.group][:, None]
                 for channel, rows in enumerate(collected):
                     matters = (columns >= 0) & (light[:, :, channel] > NEGLIGIBLE_SHARE)
+                    # The first function is the node's own.
+                    matters[:, 0] = True
                     rows.add(columns, matters, mean[:, :, channel], variance)
                 self._count(len(numbers))
         matrices = [rows.matrices() for rows in collected]
@@ -430,7 +444,10 @@ class RefinedEstimator:
 
     def _pictures(self, patterns: np.ndarray, channel: int) -> np.ndarray:
         """The light (frames, h, w) that a channel answers to."""
-        light = patterns @ self.mixing[channel].astype(np.float32)
+        if _are_grey(patterns) and abs(self.mixing[channel].sum() - 1.0) < SAME_LIGHT:
+            light = patterns[:, :, 0]
+        else:
+            light = patterns @ self.mixing[channel]
         return light.reshape(-1, *self.grid)
 
     # Rows of T.
@@ -508,16 +525,19 @@ class RefinedEstimator:
 
     def _core(self, channel: int) -> scipy.sparse.csr_array:
         """K of all stages, (nodes, nodes), less the identity: T - I = diag(w) W^T K W."""
-        nodes = self.hats.nodes
-        core = scipy.sparse.csr_array((nodes, nodes))
-        for stage in self.stages:
-            values = scipy.sparse.coo_array(stage.mean[channel])
-            row, column = values.coords
-            places = (row + self.hats.first[stage.level], column)
-            core = core + scipy.sparse.csr_array((values.data, places), shape=core.shape)
-        own = np.arange(self.pixels)
-        identity = (1.0 / self.light[:, channel], (own, own))
-        return scipy.sparse.csr_array(core - scipy.sparse.csr_array(identity, shape=core.shape))
+        pixels: Any = self.stages[-1].mean[channel].copy()
+        is_own = pixels.indices == np.repeat(np.arange(self.pixels), np.diff(pixels.indptr))
+        pixels.data[is_own] -= 1.0 / self.light[:, channel]
+        by_level = {stage.level: stage.mean[channel] for stage in self.stages}
+        by_level[0] = pixels
+        blocks = []
+        for level in range(len(self.hats.sizes)):
+            shape = (self.hats.nodes_of(level), self.hats.nodes)
+            block = by_level.get(level)
+            blocks.append(scipy.sparse.csr_array(shape) if block is None else block)
+        core = scipy.sparse.csr_array(scipy.sparse.vstack(blocks, format="csr"))
+        core.sort_indices()
+        return core
 
     def _count_coarse(self, stage: str, done: int, total: int) -> None:
         """Tell the progress of the coarsest stage."""
@@ -663,6 +683,13 @@ def _between(values: np.ndarray, step: int, grid: tuple[int, int]) -> np.ndarray
     """Values at every `step`-th pixel, interpolated to all pixels of a grid, (N,)."""
     places = np.indices(grid).reshape(2, -1) / step
     return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
+
+
+def _are_grey(patterns: np.ndarray) -> bool:
+    """Return True if the colours of patterns (frames, N, channels) are the same."""
+    if patterns.strides[2] == 0 or patterns.shape[2] == 1:
+        return True
+    return all(np.ptp(pattern, axis=1).max() == 0 for pattern in patterns)
 
 
 def _without_own(values: Any, first: int) -> Any:

@@ -11,12 +11,15 @@ off, so that the curve of the projector does not matter. Of each scale s = 2^l t
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
 that of T.
+
+A picture that all others contradict is left out (`estimation.contradiction`); several are refused.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,11 +27,13 @@ import cv2
 import numpy as np
 import scipy.stats
 
+from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
-from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, ScanGrid
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore, CompressedRecord
 
@@ -38,10 +43,6 @@ WALSH = ((0, 0, 1, 1), (0, 1, 1, 0), (0, 1, 0, 1))
 CONFIDENCE = 0.95
 # Pictures that judge.
 JUDGES = 8
-# Surprise of a picture, relative to that of the median one, from which on it is refused. In clean
-# scans of corners and boxes at random it is 2 to 7, once 14; of a picture that is a tenth too dark
-# 18 to 37.
-MAX_SURPRISE_RATIO = 20.0
 # Fields of the checkerboard, and lit patches, along the shorter side.
 CHECKERBOARD_FIELDS = 6
 PATCH_SHARE = 8
@@ -49,6 +50,10 @@ PATCH_SHARE = 8
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
 SEED = 0
+# Why a picture contradicts all others.
+CAUSES = "another light was on, the exposure was another one, or something moved"
+
+logger = logging.getLogger(__name__)
 
 
 def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
@@ -173,6 +178,8 @@ class Sketch:
         Their root mean square.
     bound : float
         What that of other pictures is below, with a probability of 95 %.
+    wrong_patterns : list of int
+        Numbers of patterns, from 1 on, whose pictures contradict all others.
     """
 
     arrays: dict[str, np.ndarray]
@@ -180,6 +187,7 @@ class Sketch:
     errors: np.ndarray
     error: float
     bound: float
+    wrong_patterns: list[int]
 
 
 def scan(
@@ -192,34 +200,40 @@ def scan(
     """
     shown = [*patterns(grid.grid), *judges(grid.grid)]
     log.announce(shown)
-    pictures: list[Picture] = []
-    for start in range(0, len(shown), BATCH_SIZE):
-        pictures += log.take(shown[start : start + BATCH_SIZE])
-    pairs = _pairs(grid, shown, pictures)
-    is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
-    mixing = grid.calibration.mixing
-    known_mixing = _known_mixing(mixing, grid.channels)
-    estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-    estimator.learn(pairs.select(~is_judge))
-    check_surprise(estimator.surprise)
-    return _judged(estimator, pairs.select(is_judge))
+    pairs = _photograph(grid, shown, log)
+    first_judge = len(pairs) - JUDGES
+    known_mixing = _known_mixing(grid.calibration.mixing, grid.channels)
+
+    def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
+        estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
+        # A slice copies no pictures.
+        fitted = pairs.select(slice(0, first_judge))
+        estimator.learn(fitted.without([number for number in wrong if number < first_judge]))
+        return estimator
+
+    wrong, estimator = find_wrong_pictures(pairs, learn)
+    _report_wrong([log.names[number - 1] for number in wrong], len(shown))
+    judging = pairs.select(slice(first_judge, None))
+    wrong_judges = [number - first_judge for number in wrong if number >= first_judge]
+    return _judged(estimator, judging.without(wrong_judges), wrong)
 
 
-def check_surprise(surprise: np.ndarray, most: float = MAX_SURPRISE_RATIO) -> None:
-    """Refuse a picture that all others contradict, such as one of another lamp or exposure.
-
-    `surprise` is that of each picture, (frames,), white first, which no pattern is like; `most` is
-    the largest one relative to that of the median picture.
-    """
-    of_patterns = surprise[1:]
-    if not len(of_patterns):
+def _report_wrong(names: Sequence[str], patterns: int) -> None:
+    """Warn of a picture that contradicts all others, and is left out; refuse several."""
+    if not names:
         return
-    number = int(of_patterns.argmax())
-    if of_patterns[number] > most * np.median(of_patterns):
+    pictures = " and of ".join(names)
+    if len(names) > 1:
         raise ScanRefused(
-            f"the picture of pattern {number + 1} of {len(of_patterns)} contradicts those of all "
-            "others: another exposure, another light, or something moved; the scan must be repeated"
+            f"the pictures of {pictures}, of {patterns} patterns, contradict all others: "
+            f"{CAUSES}; the scan must be repeated"
         )
+    logger.warning(
+        "the picture of %s, of %d patterns, contradicts all others, and is left out: %s",
+        pictures,
+        patterns,
+        CAUSES,
+    )
 
 
 def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
@@ -228,34 +242,51 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
     return mixing
 
 
-def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> Pairs:
+def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
     """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
-    white = grid.white
-    seen = [white, *pictures]
-    variances = [white.variance]
-    for picture in pictures:
-        variances.append(np.where(picture.known, picture.variance + grid.ambient, UNKNOWN))
-    lit = np.stack([np.ones(grid.grid), *shown]).astype(np.uint8)
-    patterns_of_channels = np.repeat(lit.reshape(len(lit), -1, 1), grid.channels, axis=2)
+    frames = len(shown) + 1
+    shape = (frames, len(grid.seen), grid.channels)
+    photographs = scratch_array(shape, np.float32)
+    variance = scratch_array(shape, np.float32)
+    photographs[0] = grid.white.value.T
+    variance[0] = grid.white.variance.T
+    frame = 1
+    for start in range(0, len(shown), BATCH_SIZE):
+        for picture in log.take(shown[start : start + BATCH_SIZE]):
+            photographs[frame] = picture.value.T
+            noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
+            variance[frame] = noise.T
+            frame += 1
+    lit = np.ones((frames, *grid.grid), np.uint8)
+    for number, pattern in enumerate(shown):
+        lit[number + 1] = pattern
     return Pairs(
         grid=grid.grid,
         camera_grid=grid.grid,
-        patterns=patterns_of_channels,
-        photographs=np.stack([picture.value.T for picture in seen]),
-        variance=np.stack([variance.T for variance in variances]),
+        patterns=np.broadcast_to(lit.reshape(frames, -1, 1), shape),
+        photographs=photographs,
+        variance=variance,
     )
 
 
-def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
+def _judged(
+    estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
+) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
-    variance: Any = pairs.variance
-    is_known = variance < KNOWN_VARIANCE
-    explained = estimator.explain(pairs.patterns)
-    left = np.where(is_known, pairs.photographs - explained, 0.0)
-    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
-    light = np.where(is_known, pairs.photographs, 0.0)
-    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
-    squares = np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy
+    squares = np.zeros(len(pairs))
+    left = np.zeros(estimator.channels)
+    for number in range(len(pairs)):
+        judge = pairs.select(slice(number, number + 1))
+        variance: Any = judge.variance
+        is_known = variance < KNOWN_VARIANCE
+        explained = estimator.explain(judge.patterns)
+        unexplained = np.where(is_known, judge.photographs - explained, 0.0)
+        of_channels = (unexplained**2).sum(axis=(0, 1))
+        noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
+        light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
+        energy = max((light**2).sum(), np.finfo(float).tiny)
+        squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        left += of_channels
     error = math.sqrt(squares.mean())
     scales = estimator.scale_of_variance(pairs.patterns, left)
     return Sketch(
@@ -264,6 +295,7 @@ def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
         errors=np.sqrt(squares),
         error=error,
         bound=error_bound(error, len(squares)),
+        wrong_patterns=wrong_patterns,
     )
 
 
@@ -280,6 +312,7 @@ def finish(store: BlockStore, sketch: Sketch) -> None:
             "error": sketch.error,
             "bound": sketch.bound,
             "errors": sketch.errors.tolist(),
+            "wrong_patterns": sketch.wrong_patterns,
         }
     )
     store.finalize(compressed=CompressedRecord(sketch.arrays))
