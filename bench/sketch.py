@@ -433,7 +433,10 @@ def main() -> None:
     results = scan_with_cameras(f"corner {side} x {side}", square, options)
     bounces = []
     direct: list[Claim] = []
-    for name in SCENES:
+    names = list(SCENES)
+    if options.smoke:
+        names = names[:2]
+    for name in names:
         truth = transport_of(PerspectiveTransport(name, (side, side)), options)
         results += scan_with_cameras(name, truth, options)
         smaller = PerspectiveTransport(name, (bounces_side, bounces_side))
