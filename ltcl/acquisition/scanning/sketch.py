@@ -246,24 +246,41 @@ def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> 
 def _judged(estimator: Estimator, pairs: Pairs) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
     variance: Any = pairs.variance
-    is_known = variance < KNOWN_VARIANCE
     explained = estimator.explain(pairs.patterns)
-    left = np.where(is_known, pairs.photographs - explained, 0.0)
-    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
-    light = np.where(is_known, pairs.photographs, 0.0)
-    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
-    squares = np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy
-    error = math.sqrt(squares.mean())
-    degrees = len(squares)
-    bound = error * math.sqrt(degrees / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, degrees))
+    left = np.where(variance < KNOWN_VARIANCE, pairs.photographs - explained, 0.0)
+    errors = judged_errors(pairs.photographs, explained, variance)
+    error = math.sqrt((errors**2).mean())
     scales = estimator.scale_of_variance(pairs.patterns, left)
     return Sketch(
         arrays=estimator.arrays(scales),
         own_variance=estimator.own_variance() * scales[:, None],
-        errors=np.sqrt(squares),
+        errors=errors,
         error=error,
-        bound=bound,
+        bound=error_bound(error, len(errors)),
     )
+
+
+def judged_errors(
+    photographs: np.ndarray, explained: np.ndarray, variance: np.ndarray
+) -> np.ndarray:
+    """Error of T p for each photograph (k, N, channels), relative to it, less the noise, (k,).
+
+    Pixels whose variance is that of unknown values do not count.
+    """
+    is_known = variance < KNOWN_VARIANCE
+    left = np.where(is_known, photographs - explained, 0.0)
+    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
+    light = np.where(is_known, photographs, 0.0)
+    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
+    return np.sqrt(np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy)
+
+
+def error_bound(error: float, count: int) -> float:
+    """What errors of other pictures are below, with a probability of `CONFIDENCE`.
+
+    `error` is the root mean square of those of `count` pictures.
+    """
+    return error * math.sqrt(count / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, count))
 
 
 def finish(store: BlockStore, sketch: Sketch) -> None:
