@@ -18,9 +18,10 @@ from ltcl.acquisition.rigs.simulated import SimulatedRig
 
 # Patches that a projector pixel covers, rows and columns.
 PIXEL_PATCHES = (1.5, 3.0)
-# Camera pixels to a side of a projector pixel, and projector pixels that it sees beyond the picture.
+# Camera pixels to a side of a projector pixel; projector pixels that it sees beyond the picture.
 CAMERA_PIXELS = 3.1
 SEEN_MARGIN = 6
+AMBIENT = 0.01
 # Light of a bounce, relative to the direct light, that is the last.
 LAST_BOUNCE = 1e-7
 
@@ -49,7 +50,7 @@ class MovedCornerRig(SimulatedRig):
         *,
         shift: tuple[float, float] = (0.0, 0.0),
         lamp: float = 1.0,
-        ambient: float = 0.01,
+        ambient: float = AMBIENT,
         **sensor: Any,
     ) -> None:
         super().__init__((side, side), 1, sensor)
@@ -66,7 +67,8 @@ class MovedCornerRig(SimulatedRig):
         self._patches_of_projector = []
         self._camera_of_projector = []
         self._camera_of_patches = []
-        for axis, (size, width) in enumerate(zip((patches, 2 * patches), PIXEL_PATCHES, strict=True)):
+        for axis, width in enumerate(PIXEL_PATCHES):
+            size = self._bounce.grid[axis]
             middle = size / 2.0
             pixels = middle + width * (np.arange(side + 1) - side / 2.0 + shift[axis])
             edges = np.arange(size + 1.0)

@@ -69,4 +69,6 @@ def _in_nodes(windows: Windows, values: np.ndarray) -> Any:
     """Values of the functions of each row, (N, q), at their nodes."""
     row, function = np.nonzero((windows.nodes != windows.absent) & (values != 0.0))
     places = row, windows.nodes[row, function]
-    return scipy.sparse.csr_array((values[row, function], places), shape=(len(values), windows.absent))
+    return scipy.sparse.csr_array(
+        (values[row, function], places), shape=(len(values), windows.absent)
+    )

@@ -7,10 +7,10 @@ A place u on the old projector's picture is now lit by the place G(u) of the new
 
 with s and t the place in halves of the longer side, from the middle: a homography close to the
 identity, to second order, and as much of the parallax of a scene. Pixels of the pattern p are even
-squares. A camera pixel at u sees its mean over a footprint at G(u), and q is that on the old pixels,
-resampled as pictures are: bilinear interpolation of p would be biased by a tenth of a pixel, since
-camera pixels that straddle two old pixels count little. With the old transport T and pictures y on
-the old pixels, least squares find theta in
+squares. A camera pixel at u sees its mean over a footprint at G(u), and q is that on the old
+pixels, resampled as pictures are: bilinear interpolation of p would be biased by a tenth of a
+pixel, since camera pixels that straddle two old pixels count little. With the old transport T and
+pictures y on the old pixels, least squares find theta in
 
     y_k = (y_white / T q_white) T q_k
 
@@ -25,6 +25,7 @@ objects from another side; one map for the whole picture does not describe that.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -45,6 +46,10 @@ MAX_STEPS = 30
 LEAST_CHANGE = 1e-4
 # Shift in pixels for derivatives: pictures are linear between pixels.
 DERIVATIVE_STEP = 0.02
+# Rounds in which pixels are trusted less that are left by more than this times as much as the
+# median.
+ROBUST_ROUNDS = 3
+OUTLIER_RATIO = 3.0
 # Damping of the first step, its change when a step succeeds or fails, and its end.
 FIRST_DAMPING = 1e-3
 DAMPING_FACTOR = 5.0
@@ -228,12 +233,14 @@ class Views:
 class MovementFit:
     """A movement, the gain of the lamp (channels,), and what both leave of the pictures.
 
-    `misfit` is relative to the light of the pictures.
+    `misfit` is relative to the light of the pictures; `typical_misfit` is that of the median pixel,
+    which a change of one place does not make larger.
     """
 
     movement: Movement
     gain: np.ndarray
     misfit: float
+    typical_misfit: float
 
 
 def search_shift(views: Views, largest: float) -> Movement:
@@ -291,9 +298,13 @@ def _likeness(
 
 def fit_movement(views: Views, products: Products, first: Movement) -> MovementFit:
     """The movement that explains pictures best, from a first one on, and the gains."""
-    about = _Search(views, products, views.bilinear).run(first)
-    search = _Search(views, products, views.resampled)
-    return search.with_gain(search.run(about))
+    movement = first
+    for lighting in (views.bilinear, views.resampled):
+        search = _Search(views, products, lighting)
+        for _ in range(ROBUST_ROUNDS):
+            movement = search.run(movement)
+            search.trust_less_where_it_fails(movement)
+    return search.with_gain(movement)
 
 
 def no_movement(views: Views, products: Products) -> MovementFit:
@@ -315,6 +326,7 @@ class _Search:
         light = np.maximum(views.pictures[0], np.finfo(float).tiny)
         deviation = np.sqrt(views.variance[1:] + (MODEL_ERROR * light) ** 2)
         self.weight = np.where(self.known, 1.0 / deviation, 0.0)
+        self._first_weight = self.weight
 
     def run(self, movement: Movement) -> Movement:
         """The movement of least squares."""
@@ -343,6 +355,18 @@ class _Search:
                 break
         return movement
 
+    def trust_less_where_it_fails(self, movement: Movement) -> None:
+        """Weigh pixels less that are left as few others are (Cauchy): something changed there."""
+        self.weight = self._first_weight
+        is_used = self._lit(movement)
+        residual = self._residual(movement, is_used).reshape(self.weight.shape)
+        square = (residual**2).mean(axis=(0, 2))
+        if not square.any():
+            return
+        typical = np.median(square[square > 0])
+        trust = 1.0 / np.sqrt(1.0 + square / (OUTLIER_RATIO**2 * typical))
+        self.weight = self._first_weight * trust[:, None]
+
     def with_gain(self, movement: Movement) -> MovementFit:
         """The gains of the lamp under a movement, and what both leave."""
         picture = self._predict(movement)
@@ -352,9 +376,13 @@ class _Search:
         noise = np.where(is_known, self.views.variance, 0.0)
         squares = (model**2).sum(axis=(0, 1))
         gain = (model * seen).sum(axis=(0, 1)) / np.maximum(squares, np.finfo(float).tiny)
-        left = ((seen - gain * model) ** 2).sum() - noise.sum()
-        misfit = np.sqrt(max(left, 0.0) / max((seen**2).sum(), np.finfo(float).tiny))
-        return MovementFit(movement=movement, gain=gain, misfit=float(misfit))
+        left = ((seen - gain * model) ** 2 - noise).sum(axis=(0, 2))
+        light = (seen**2).sum(axis=(0, 2))
+        misfit = math.sqrt(max(left.sum(), 0.0) / max(light.sum(), np.finfo(float).tiny))
+        typical = 0.0
+        if light.any():
+            typical = math.sqrt(max(np.median(left[light > 0] / light[light > 0]), 0.0))
+        return MovementFit(movement=movement, gain=gain, misfit=misfit, typical_misfit=typical)
 
     def _predict(self, movement: Movement) -> np.ndarray:
         """T q of all patterns, (k, N, channels)."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The twelve photographs of an update: what is shown, and the light that they show.
 
-    black, white     ambient light, and the lamp
-    fitted           a picture like nature, and squares of 2, 4 and 8 pixels at random, two of each:
-                     where the light falls now, and what has changed
-    judges           three of the pictures that judge a sketch, which are never fitted
+black, white     ambient light, and the lamp
+fitted           a picture like nature, and squares of 2, 4 and 8 pixels at random, two of each:
+                 where the light falls now, and what has changed
+judges           three of the pictures that judge a sketch, which are never fitted
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from ltcl.acquisition.session import Photograph, ProgressFunction, merge_photogr
 # Pictures like nature, and sides of squares, of the patterns that are fitted.
 NATURE_PATTERNS = 1
 SQUARES = (2, 2, 4, 4, 8, 8)
-# Places of the judges among those of a sketch: like nature, text, a lit patch.
-JUDGE_PLACES = (0, 4, 7)
+# Judges, and their places among those of a sketch, the first that light anything: like nature,
+# text, a lit patch; and with too few pixels for text a checkerboard, or a half plane.
+JUDGES = 3
+JUDGE_PLACES = (0, 4, 7, 5, 2)
 SEED = 5
 # All photographs.
-PHOTOGRAPHS = 2 + NATURE_PATTERNS + len(SQUARES) + len(JUDGE_PLACES)
+PHOTOGRAPHS = 2 + NATURE_PATTERNS + len(SQUARES) + JUDGES
 
 
 def fitted_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
@@ -38,7 +40,7 @@ def fitted_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     7
     """
     random = np.random.default_rng(SEED)
-    patterns = [like_nature(grid, random) > 0 for _ in range(NATURE_PATTERNS)]
+    patterns: list[np.ndarray] = [like_nature(grid, random) > 0 for _ in range(NATURE_PATTERNS)]
     for side in SQUARES:
         size = min(side, max(min(grid) // 2, 1))
         height, width = (-(-length // size) for length in grid)
@@ -48,10 +50,20 @@ def fitted_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     return [pattern.astype(np.float32) for pattern in patterns]
 
 
+def judge_places(grid: tuple[int, int]) -> list[int]:
+    """Places of the judges among those of a sketch.
+
+    >>> judge_places((64, 64)), judge_places((4, 8))
+    ([0, 4, 7], [0, 7, 5])
+    """
+    pictures = judges(grid)
+    return [place for place in JUDGE_PLACES if pictures[place].any()][:JUDGES]
+
+
 def judging_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     """The patterns (h, w) of 0 and 1 that judge."""
     pictures = judges(grid)
-    return [pictures[place] for place in JUDGE_PLACES]
+    return [pictures[place] for place in judge_places(grid)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,6 +102,6 @@ def photograph(
     return UpdateLight(
         black=black_light,
         white=white_light,
-        fitted=others[: -len(JUDGE_PLACES)],
-        judging=others[-len(JUDGE_PLACES) :],
+        fitted=others[:-JUDGES],
+        judging=others[-JUDGES:],
     )

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks
 from ltcl.acquisition.calibration import Calibration, StoredMap, is_calibrated, stored_map
 from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS, check_memory
 from ltcl.acquisition.geometry import Correspondence, Resampling
@@ -43,10 +42,11 @@ from ltcl.acquisition.updating.movement import (
     search_shift,
 )
 from ltcl.acquisition.updating.photographs import (
-    JUDGE_PLACES,
+    JUDGES,
     PHOTOGRAPHS,
     UpdateLight,
     fitted_patterns,
+    judge_places,
     judging_patterns,
     photograph,
 )
@@ -55,7 +55,6 @@ from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError
 from ltcl.files import as_path
 from ltcl.store import BlockStore, CompressedRecord, load
-from ltcl.store.block_store import check_place
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.noise import Noise
@@ -67,10 +66,13 @@ logger = logging.getLogger(__name__)
 # shift is searched for, so that one that is too large is found.
 MAX_MOVEMENT_SHARE = 1 / 8
 SEARCH_RATIO = 1.5
-# What the moved transport may leave of pictures; more is another scene, or another kind of change.
+# What the moved transport may leave of pictures at the median pixel; more is another scene, or
+# another kind of change.
 MAX_MISFIT = 0.1
-# Movement in pixels below which there is none: smaller than errors of the map.
-LEAST_MOVEMENT = 0.02
+# What is left without a movement, relative to that with it, and of the light, up to which there is
+# none: one by a hundredth of a pixel leaves about half a percent of the light.
+NOTABLE_MISFIT_RATIO = 1.1
+NOTABLE_MISFIT = 0.002
 # Change of the light of a camera pixel under white, relative to it and beyond the noise, from which
 # on it does not see what it saw before.
 MAX_WHITE_CHANGE = 0.3
@@ -263,7 +265,8 @@ def update(
         raise InputError(f"store is {path}, which is the scan; it must be another folder")
     if device is not None:
         device = open_device(device)
-    check_place(path, overwrite=False)
+    if path.exists() and not _is_empty_folder(path):
+        raise FileError(f"{path}: exists; store must be a new folder")
     shots = Shots(rig)
     previous = _open_scan(scan)
     T = HostTransport.of(previous)
@@ -360,6 +363,10 @@ def update(
     return result
 
 
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
+
+
 def _open_scan(scan: str | os.PathLike[str]) -> BlockStore:
     """The store of a finished scan on the projector's own pixels."""
     opened = BlockStore.open(scan)
@@ -454,13 +461,13 @@ def _find_movement(
     first = search_shift(views, SEARCH_RATIO * largest)
     fit = fit_movement(views, T.products, first)
     still = no_movement(views, T.products)
-    if fit.movement.largest < LEAST_MOVEMENT or still.misfit <= fit.misfit:
+    if still.misfit <= NOTABLE_MISFIT_RATIO * fit.misfit + NOTABLE_MISFIT:
         fit = still
-    if fit.misfit > MAX_MISFIT:
+    if fit.typical_misfit > MAX_MISFIT:
         raise AcquisitionError(
             f"no movement of the projector by up to {largest:.1f} pixels explains the photographs: "
-            f"{fit.misfit:.0%} of their light is left, where at most {MAX_MISFIT:.0%} may be; it has "
-            "moved further, or the camera or the scene has changed; a new scan is needed"
+            f"{fit.typical_misfit:.0%} of their light is left, where at most {MAX_MISFIT:.0%} may "
+            "be; it has moved further, or the camera or the scene has changed; a new scan is needed"
         )
     if fit.movement.largest > largest:
         raise AcquisitionError(
@@ -541,7 +548,7 @@ class _Judgement:
         explained = T.products(patterns)
         errors = judged_errors(pictures.value, explained, pictures.variance)
         error = math.sqrt((errors**2).mean())
-        previous_errors = _previous_errors(previous)
+        previous_errors = _previous_errors(previous, T.grid)
         previous_error = math.sqrt((previous_errors**2).mean())
         allowed = MAX_UNKNOWN_ERROR
         if not math.isnan(previous_error):
@@ -564,14 +571,14 @@ class _Judgement:
         return max(self.error / self.previous_error, 1.0)
 
 
-def _previous_errors(previous: BlockStore) -> np.ndarray:
+def _previous_errors(previous: BlockStore, grid: tuple[int, int]) -> np.ndarray:
     """Errors of a scan, or of an update, for the same pictures; NaN if they are not known."""
     errors = np.array(previous.attributes.get("sketch", {}).get("errors", ()), np.float64)
-    if len(errors) > max(JUDGE_PLACES):
-        return errors[[*JUDGE_PLACES]]
-    if len(errors) == len(JUDGE_PLACES):
+    if len(errors) == JUDGES:
         return errors
-    return np.full(len(JUDGE_PLACES), np.nan)
+    if len(errors) > JUDGES:
+        return errors[judge_places(grid)]
+    return np.full(JUDGES, np.nan)
 
 
 def _failing_cells(

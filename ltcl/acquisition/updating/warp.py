@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """T of a finished scan on the host, and the same after the projector has moved.
 
-A scan is T = C W: rows of T in functions h_n, whose sums W are (`ltcl.operators.Hats`), or in pixels.
-The row of a new pixel i is that of its old place g(i), read at the old places of the columns,
+A scan is T = C W: rows of T in functions h_n, whose sums W are (`ltcl.operators.Hats`), or in
+pixels. The row of a new pixel i is that of its old place g(i), read at the old places of the
+columns,
 
     T'[i, j] = gain f_g(i)(g(j)),    f_a(u) = sum_n C_a,n h_n(u)
 
 which keeps the light: a pixel of the projector sends the same wherever it falls. Two parts go two
 ways:
 
-    near     entries up to `REACH` pixels from the diagonal, the direct light among them, stay as far
-             from it: new pixel j lights the place that new pixel j looks at, however it falls on
-             the old pixels
+    near     entries up to `REACH` pixels from the diagonal, the direct light among them, stay as
+             far from it: new pixel j lights the place that new pixel j looks at, however it falls
+             on the old pixels
     others   rows are interpolated between the old ones, and functions of each level between its
              nodes: C' = B C P, with P_n,m = h_n(g(m)) at the nodes m; what the nodes of the next
              finer level show beyond that, as at a crease, is added there
@@ -28,10 +29,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.estimation.estimator import BASIS
 from ltcl.acquisition.estimation.windows import REACH, hat_levels, hat_matrix
 from ltcl.acquisition.updating.movement import Movement, interpolation
-from ltcl.errors import InputError
-from ltcl.operators.pyramid import HATS
+from ltcl.errors import FileError, InputError
 from ltcl.store import BlockStore, StoredRows
 from ltcl.store.block_store import read
 
@@ -65,16 +66,18 @@ class HostTransport:
         """T of a finished scan; InputError for one whose rows are in other functions."""
         record: Any = read(store.path)
         grid = store.layout.grid
-        W = hat_matrix(grid)
+        if grid is None:
+            raise FileError(f"{store.path}: does not say how its pixels lie side by side")
+        W: Any = hat_matrix(grid)
         nodes = W.shape[0]
         cores = []
         for channel in range(store.layout.channels):
             if store.layout.kind == "compressed":
-                core = _compressed_core(record.arrays, channel, store)
+                core: Any = _compressed_core(record.arrays, channel, store)
                 cores.append(core + scipy.sparse.eye_array(*core.shape, format="csr"))
                 continue
             rows: StoredRows = record.matrices[channel]
-            pixels = rows.tocsr()
+            pixels: Any = rows.tocsr()
             entries = pixels.data.astype(np.float64), pixels.indices, pixels.indptr
             cores.append(scipy.sparse.csr_array(entries, shape=(pixels.shape[0], nodes)))
         return cls(grid=grid, cores=cores, W=W)
@@ -98,7 +101,7 @@ class HostTransport:
 def _compressed_core(arrays: Any, channel: int, store: BlockStore) -> scipy.sparse.csr_array:
     """C - I of a channel of a compressed transport in hats."""
     name = str(arrays.get("basis_0.name", "pixels"))
-    if name != HATS:
+    if name != BASIS:
         raise InputError(
             f"scan is {store.path}, of strategy {store.attributes['strategy']!r}, in sums of "
             f"{name}; it must be a sketch, or a scan by pixels or S-matrices"
