@@ -13,12 +13,22 @@ with A of 131072 pixels, 69 GB, need a table of 134 MB.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
+import cv2
 import numpy as np
 import scipy.linalg
+import scipy.sparse.linalg
 
+from ltcl import Transport
+from ltcl.acquisition.scanning.sketch import like_nature
 from ltcl.scenes import exchange
 from ltcl.scenes.scene import transport_matrix
+
+# Change of light from bounce to bounce, relative to direct light, after which others do not count.
+LEAST_CHANGE = 1e-6
+# Albedos of a textured corner.
+COLOURS = (0.7, 0.5, 0.4)
 
 
 class Bounce:
@@ -68,6 +78,79 @@ class Bounce:
         received = np.concatenate([on_left, on_right], axis=1)
         bounced = np.fft.irfft(received.view(np.complex128), 2 * n, axis=0)[:n]
         return self.albedo * bounced.reshape(np.shape(x))
+
+
+class TexturedCorner(scipy.sparse.linalg.LinearOperator):
+    """T = (I - diag(albedo) U A V)^-1 diag(albedo direct) of a corner with texture, never stored.
+
+    Light bounces between n x 2 n cells by the form factors A of `Bounce`. V averages the pixels of
+    each cell, `step` along both sides, and U interpolates between the middles of cells; for a step
+    of 1 both are the identity, and T is exact. The first and the last `margin` columns of pixels
+    are left out: neither lit nor seen. The albedo has texture like nature, and bricks.
+    """
+
+    def __init__(self, n: int, albedo: float, *, step: int = 1, margin: int = 0, seed: int = 0):
+        self.bounce = Bounce(n, 1.0)
+        self.cells = (n, 2 * n)
+        self.full_grid = (n * step, 2 * n * step)
+        self.margin = margin
+        self.grid = (n * step, 2 * n * step - 2 * margin)
+        pixels = self.grid[0] * self.grid[1]
+        super().__init__(np.float64, (pixels, pixels))
+        texture = like_nature(self.full_grid, np.random.default_rng(seed))
+        row, column = np.indices(self.full_grid)
+        bricks = np.where((row // 7 + column // 11) % 2 == 0, 1.0, -1.0)
+        variation = 0.5 * texture / np.abs(texture).max() + 0.5 * bricks
+        self.albedo = albedo * (0.7 + 0.3 * variation)
+        across = np.linspace(0.0, np.pi, self.full_grid[1])
+        self.direct = self.albedo * (0.6 + 0.3 * np.cos(across))
+
+    @property
+    def first_bounce(self) -> np.ndarray:
+        """What pixels send back of the light of their own, (N,)."""
+        return self._inside(self.direct).ravel()
+
+    def _matmat(self, X: np.ndarray) -> np.ndarray:
+        columns = [self._picture(column.reshape(self.grid)) for column in np.asarray(X).T]
+        return np.stack(columns, axis=1)
+
+    def _picture(self, light: np.ndarray) -> np.ndarray:
+        """T p of a picture."""
+        margins = ((0, 0), (self.margin, self.margin))
+        direct = self.direct * np.pad(light.astype(np.float64), margins)
+        total = direct
+        change = np.inf
+        while change > LEAST_CHANGE * np.abs(direct).max(initial=LEAST_CHANGE):
+            received = self.bounce.matmat(self._cells(total).ravel()).reshape(self.cells)
+            following = direct + self.albedo * self._between(received)
+            change = np.abs(following - total).max()
+            total = following
+        return self._inside(total).ravel()
+
+    def _inside(self, picture: np.ndarray) -> np.ndarray:
+        return picture[:, self.margin : self.margin + self.grid[1]]
+
+    def _cells(self, picture: np.ndarray) -> np.ndarray:
+        """Means over cells."""
+        height, width = self.cells
+        return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+    def _between(self, cells: np.ndarray) -> np.ndarray:
+        """Light between the middles of cells."""
+        height, width = self.full_grid
+        return cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def textured_transport(grid: tuple[int, int], step: int, device: Any) -> Transport:
+    """The true transport of a corner in three colours, whose cells have `step` pixels a side."""
+    height, width = grid
+    cells = height // step
+    margin = height - width // 2
+    channels = []
+    for seed, albedo in enumerate(COLOURS):
+        channels.append(TexturedCorner(cells, albedo, step=step, margin=margin, seed=seed))
+    direct = np.stack([channel.first_bounce for channel in channels])
+    return Transport(channels, grid, first_bounce=direct, device=device)
 
 
 def _form_factors(n: int) -> np.ndarray:

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+# Bytes of a scratch array that are kept in memory.
+MAX_ARRAY_BYTES = 1 << 26
 # Values of a strip of rows.
 STRIP_VALUES = 1 << 20
 
@@ -67,6 +69,21 @@ class ImageFile:
         with self._lock:
             self._file.seek(offset)
             self._file.readinto(array.data.cast("B"))
+
+
+def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array of zeros, which stands in a temporary file if it is large.
+
+    The file is removed with the array.
+
+    >>> scratch_array((2, 3), "float32").sum()
+    np.float32(0.0)
+    """
+    dtype = np.dtype(dtype)
+    if math.prod(shape) * dtype.itemsize <= MAX_ARRAY_BYTES:
+        return np.zeros(shape, dtype)
+    with tempfile.TemporaryFile(prefix="ltcl-") as file:
+        return np.memmap(file, dtype, "w+", shape=shape)
 
 
 @dataclass(frozen=True, kw_only=True)

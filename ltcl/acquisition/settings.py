@@ -17,7 +17,7 @@ from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots, offered_exposure
 from ltcl.errors import InputError, InputTypeError
 
-STRATEGIES = ("sketch", "adaptive", "pixel", "block", "hadamard")
+STRATEGIES = ("sketch", "adaptive", "direct", "pixel", "block", "hadamard")
 _GEOMETRIES = ("graycode", "aligned")
 
 
@@ -30,7 +30,7 @@ class ScanSettings:
     geometry : "graycode", "aligned" or Correspondence
         How camera pixels are assigned to projector pixels: measured with Gray code, the same
         pixels, or as measured before.
-    strategy : "auto", "sketch", "adaptive", "pixel", "block" or "hadamard"
+    strategy : "auto", "sketch", "adaptive", "direct", "pixel", "block" or "hadamard"
         Order and grouping of the lit pixels; "auto" decides by the pixels and the noise of the
         camera.
     exposures : sequence of float, optional

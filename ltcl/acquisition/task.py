@@ -23,11 +23,11 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
-from ltcl.acquisition.estimation.estimator import check_memory
+from ltcl.acquisition.estimation import refinement
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
-from ltcl.acquisition.scanning import adaptive, columns, plan, sketch
+from ltcl.acquisition.scanning import adaptive, columns, direct, plan, sketch
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import LAMP_GAIN, ScanCamera, ScanGrid
 from ltcl.acquisition.session import (
@@ -47,9 +47,12 @@ from ltcl.transport.transport import Transport
 logger = logging.getLogger(__name__)
 
 # Strategies whose pictures are kept until T is made of all of them.
-PICTURE_STRATEGIES = ("sketch", "adaptive")
+PICTURE_STRATEGIES = ("sketch", "adaptive", "direct")
 # Error of a sketch from which on its light is too rough for one.
 NOTABLE_ERROR = 0.02
+# Part of the light that is indirect, from which on a scan of direct light warns that it is left
+# out.
+NOTABLE_INDIRECT = 0.02
 # Mean difference of black or white, relative to full scale, of the cells of a digest: lamps and
 # exposures vary less.
 MAX_VIEW_DIFFERENCE = 0.03
@@ -81,10 +84,11 @@ def acquire(
         seconds).
     geometry : "graycode", "aligned" or Correspondence
         Which projector pixel each camera pixel sees: measured; the same; or as measured before.
-    strategy : "auto", "sketch", "adaptive", "pixel", "block" or "hadamard"
+    strategy : "auto", "sketch", "adaptive", "direct", "pixel", "block" or "hadamard"
         Some tens of patterns of all scales, from which T is estimated; cells that are divided where
-        needed; one pixel at a time; blocks of pixels, which makes a coarser transport; many pixels
-        at once. "auto" decides by the pixels and the noise of the camera (`scanning.plan`).
+        needed; a few fine patterns, which show direct light alone; one pixel at a time; blocks of
+        pixels, which makes a coarser transport; many pixels at once. "auto" decides between those
+        that measure all light by the pixels and the noise of the camera (`scanning.plan`).
     store : path, optional
         Folder of the transport, which keeps the photographs, to be resumed. Until the set-up is
         measured they are in the folder STORE.calibration; to begin again, remove both.
@@ -92,8 +96,8 @@ def acquire(
         Go on with the content of the store; else the store must not exist.
     progress : function of (str, int, int), optional
         Called with "calibration" or "scan", how many of its photographs or patterns are done, those
-        of an earlier run included, and of how many at most; for a sketch then with "fit", rows of T
-        that are estimated, and all.
+        of an earlier run included, and of how many at most; for "sketch" and "direct" then with
+        "fit", rows of T that are estimated, and all.
     exposures : sequence of float, optional
         Seconds of the photographs of each pattern, which the rig must have; by default chosen.
     response : Response, optional
@@ -326,12 +330,13 @@ def _calibrate(
 ) -> BlockStore:
     """Measure the set-up, choose a strategy, and make the store, which is resumed from here on."""
     side = settings.block if settings.strategy == "block" else 1
-    is_sketched = plan.is_sketched(settings.strategy, shots.grid)
-    if is_sketched:
-        check_memory(shots.grid, shots.channels)
+    if settings.strategy == "direct":
+        direct.check_memory(shots.grid, shots.channels)
+    elif plan.is_sketched(settings.strategy, shots.grid):
+        refinement.check_memory(shots.grid, shots.channels)
     calibration = calibrate.measure(
         shots,
-        sparing=is_sketched,
+        sparing=plan.is_sparing(settings.strategy, shots.grid),
         geometry=settings.geometry,
         response=settings.response,
         exposures=settings.exposures,
@@ -388,6 +393,8 @@ def _store_sizes(strategy: str, grid: ScanGrid, order: int) -> dict[str, Any]:
     if strategy in PICTURE_STRATEGIES:
         if strategy == "sketch":
             most = sketch.most_patterns(grid.grid)
+        elif strategy == "direct":
+            most = direct.most_patterns(grid.grid)
         else:
             most = adaptive.most_patterns(adaptive.Cells(grid.grid))
         return {
@@ -448,17 +455,34 @@ def _run_pictures(
         progress("scan", done, max(done, planned))
 
     log = PictureLog(store, camera, count)
-    if store.attributes["strategy"] == "sketch":
+    strategy = store.attributes["strategy"]
+    if strategy == "sketch":
         sketched = sketch.scan(grid, log, progress)
         store.update(patterns=log.done)
         sketch.finish(store, sketched)
         if sketched.error > NOTABLE_ERROR:
             _advise_another_scan(grid, sketched.error)
+    elif strategy == "direct":
+        scanned = direct.scan(grid, log, progress)
+        store.update(patterns=log.done)
+        direct.finish(store, grid, scanned, settings.sigmas)
+        _tell_left_out(scanned.left_out)
     else:
         core = adaptive.scan(grid, log, settings.threshold, settings.sigmas)
         store.update(patterns=log.done)
         adaptive.finish(store, grid, core, grid.calibration.mixing, settings.sigmas)
     progress("scan", log.done, log.done)
+
+
+def _tell_left_out(share: float) -> None:
+    """Say how much light a scan of direct light has left out."""
+    level = logging.WARNING if share >= NOTABLE_INDIRECT else logging.INFO
+    logger.log(
+        level,
+        "T is direct light alone: indirect light was left out, %.1f %% of the light of the median "
+        "pixel under white",
+        100 * share,
+    )
 
 
 def _advise_another_scan(grid: ScanGrid, error: float) -> None:

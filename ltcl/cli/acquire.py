@@ -355,7 +355,12 @@ def _report(context: Context, folder: Path, device: str | None) -> Answer:
     context.progress("entries and noise")
     facts = Report.of(project.store)
     T = store.load(project.store, on_dark="mask", device=opened)
-    judgement = verdict(T, sum_deviation=facts.sum_deviation, saturation=facts.saturated)
+    judgement = verdict(
+        T,
+        sum_deviation=facts.sum_deviation,
+        saturation=facts.saturated,
+        left_out=facts.left_out,
+    )
     scan = ScanReport(
         folder=folder,
         store=project.store,

@@ -94,7 +94,7 @@ def _rig_options(
     ] = "srgb",
     bits: Annotated[int, option("Bits per photograph.", min=8, max=16, panel=RIG_PANEL)] = 12,
     strategy: Annotated[
-        Literal["auto", "sketch", "adaptive", "pixel", "block", "hadamard"],
+        Literal["auto", "sketch", "adaptive", "direct", "pixel", "block", "hadamard"],
         option("Strategy of the scan by 'ltcl acquire'.", panel=RIG_PANEL),
     ] = "auto",
     seed: Annotated[int, option("Random seed of the noise.", min=0, panel=RIG_PANEL)] = 0,

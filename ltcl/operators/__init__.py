@@ -6,6 +6,7 @@ from __future__ import annotations
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import (
     Basis,
+    ScaledBasis,
     SubsetBasis,
     multiresolution_order,
     restrict_to_support,
@@ -46,6 +47,7 @@ __all__ = [
     "Parts",
     "Pyramid",
     "RowBlocks",
+    "ScaledBasis",
     "ScaledColumns",
     "Streamed",
     "SubsetBasis",

@@ -197,6 +197,53 @@ class SubsetBasis(Basis):
         )
 
 
+class ScaledBasis(Basis):
+    """W diag(scale), (M, N): a basis W of pictures whose pixels are scaled.
+
+    W^T x is then multiplied by the scale of each pixel, such as the albedo of a surface under
+    light that is smooth.
+
+    Parameters
+    ----------
+    of : Basis
+        W.
+    scale : (N,)
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Hats, ScaledBasis
+    >>> W = ScaledBasis(Hats(ltcl.open_device(), (1, 2)), [2.0, 3.0])
+    >>> (W.T @ numpy.ones(2)).tolist()
+    [2.0, 3.0]
+    """
+
+    def __init__(self, of: Basis, scale: Any) -> None:
+        factors = checks.shape("scale", checks.real("scale", scale), of.shape[1:])
+        self.scale = checks.finite("scale", factors)
+        self.of = of
+        self._scale = of.device.upload(self.scale)
+        super().__init__(of.device, of.grid, of.name, of.shape[0], of, self._scale)
+        self.orthonormal = False
+        self.isometric = False
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of W, and the scale."""
+        return {**self.of.to_arrays(), "scale": self.scale}
+
+    def _transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> None:
+        if transpose:
+            product = self.device.empty(out.shape)
+            self.of._queue_product(x, product, PLAIN, True)
+            vectors.scale_rows(self._scale, product, product)
+            vectors.axpby(a, product, b, y if b else product, out)
+        else:
+            scaled = vectors.scale_rows(self._scale, x, x.like())
+            self.of._queue_product(scaled, out, Epilogue(a, b, y), False)
+
+
 def _count_coefficients(grid: tuple[int, int], of: Basis | None) -> int:
     """The pixels of a grid, or the coefficients of W."""
     if of is None:

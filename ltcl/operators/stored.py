@@ -27,7 +27,7 @@ from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators.base import Operator
-from ltcl.operators.bases import Basis, SubsetBasis
+from ltcl.operators.bases import Basis, ScaledBasis, SubsetBasis
 from ltcl.operators.compressed import Compressed
 from ltcl.operators.csr import CSR, Pattern, plain_arrays
 from ltcl.operators.dense import Dense
@@ -65,19 +65,26 @@ def multiscale_arrays(
     grid: tuple[int, int],
     cores: Sequence[scipy.sparse.csr_array],
     diagonals: np.ndarray,
+    scales: np.ndarray | None = None,
 ) -> Arrays:
-    """The arrays of S = I + R, R = C W, made without a device.
+    """The arrays of S = I + R, R = C W or R = diag(scale) W^T C W, made without a device.
 
     `sums` names W, the sums at all scales of a `grid`: "pyramid" or "hats".
 
-    `cores` are C, (N, sums), and `diagonals`, (channels, N), are those of R.
+    `cores` are C, (N, sums), or (sums, sums) with `scales`, (channels, N); `diagonals`,
+    (channels, N), are those of R.
     """
-    arrays = {"basis_0.name": np.array(sums), "basis_0.grid": np.array(grid)}
+    described = {"name": np.array(sums), "grid": np.array(grid)}
+    arrays = _prefixed("basis_0", described)
     for number, (C, diagonal) in enumerate(zip(cores, diagonals, strict=True)):
+        out = NO_BASIS
+        if scales is not None:
+            out = number + 1
+            arrays |= _prefixed(f"basis_{out}", {**described, "scale": scales[number]})
         R = {
             "kind": np.array("compressed"),
             "error": np.array(0.0),
-            "out": np.array(NO_BASIS),
+            "out": np.array(out),
             "into": np.array(0),
             "diagonal": diagonal,
         }
@@ -206,6 +213,8 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
         W = Wavelet(device, grid, name, np.asarray(levels).tolist())
     if "places" in arrays:
         return SubsetBasis(device, grid, arrays["places"], W)
+    if W is not None and "scale" in arrays:
+        return ScaledBasis(W, arrays["scale"])
     if W is None:
         raise InputError(f"the arrays describe {name}, which is no basis")
     return W

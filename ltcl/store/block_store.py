@@ -16,9 +16,9 @@ import os
 import re
 import shutil
 from collections import ChainMap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -53,8 +53,18 @@ CRC32C_BYTES = 4
 EXTRA = "extra."
 COLUMNS = re.compile(r"columns_(\d)\.(\d+)")
 
+# Rows of a block of a sparse T, whose rows have few entries.
+SPARSE_BLOCK_ROWS = 1 << 16
+
 # Of channel, first row, rows (rows, N) and variance of their entries; returns the last two changed.
 RowChange = Callable[[int, int, scipy.sparse.csr_array, np.ndarray], tuple[Any, Any]]
+
+
+class SparseMatrix(NamedTuple):
+    """T of one channel, its indices sorted, and the variance of its entries, (nnz,)."""
+
+    matrix: scipy.sparse.csr_array
+    variance: np.ndarray
 
 
 class BlockStore:
@@ -223,18 +233,22 @@ class BlockStore:
         sigmas: float = 0.0,
         change: RowChange | None = None,
         compressed: CompressedRecord | None = None,
+        matrices: Sequence[SparseMatrix] | None = None,
         memory: int = 1 << 28,
     ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
         The diagonal is a first bounce where it is above 0 by `sigmas` standard deviations. `change`
         of channel, first row, rows (rows, N) and the variance of their entries returns the last two
-        changed. A transport `compressed` takes the place of all columns. `memory` is about how many
-        bytes are used.
+        changed. A transport `compressed` takes the place of all columns, or `matrices` do, T (M, M)
+        of each channel with M pixels of the camera. `memory` is about how many bytes are used.
         """
         with self._writing(finished=True):
             if not self.final:
-                self._finish(sigmas, change, compressed, memory)
+                if matrices is not None:
+                    self._finish_matrices(sigmas, matrices)
+                else:
+                    self._finish(sigmas, change, compressed, memory)
         self._open()
         shutil.rmtree(self._root / "log", ignore_errors=True)
 
@@ -264,6 +278,23 @@ class BlockStore:
                 state=self.attributes,
                 sigmas=sigmas,
             )
+        write_final(self.path, layout, self.provenance, content)
+
+    def _finish_matrices(self, sigmas: float, matrices: Sequence[SparseMatrix]) -> None:
+        """Write the files of the final store of a sparse T."""
+        pixels = self.layout.shape[0]
+        layout = StoreLayout(
+            (pixels, pixels),
+            self.layout.camera_grid or self.layout.grid,
+            channels=len(matrices),
+            block_rows=min(pixels, SPARSE_BLOCK_ROWS),
+        )
+        content = FinalContent(
+            rows=_blocks_of_matrices(layout, matrices),
+            extras=_StoredExtras(self),
+            state=self.attributes,
+            sigmas=sigmas,
+        )
         write_final(self.path, layout, self.provenance, content)
 
     def verify(self) -> None:
@@ -488,6 +519,19 @@ def _record_content(record: StoreRecord) -> tuple[StoreLayout, FinalContent]:
                 yield PlacedBlock(channel, number, block)
 
     return layout, FinalContent(rows=rows(), extras=extras, state={})
+
+
+def _blocks_of_matrices(
+    layout: StoreLayout, matrices: Sequence[SparseMatrix]
+) -> Iterator[PlacedBlock]:
+    """The blocks of rows of a sparse T."""
+    for channel, (matrix, variance) in enumerate(matrices):
+        for number in range(layout.blocks()):
+            start, stop = layout.span(number)
+            first, last = matrix.indptr[[start, stop]]
+            rows = scipy.sparse.csr_array(matrix[start:stop])
+            block = check_block(rows, variance[first:last], layout.block_shape(number))
+            yield PlacedBlock(channel, number, block)
 
 
 def compressed_content(record: CompressedRecord) -> tuple[StoreLayout, FinalContent]:

@@ -59,18 +59,20 @@ def arrays_of_scan(
     first_bounce: np.ndarray,
     mixing: np.ndarray | None = None,
     sums: str = PYRAMID,
+    scales: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """The arrays of T = I + C W of each channel, C (N, sums) between pixels and the sums W.
 
-    `diagonals` are those of C W, (channels, N); `first_bounce` is like them. `sums` is
-    the name of W: "pyramid" or "hats".
+    With `scales`, (channels, N), of T = I + diag(scale) W^T C W, C (sums, sums). `diagonals` are
+    those of T - I, (channels, N); `first_bounce` is like them. `sums` is the name of W: "pyramid"
+    or "hats".
     """
     arrays = {"grid": np.array(grid), "first_bounce": first_bounce}
     if mixing is not None:
         arrays["mixing"] = np.asarray(mixing)
     for channel in range(len(cores)):
         arrays[f"columns_{channel}"] = np.ones(diagonals.shape[1])
-    return arrays | stored_operators.multiscale_arrays(sums, grid, cores, diagonals)
+    return arrays | stored_operators.multiscale_arrays(sums, grid, cores, diagonals, scales)
 
 
 def matrices_from_arrays(

@@ -22,7 +22,7 @@ from ltcl.acquisition.agreement import find_deviation, sample
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.radiance import valid_share
 from ltcl.acquisition.rigs.shooting_list import Shot
-from ltcl.acquisition.scanning.plan import is_sketched
+from ltcl.acquisition.scanning.plan import is_sparing
 from ltcl.errors import LtclError
 from ltcl.store import BlockStore, load
 from ltcl.viewer import scan_files
@@ -116,7 +116,7 @@ class Scan(ViewerScene):
             facts["frames"],
             aligned=facts["aligned"],
             by_hand=facts["by_hand"],
-            sparing=is_sketched(settings.strategy, facts["grid"]),
+            sparing=is_sparing(settings.strategy, facts["grid"]),
         )
         height, width = facts["grid"]
         self.pixels = height * width

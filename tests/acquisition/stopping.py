@@ -29,6 +29,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "block": {"grid": (8, 8), "channels": 3, "block": 2},
     "adaptive": {"grid": (8, 8)},
     "sketch": {"grid": (8, 8)},
+    "direct": {"grid": (8, 8)},
 }
 """Rigs and settings by strategy."""
 

@@ -133,7 +133,7 @@ def test_a_photograph_of_another_kind_is_not_kept(tmp_path: Path) -> None:
     assert calibration_photographs(path) == 29
 
 
-@pytest.mark.parametrize("strategy", ["pixel", "hadamard", "adaptive", "sketch"])
+@pytest.mark.parametrize("strategy", ["pixel", "hadamard", "adaptive", "sketch", "direct"])
 def test_some_black_pixels_are_masked(strategy: str) -> None:
     """Their noise is no first bounce: compensation goes on as if they were not there."""
     black = [3, 17]
@@ -222,7 +222,7 @@ class Disk:
 
 
 @pytest.mark.rare
-@pytest.mark.parametrize("strategy", ["pixel", "adaptive", "sketch"])
+@pytest.mark.parametrize("strategy", ["pixel", "adaptive", "sketch", "direct"])
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str) -> None:
     """It is full at random places of all stages; each time there is room again later."""
     path = tmp_path / "T.zarr"

@@ -54,6 +54,7 @@ def committed(path: Path) -> tuple[bool, bool, int]:
         "pixel",
         "adaptive",
         "sketch",
+        "direct",
         pytest.param("hadamard", marks=pytest.mark.slow),
         pytest.param("block", marks=pytest.mark.slow),
     ],

@@ -203,7 +203,7 @@ def test_what_cannot_be_updated_is_refused_before_the_first_photograph(
     camera: Any = small_rig()
     camera.photograph = None
     new = tmp_path / "new.zarr"
-    with pytest.raises(InputError, match="'adaptive', in sums of pyramid; it must be a sketch"):
+    with pytest.raises(InputError, match="'adaptive'; it must be one of sketch, pixel"):
         ltcl.update(camera, small, store=new)
     with pytest.raises(InputError, match=r"store is .*, which is the scan"):
         ltcl.update(camera, small, store=small)

@@ -91,7 +91,7 @@ def test_plans_before_and_after_the_calibration(program, simulated, acquired):
     assert not (simulated / "transport.zarr").exists()
     lines = program("acquire", "plan", simulated).out.splitlines()
     for report in (before, after):
-        assert {*report["plans"]} == {line.split()[0] for line in lines[4:9]}
+        assert {*report["plans"]} == {line.split()[0] for line in lines[4:10]}
         assert report["auto"] in report["plans"]
         assert report["asked_for"] == "pixel"
         assert report["plans"]["block"]["grid"] == [2, 4]

@@ -31,6 +31,7 @@ from ltcl.operators import (
     Operator,
     Pyramid,
     RowBlocks,
+    ScaledBasis,
     ScaledColumns,
     SubsetBasis,
     Tiles,
@@ -96,6 +97,8 @@ def bases_and_compressed(device: Device) -> dict[str, Pair]:
     core = gallery.sparse(44, 44)
     C = core.toarray()[:PIXELS, :PIXELS]
     C9 = core.toarray()[:9, :9]
+    scale = np.linspace(0.2, 1.5, PIXELS)
+    scaled = ScaledBasis(pyramid, scale)
     large = CSR(device, core)
     middle = CSR(device, scipy.sparse.csr_array(C))
     small = CSR(device, scipy.sparse.csr_array(C9))
@@ -111,6 +114,8 @@ def bases_and_compressed(device: Device) -> dict[str, Pair]:
         "two bases": (Compressed(middle, permutation, wavelet), P.T @ C @ W),
         "more than pixels": (Compressed(large, pyramid, pyramid), Q.T @ core @ Q),
         "fewer than pixels": (Compressed(small, some, some), V.T @ C9 @ V),
+        "scaled": (scaled, Q * scale),
+        "scaled rows": (Compressed(large, scaled, pyramid), (Q * scale).T @ core @ Q),
     }
 
 
@@ -132,7 +137,7 @@ NAMES = (
     "dense, csr, transposed dense, transposed csr, host, scaled columns, I + R, I - A, shifted, "
     "shifted where lit, I + transposed, I + (A - I), wavelet, order, pyramid, hats, "
     "wavelet and order, both sides, rows, columns, two bases, more than pixels, fewer than pixels, "
-    "coupled, mixed"
+    "scaled, scaled rows, coupled, mixed"
 )
 
 

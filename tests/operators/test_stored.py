@@ -19,6 +19,7 @@ from ltcl.operators import (
     Hats,
     IdentityPlus,
     Pyramid,
+    ScaledBasis,
     ScaledColumns,
     SubsetBasis,
     Wavelet,
@@ -41,6 +42,7 @@ SYSTEMS = (
     "pixels",
     "pyramid",
     "hats",
+    "scaled",
     "two",
 )
 
@@ -83,6 +85,10 @@ def make_system(device: Device, name: str, form: str = "csr") -> IdentityPlus:
     if name in ("pyramid", "hats"):
         P = Pyramid(device, GRID) if name == "pyramid" else Hats(device, GRID)
         return IdentityPlus(between(P, P, error=0.1, diagonal=np.arange(N)))
+    if name == "scaled":
+        P = Pyramid(device, GRID)
+        out = ScaledBasis(P, np.linspace(0.2, 1.0, N))
+        return IdentityPlus(between(out, P, error=0.1, diagonal=np.arange(N)))
     return IdentityPlus(between(W, C), solution_error=np.inf)
 
 

@@ -67,6 +67,24 @@ def test_any_shape_in_any_blocks_and_memory(
     assert "log" not in os.listdir(path)
 
 
+def test_matrices_take_the_place_of_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """T of M pixels, in several blocks of rows, from a store of M x K pictures."""
+    monkeypatch.setattr(block_store, "SPARSE_BLOCK_ROWS", 5)
+    store = fill(
+        make(tmp_path / "T.zarr", shape=(12, 7), grid=(1, 7), camera_grid=(3, 4)), final=False
+    )
+    T = transport(12, 12, 0)
+    store.finalize(sigmas=0.0, matrices=[block_store.SparseMatrix(T, variance(T).data)])
+    store.verify()
+    assert (store.layout.shape, store.layout.grid) == ((12, 12), (3, 4))
+    np.testing.assert_array_equal(rows(store, 0), T.toarray())
+    spread: list[Any] = [store.block(0, b).variance for b in range(store.layout.blocks())]
+    np.testing.assert_array_equal(np.concatenate(spread), variance(T).data)
+    np.testing.assert_array_equal(store.extra("first_bounce")[0], np.maximum(T.diagonal(), 0.0))
+
+
 def test_rows_are_changed_once_even_if_all_is_asked_for_again(tmp_path: Path) -> None:
     store = fill(make(tmp_path / "T.zarr"), with_variance=True, final=False)
     errors = iter([None, None, OSError("no more")])

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import (
     PRIOR_STEP,
@@ -25,7 +24,6 @@ from ltcl.acquisition.estimation.regression import (
 )
 from ltcl.acquisition.estimation.windows import (
     Windows,
-    functions_of_row,
     hat_matrix,
     sums_under_hats,
 )
@@ -65,7 +63,6 @@ class Estimator:
         solves: int = 1,
     ) -> None:
         self.grid = grid
-        check_memory(grid, channels)
         self.windows = Windows.of(grid)
         self.W = hat_matrix(grid)
         self.W_squared: Any = scipy.sparse.csr_array(self.W.multiply(self.W))
@@ -119,7 +116,7 @@ class Estimator:
         channels = []
         for channel in range(self.channels):
             sums = self._sums(patterns, channel)
-            channels.append((self._core(channel) @ sums[:-1]).T)
+            channels.append((self.coefficients(channel) @ sums[:-1]).T)
         return np.stack(channels, axis=2)
 
     @property
@@ -138,17 +135,18 @@ class Estimator:
     def scale_of_variance(self, patterns: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Factors of the variances of all entries, under which T p errs as it did, (channels,).
 
-        `left` is what T left of photographs, (frames, N, channels). Errors of entries in a row go
-        together, which their variances do not tell.
+        `left` are the squares that T left of photographs of patterns, summed up over them and all
+        pixels, (channels,). Errors of entries in a row go together, which their variances do not
+        tell.
         """
         scales = []
         for channel in range(self.channels):
             prior = self.priors[channel]
             squares = (patterns @ self.mixing[channel]) ** 2
             sums = self.W_squared @ squares.T
-            expected = (self._variances(channel) @ sums).sum()
+            expected = (self.variances(channel) @ sums).sum()
             noise = len(patterns) * (prior.noise * prior.light**2).sum()
-            measured = max((left[:, :, channel] ** 2).sum() - noise, 0.0)
+            measured = max(left[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
 
@@ -165,8 +163,8 @@ class Estimator:
 
     def _entries(self, channel: int, scale: float) -> Iterator[tuple[np.ndarray, ...]]:
         """Rows, columns, light and variances of the entries of T that `Noise.fit` looks at."""
-        C: Any = self._core(channel)
-        V: Any = self._variances(channel) * scale
+        C: Any = self.coefficients(channel)
+        V: Any = self.variances(channel) * scale
         pixels = C.shape[0]
         step = noise_step((pixels, pixels))
         by_column = self.W.tocsc()
@@ -185,7 +183,7 @@ class Estimator:
         first_bounce = []
         own = np.arange(len(self.windows.nodes))
         for channel in range(self.channels):
-            C = self._core(channel)
+            C = self.coefficients(channel)
             products: Any = C.multiply(self.W.T)
             diagonals.append(products.sum(axis=1) - 1.0)
             identity = scipy.sparse.eye_array(len(own), self.windows.absent, format="csr")
@@ -206,11 +204,11 @@ class Estimator:
         variance = np.where(is_own, rows.variance, 0.0).sum(axis=1)
         return direct, variance
 
-    def _core(self, channel: int) -> scipy.sparse.csr_array:
+    def coefficients(self, channel: int) -> scipy.sparse.csr_array:
         """C (N, nodes) of T = C W."""
         return self._in_nodes(channel, self.rows[channel].mean)
 
-    def _variances(self, channel: int) -> scipy.sparse.csr_array:
+    def variances(self, channel: int) -> scipy.sparse.csr_array:
         """Variances of C, in the same pattern."""
         return self._in_nodes(channel, self.rows[channel].variance)
 
@@ -234,7 +232,7 @@ class Estimator:
         """The mixing that explains the photographs best, given the rows."""
         found = np.empty_like(self.mixing)
         for channel in range(self.channels):
-            C = self._core(channel)
+            C = self.coefficients(channel)
             answers = []
             for colour in range(3):
                 sums = sums_under_hats(self.W, list(pairs.patterns[:, :, colour]))
@@ -251,13 +249,6 @@ class Estimator:
         if self._progress is not None:
             expected = self._expected * self.channels
             self._progress("fit", self._done, max(self._done, expected))
-
-
-def check_memory(grid: tuple[int, int], channels: int) -> None:
-    """Refuse a grid whose rows do not fit the memory of the host."""
-    height, width = grid
-    numbers = height * width * functions_of_row(grid) * (channels + 1)
-    checks.fits_host(f"estimating T of {height} x {width} pixels", numbers * ROW_BYTES)
 
 
 def _light(patterns: np.ndarray, photographs: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@
     view        which projector pixel a camera pixel sees
     windows     the functions in which each row of T is written
     estimator   T in the functions of `windows`, by the `regression` of its rows
+    refinement  T of many pixels: far light at few nodes of `hats`, `near` light at every pixel
 
 Some pairs are held out, the error of T is that of their photographs; then they are used, too.
 """
@@ -20,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs, gains
+from ltcl.acquisition.estimation.refinement import make_estimator
 from ltcl.acquisition.estimation.view import find_view
 from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.errors import InputError, InputTypeError
@@ -213,7 +214,7 @@ def _fit(
 
     # 1. The prior and the colours, from the pairs that are not held out.
     # Rows are solved for those that judge, and at last for all pairs.
-    estimator = Estimator(pairs.grid, pairs.channels, mixing, progress, solves=2)
+    estimator = make_estimator(pairs.grid, pairs.channels, mixing, progress, solves=2)
     estimator.learn(pairs.select(~is_judge))
     explained = estimator.explain(pairs.patterns)
     pairs.check_partners(explained)
@@ -232,7 +233,8 @@ def _fit(
     errors = _norms(left) / np.maximum(_norms(steady.photographs[judges]), np.finfo(float).tiny)
 
     error = float(np.sqrt(np.mean(errors**2)))
-    scales = estimator.scale_of_variance(pairs.patterns[judges], left)
+    squares = (left**2).sum(axis=(0, 1))
+    scales = estimator.scale_of_variance(pairs.patterns[judges], squares)
 
     # 3. The transport, from all pairs.
     estimator.solve(steady)

@@ -83,7 +83,7 @@ class Pairs:
         """1 or 3."""
         return self.photographs.shape[2]
 
-    def select(self, chosen: np.ndarray) -> Self:
+    def select(self, chosen: np.ndarray | slice) -> Self:
         """Some of the pairs."""
         variance = None if self.variance is None else self.variance[chosen]
         return replace(

@@ -175,6 +175,46 @@ def _solve(
     return deviation * mean, deviation**2 * variance, misfit, surprise
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChannelRows:
+    """Coefficients of rows for several channels with the same patterns.
+
+    `mean` is (rows, q, channels), `variance` (rows, q), `misfit` the mean square of what they leave
+    relative to the noise, (rows,), by degrees of freedom, over all channels.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    misfit: np.ndarray
+
+
+def solve_channels(
+    B: np.ndarray, pictures: np.ndarray, deviation: np.ndarray, noise: np.ndarray
+) -> ChannelRows:
+    """Rows of all channels at once, by one system for each row.
+
+    B is (rows, q, patterns), pictures (rows, patterns, channels), `deviation` V^1/2 (rows, q),
+    `noise` (rows, patterns).
+    """
+    whitening = 1.0 / np.sqrt(noise)
+    S = B * deviation[:, :, None] * whitening[:, None, :]
+    y = pictures * whitening[:, :, None]
+    q = S.shape[1]
+    transposed = S.transpose(0, 2, 1)
+    covariance = np.linalg.inv(np.eye(q) + S @ transposed)
+    mean = covariance @ (S @ y)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    left = y - transposed @ mean
+    known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
+    freedom = np.maximum(known - (q - variance.sum(axis=1)), 1.0)
+    squares = (left**2).sum(axis=1).mean(axis=1)
+    return ChannelRows(
+        mean=deviation[:, :, None] * mean,
+        variance=deviation**2 * variance,
+        misfit=squares / freedom,
+    )
+
+
 def _posterior(S: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean and variances, (rows, q), of coefficients of unit variance that y shows.
 

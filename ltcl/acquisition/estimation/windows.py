@@ -56,13 +56,13 @@ def hat_matrix(grid: tuple[int, int]) -> scipy.sparse.csr_array:
     """W (nodes, N) of `ltcl.operators.Hats`: the hats of all levels on the pixels."""
     levels = []
     for level, (height, width) in enumerate(hat_levels(grid)):
-        down = _hats_of_side(grid[0], height, 2**level)
-        across = _hats_of_side(grid[1], width, 2**level)
+        down = hats_of_side(grid[0], height, 2**level)
+        across = hats_of_side(grid[1], width, 2**level)
         levels.append(scipy.sparse.kron(down, across, format="csr"))
     return scipy.sparse.csr_array(scipy.sparse.vstack(levels, format="csr"))
 
 
-def _hats_of_side(pixels: int, nodes: int, width: int) -> scipy.sparse.csr_array:
+def hats_of_side(pixels: int, nodes: int, width: int) -> scipy.sparse.csr_array:
     """Hats along one side, (nodes, pixels)."""
     distance = np.abs(np.arange(pixels) / width - np.arange(nodes)[:, None])
     return scipy.sparse.csr_array(np.maximum(1.0 - distance, 0.0))

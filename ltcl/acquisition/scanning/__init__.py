@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Scanning T: the order in which pixels are lit, and T from the pictures.
 
-columns, adaptive, sketch
+columns, adaptive, sketch, direct
                      strategies: batches of columns; cells that are divided where needed; few
-                     patterns, from which T is estimated
+                     patterns, from which T is estimated; fine patterns, for direct light alone
 pictures             pictures of patterns on the pixels of the scan; `picture_log` keeps them
 plan, pace, report   photographs, time and errors before a scan; its result after it
 """

@@ -90,11 +90,13 @@ class PictureLog:
         layout = self._store.layout
         shape = layout.block_shape(batch, "columns")
         _, pixels = shape
-        row, column = np.indices((len(pictures), pixels)).reshape(2, -1)
+        column = np.tile(np.arange(pixels, dtype=np.int32), len(pictures))
+        # Rows of a batch that is not full are empty.
+        ends = np.minimum(np.arange(shape[0] + 1), len(pictures)) * pixels
         for channel in range(layout.channels):
             value = np.concatenate([picture.value[channel] for picture in pictures])
             variance = np.concatenate([picture.variance[channel] for picture in pictures])
-            matrix = scipy.sparse.csr_array((value, (row, column)), shape=shape)
+            matrix = scipy.sparse.csr_array((value, column, ends.astype(np.int32)), shape=shape)
             self._store.write(channel, batch, matrix, variance)
 
     def _is_written(self, batch: int) -> bool:

@@ -13,7 +13,7 @@ seconds has the variance V(L) = variance(L t) / t^2 of the noise model; several 
 A picture T p of random light p in [0, 1] sums a row up, which is corrected to the sum that white
 shows. Of the variances v of a row e^2 = (sum v - sum v^2 / sum v) / 3 / (d + g)^2 is left, relative
 to T p. A scan by cells has about K = 3 log4 N of them with V(g / K + a) for all of p, and half its
-threshold is spread.
+threshold is spread. A scan of direct light leaves all of g out.
 """
 
 from __future__ import annotations
@@ -27,18 +27,20 @@ import numpy as np
 
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.estimation.neighbours import OFFSETS
+from ltcl.acquisition.estimation.refinement import numbers_of_row
 from ltcl.acquisition.estimation.windows import functions_of_row
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiance import valid_values
 from ltcl.acquisition.radiometry import NoiseModel
-from ltcl.acquisition.scanning import adaptive, columns, sketch
+from ltcl.acquisition.scanning import adaptive, columns, direct, sketch
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE
 from ltcl.acquisition.settings import STRATEGIES, ScanSettings
 
 # Pixels from which one at a time, or as many patterns, take too long.
 MAX_SINGLE_PIXELS = 2048
-# Pixels from which "auto" makes no sketch, which takes a millisecond and 30 kB for each of them.
-MAX_SKETCHED_PIXELS = 1 << 15
+# Pixels from which "auto" makes no sketch, whose pictures are all in memory.
+MAX_SKETCHED_PIXELS = 1 << 18
 # Indirect share of a camera pixel's light under white, unless it is measured: a white corner.
 INDIRECT_SHARE = 0.25
 # Relative error of T p by the calibration: response and white.
@@ -76,7 +78,7 @@ class Plan:
     grid : tuple of int
         Pixels (h, w) of T.
     patterns : int
-        Patterns of the scan, for "adaptive" at most.
+        Patterns of the scan, for "adaptive" and "direct" at most.
     calibration : int
         Photographs of the calibration.
     photographs : int
@@ -161,7 +163,7 @@ def plans(
     frames, aligned, by_hand
         What the number of these depends on, as in `calibrate.expected_photographs`.
     fixed_exposures : bool
-        A sketch takes all exposures, too; else the first one alone.
+        Strategies of few patterns take all exposures, too; else the first one alone.
     megapixels : float, optional
         Pixels of the camera in millions; None: not known.
     pace : float, optional
@@ -181,20 +183,22 @@ def plans(
     result = {}
     for strategy in STRATEGIES:
         pixels = grid
-        is_sketch = strategy == "sketch"
+        sparing = is_sparing(strategy, grid)
         times = all_times
-        if is_sketch and not fixed_exposures:
+        if sparing and not fixed_exposures:
             times = all_times[:1]
         merged = _MergedNoise(noise, light.ambient, times)
         setup = calibration
         if setup is None:
             setup = expected_photographs(
-                grid, channels, frames, aligned=aligned, by_hand=by_hand, sparing=is_sketch
+                grid, channels, frames, aligned=aligned, by_hand=by_hand, sparing=sparing
             )
         if strategy == "block":
             pixels = Blocks(grid, min(block, max(grid))).grid
-        if is_sketch:
+        if strategy == "sketch":
             outlook = _sketch_outlook(grid, merged, light)
+        elif strategy == "direct":
+            outlook = _direct_outlook(grid, merged, light)
         elif strategy == "adaptive":
             outlook = _adaptive_outlook(grid, threshold, merged, light)
         else:
@@ -249,8 +253,22 @@ def _sketch_outlook(grid: tuple[int, int], merged: _MergedNoise, light: Light) -
     return _Outlook(
         patterns=patterns,
         batches=-(-patterns // BATCH_SIZE),
-        entries=math.prod(grid) * (patterns + functions),
+        entries=math.prod(grid) * (patterns + numbers_of_row(grid)),
         variance=noise + (SKETCH_ERROR * white) ** 2,
+    )
+
+
+def _direct_outlook(grid: tuple[int, int], merged: _MergedNoise, light: Light) -> _Outlook:
+    """A scan of direct light, each of whose pictures has half of the light."""
+    patterns = direct.SHIFTS + direct.JUDGES
+    neighbours = len(OFFSETS)
+    half = 0.5 * (light.direct + light.indirect)
+    noise = neighbours / direct.SHIFTS * merged.variance(half)
+    return _Outlook(
+        patterns=patterns,
+        batches=-(-patterns // BATCH_SIZE),
+        entries=math.prod(grid) * (patterns + neighbours),
+        variance=noise + light.indirect**2,
     )
 
 
@@ -331,6 +349,11 @@ def is_sketched(strategy: str, grid: tuple[int, int]) -> bool:
     if strategy == "auto":
         return MAX_SINGLE_PIXELS < math.prod(grid) <= MAX_SKETCHED_PIXELS
     return strategy == "sketch"
+
+
+def is_sparing(strategy: str, grid: tuple[int, int]) -> bool:
+    """True if a scan takes few patterns, half lit, after a calibration of few photographs."""
+    return strategy == "direct" or is_sketched(strategy, grid)
 
 
 def choose(plans: dict[str, Plan]) -> tuple[str, str]:

@@ -46,11 +46,15 @@ class Report:
     noise_direct, noise_sum : float
         Median relative standard deviation of the first bounce, and of row sums.
     sum_deviation : float
-        Relative deviation (rms) of sums of measured columns from white; NaN of a sketch or an
-        adaptive scan.
+        Relative deviation (rms) of sums of measured columns from white; NaN for a scan that takes
+        no columns.
     judged_error, judged_bound : float
-        Relative error of T p for the pictures that judge a sketch, to which it was not fitted; and
-        what that of others is below, with a probability of 95 %. NaN of another scan.
+        Relative error of T p for the pictures that judge a sketch, to which it was not fitted, or
+        of the direct light of those that judge a scan of it; and what that of others is below, with
+        a probability of 95 %. NaN for another scan.
+    left_out : float
+        Indirect light that a scan of direct light left out, relative to all light of the median
+        pixel under white; NaN for another scan.
 
     Examples
     --------
@@ -83,6 +87,7 @@ class Report:
     sum_deviation: float
     judged_error: float = math.nan
     judged_bound: float = math.nan
+    left_out: float = math.nan
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Report:
@@ -105,11 +110,13 @@ class Report:
             sharpness = grid.sharpness.own
             blur = grid.sharpness.blur
         sum_deviation = math.nan
-        if scan.layout.kind != "compressed":
+        strategy = scan.attributes["strategy"]
+        is_direct = strategy == "direct"
+        if scan.layout.kind != "compressed" and not is_direct:
             sum_deviation = columns.deviation(scan.extra(columns.ROW_SUMS), white)
-        judgement = scan.attributes.get("sketch", {})
+        judgement = scan.attributes.get("direct" if is_direct else "sketch", {})
         return cls(
-            strategy=scan.attributes["strategy"],
+            strategy=strategy,
             why=scan.attributes["why"],
             grid=scan.layout.grid,
             channels=len(first_bounce),
@@ -127,8 +134,9 @@ class Report:
             noise_direct=_relative_noise(entries.variance, first_bounce),
             noise_sum=_relative_noise(white.variance, white.value, white.known),
             sum_deviation=sum_deviation,
-            judged_error=judgement.get("error", math.nan),
-            judged_bound=judgement.get("bound", math.nan),
+            judged_error=_number(judgement.get("error")),
+            judged_bound=_number(judgement.get("bound")),
+            left_out=_number(judgement.get("left_out")),
         )
 
     def to_json(self) -> str:
@@ -163,10 +171,18 @@ class Report:
                 f"{self.sharpness:.0%} of a pixel is its own light: "
                 f"relative error of fine patterns {self.blur:.1%}"
             )
-        if not math.isnan(self.judged_error):
+        if not math.isnan(self.left_out):
             lines.append(
-                f"error of T p {self.judged_error:.2%} for pictures that it was not fitted to; for "
-                f"others at most {self.judged_bound:.2%}, with a probability of 95 %"
+                "T is direct light alone: indirect light is left out, "
+                f"{self.left_out:.1%} of the light of the median pixel under white"
+            )
+        if not math.isnan(self.judged_error):
+            judged = "T p"
+            if self.strategy == "direct":
+                judged = "the direct light"
+            lines.append(
+                f"error of {judged} {self.judged_error:.2%} for pictures that it was not fitted "
+                f"to; for others at most {self.judged_bound:.2%}, with a probability of 95 %"
             )
         if not math.isnan(self.sum_deviation):
             photographs = f"single {self.strategy}s"
@@ -177,6 +193,11 @@ class Report:
                 f"{100 * self.sum_deviation:.2g} % (good: below 0.5 %, acceptable: below 3 %)"
             )
         return "\n".join(lines)
+
+
+def _number(value: float | None) -> float:
+    """A number from JSON, which has no NaN."""
+    return math.nan if value is None else float(value)
 
 
 def _check_finished(scan: BlockStore) -> None:

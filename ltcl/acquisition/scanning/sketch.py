@@ -26,8 +26,10 @@ import scipy.stats
 
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
+from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
-from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, ScanGrid
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore, CompressedRecord
 
@@ -191,28 +193,28 @@ def scan(
     """
     shown = [*patterns(grid.grid), *judges(grid.grid)]
     log.announce(shown)
-    pictures: list[Picture] = []
-    for start in range(0, len(shown), BATCH_SIZE):
-        pictures += log.take(shown[start : start + BATCH_SIZE])
-    pairs = _pairs(grid, shown, pictures)
-    is_judge = np.arange(len(pairs)) >= len(pairs) - JUDGES
+    pairs = _photograph(grid, shown, log)
+    fitted = slice(0, len(pairs) - JUDGES)
+    judging = slice(len(pairs) - JUDGES, None)
     mixing = grid.calibration.mixing
-    estimator = Estimator(grid.grid, grid.channels, _known_mixing(mixing, grid.channels), progress)
-    estimator.learn(pairs.select(~is_judge))
-    _check_surprise(estimator.surprise)
-    return _judged(estimator, pairs.select(is_judge))
+    known_mixing = _known_mixing(mixing, grid.channels)
+    estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
+    estimator.learn(pairs.select(fitted))
+    check_surprise(estimator.surprise)
+    return _judged(estimator, pairs.select(judging))
 
 
-def _check_surprise(surprise: np.ndarray) -> None:
+def check_surprise(surprise: np.ndarray, most: float = MAX_SURPRISE_RATIO) -> None:
     """Refuse a picture that all others contradict, such as one of another lamp or exposure.
 
-    `surprise` is that of the estimator, white first, which no pattern is like.
+    `surprise` is that of each picture, (frames,), white first, which no pattern is like; `most` is
+    the largest one relative to that of the median picture.
     """
     of_patterns = surprise[1:]
     if not len(of_patterns):
         return
     number = int(of_patterns.argmax())
-    if of_patterns[number] > MAX_SURPRISE_RATIO * np.median(of_patterns):
+    if of_patterns[number] > most * np.median(of_patterns):
         raise ScanRefused(
             f"the picture of pattern {number + 1} of {len(of_patterns)} contradicts those of all "
             "others: another exposure, another light, or something moved; the scan must be repeated"
@@ -225,62 +227,63 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
     return mixing
 
 
-def _pairs(grid: ScanGrid, shown: list[np.ndarray], pictures: list[Picture]) -> Pairs:
+def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
     """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
-    white = grid.white
-    seen = [white, *pictures]
-    variances = [white.variance]
-    for picture in pictures:
-        variances.append(np.where(picture.known, picture.variance + grid.ambient, UNKNOWN))
-    lit = np.stack([np.ones(grid.grid, np.float32), *shown])
-    patterns_of_channels = np.repeat(lit.reshape(len(lit), -1, 1), grid.channels, axis=2)
+    frames = len(shown) + 1
+    shape = (frames, len(grid.seen), grid.channels)
+    photographs = scratch_array(shape, np.float32)
+    variance = scratch_array(shape, np.float32)
+    photographs[0] = grid.white.value.T
+    variance[0] = grid.white.variance.T
+    frame = 1
+    for start in range(0, len(shown), BATCH_SIZE):
+        for picture in log.take(shown[start : start + BATCH_SIZE]):
+            photographs[frame] = picture.value.T
+            noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
+            variance[frame] = noise.T
+            frame += 1
+    lit = np.ones((frames, *grid.grid), np.uint8)
+    for number, pattern in enumerate(shown):
+        lit[number + 1] = pattern
     return Pairs(
         grid=grid.grid,
         camera_grid=grid.grid,
-        patterns=patterns_of_channels.astype(np.float64),
-        photographs=np.stack([picture.value.T for picture in seen]).astype(np.float64),
-        variance=np.stack([variance.T for variance in variances]).astype(np.float64),
+        patterns=np.broadcast_to(lit.reshape(frames, -1, 1), shape),
+        photographs=photographs,
+        variance=variance,
     )
 
 
-def _judged(estimator: Estimator, pairs: Pairs) -> Sketch:
+def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
-    variance: Any = pairs.variance
-    explained = estimator.explain(pairs.patterns)
-    left = np.where(variance < KNOWN_VARIANCE, pairs.photographs - explained, 0.0)
-    errors = judged_errors(pairs.photographs, explained, variance)
-    error = math.sqrt((errors**2).mean())
+    squares = np.zeros(len(pairs))
+    left = np.zeros(estimator.channels)
+    for number in range(len(pairs)):
+        judge = pairs.select(slice(number, number + 1))
+        variance: Any = judge.variance
+        is_known = variance < KNOWN_VARIANCE
+        explained = estimator.explain(judge.patterns)
+        unexplained = np.where(is_known, judge.photographs - explained, 0.0)
+        of_channels = (unexplained**2).sum(axis=(0, 1))
+        noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
+        light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
+        energy = max((light**2).sum(), np.finfo(float).tiny)
+        squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        left += of_channels
+    error = math.sqrt(squares.mean())
     scales = estimator.scale_of_variance(pairs.patterns, left)
     return Sketch(
         arrays=estimator.arrays(scales),
         own_variance=estimator.own_variance() * scales[:, None],
-        errors=errors,
+        errors=np.sqrt(squares),
         error=error,
-        bound=error_bound(error, len(errors)),
+        bound=error_bound(error, len(squares)),
     )
 
 
-def judged_errors(
-    photographs: np.ndarray, explained: np.ndarray, variance: np.ndarray
-) -> np.ndarray:
-    """Error of T p for each photograph (k, N, channels), relative to it, less the noise, (k,).
-
-    Pixels whose variance is that of unknown values do not count.
-    """
-    is_known = variance < KNOWN_VARIANCE
-    left = np.where(is_known, photographs - explained, 0.0)
-    noise = np.where(is_known, variance, 0.0).sum(axis=(1, 2))
-    light = np.where(is_known, photographs, 0.0)
-    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
-    return np.sqrt(np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy)
-
-
-def error_bound(error: float, count: int) -> float:
-    """What errors of other pictures are below, with a probability of `CONFIDENCE`.
-
-    `error` is the root mean square of those of `count` pictures.
-    """
-    return error * math.sqrt(count / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, count))
+def error_bound(error: float, judges: int) -> float:
+    """Bound of the error of other pictures, by the root mean square of that of some judges."""
+    return error * math.sqrt(judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges))
 
 
 def finish(store: BlockStore, sketch: Sketch) -> None:

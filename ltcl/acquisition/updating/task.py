@@ -23,13 +23,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl import checks
 from ltcl.acquisition.calibration import Calibration, StoredMap, is_calibrated, stored_map
-from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS, check_memory
+from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS, ROW_BYTES
+from ltcl.acquisition.estimation.windows import functions_of_row
 from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, difference, planes
 from ltcl.acquisition.rig import Rig, RigError, Shots
 from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
-from ltcl.acquisition.scanning.sketch import error_bound, judged_errors
+from ltcl.acquisition.scanning.sketch import error_bound
 from ltcl.acquisition.scratch import ImageFile
 from ltcl.acquisition.session import ProgressFunction, check_same, ignore_progress
 from ltcl.acquisition.updating.change import ChangedTransport, with_change
@@ -62,6 +64,9 @@ from ltcl.transport.transport import Transport
 
 logger = logging.getLogger(__name__)
 
+# Strategies of scans that can be carried over: cells of an adaptive scan do not move by parts of a
+# pixel, blocks are no pixels of the projector, and direct light alone does not explain pictures.
+STRATEGIES = ("sketch", "pixel", "hadamard")
 # Largest movement of any pixel, relative to the shorter side of the picture, and how much further a
 # shift is searched for, so that one that is too large is found.
 MAX_MOVEMENT_SHARE = 1 / 8
@@ -273,7 +278,6 @@ def update(
     mapping = stored_map(previous)
     calibration = Calibration.of(previous)
     _check_rig(previous, shots)
-    check_memory(shots.grid, shots.channels)
 
     # 1. The photographs, on the old pixels.
     seconds = calibration.exposures[0]
@@ -374,11 +378,15 @@ def _open_scan(scan: str | os.PathLike[str]) -> BlockStore:
         raise FileError(f"{opened.path}: holds no calibration; scan must be made by ltcl.acquire")
     if not opened.final:
         raise FileError(f"{opened.path}: is still being scanned; it must be a finished scan")
-    if opened.attributes["strategy"] == "block":
+    strategy = opened.attributes["strategy"]
+    if strategy not in STRATEGIES:
         raise InputError(
-            f"scan is {opened.path}, of strategy 'block'; it must be a sketch, or a scan by pixels "
-            "or S-matrices"
+            f"scan is {opened.path}, of strategy {strategy!r}; it must be one of "
+            f"{', '.join(STRATEGIES)}"
         )
+    height, width = Calibration.of(opened).resampling.grid
+    numbers = height * width * functions_of_row((height, width)) * (opened.layout.channels + 1)
+    checks.fits_host(f"updating T of {height} x {width} pixels", numbers * ROW_BYTES)
     return opened
 
 
@@ -398,6 +406,16 @@ def _unit_of_light(T: HostTransport, white: Picture) -> np.ndarray:
     own = np.where(known, T.products(np.ones((1, len(seen))))[0], 0.0)
     squares = np.maximum((own**2).sum(axis=0), np.finfo(float).tiny)
     return (own * seen).sum(axis=0) / squares
+
+
+def _judged_errors(pictures: _Pictures, explained: np.ndarray) -> np.ndarray:
+    """Error of T p for each picture (k, N, channels), relative to it, less the noise, (k,)."""
+    is_known = pictures.variance < KNOWN_VARIANCE
+    left = np.where(is_known, pictures.value - explained, 0.0)
+    noise = np.where(is_known, pictures.variance, 0.0).sum(axis=(1, 2))
+    light = np.where(is_known, pictures.value, 0.0)
+    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
+    return np.sqrt(np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy)
 
 
 def _flat(patterns: Sequence[np.ndarray]) -> np.ndarray:
@@ -546,7 +564,7 @@ class _Judgement:
     ) -> _Judgement:
         """The judgement on T by pictures of patterns that it was not fitted to."""
         explained = T.products(patterns)
-        errors = judged_errors(pictures.value, explained, pictures.variance)
+        errors = _judged_errors(pictures, explained)
         error = math.sqrt((errors**2).mean())
         previous_errors = _previous_errors(previous, T.grid)
         previous_error = math.sqrt((previous_errors**2).mean())

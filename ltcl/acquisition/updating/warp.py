@@ -29,10 +29,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.estimation.estimator import BASIS
 from ltcl.acquisition.estimation.windows import REACH, hat_levels, hat_matrix
 from ltcl.acquisition.updating.movement import Movement, interpolation
-from ltcl.errors import FileError, InputError
+from ltcl.errors import FileError
 from ltcl.store import BlockStore, StoredRows
 from ltcl.store.block_store import read
 
@@ -63,7 +62,7 @@ class HostTransport:
 
     @classmethod
     def of(cls, store: BlockStore) -> HostTransport:
-        """T of a finished scan; InputError for one whose rows are in other functions."""
+        """T of a finished scan: a sketch, or one by pixels or S-matrices."""
         record: Any = read(store.path)
         grid = store.layout.grid
         if grid is None:
@@ -73,7 +72,7 @@ class HostTransport:
         cores = []
         for channel in range(store.layout.channels):
             if store.layout.kind == "compressed":
-                core: Any = _compressed_core(record.arrays, channel, store)
+                core: Any = _compressed_core(record.arrays, channel, W)
                 cores.append(core + scipy.sparse.eye_array(*core.shape, format="csr"))
                 continue
             rows: StoredRows = record.matrices[channel]
@@ -98,21 +97,19 @@ class HostTransport:
         return HostTransport(grid=self.grid, cores=[warp.core(C) for C in self.cores], W=self.W)
 
 
-def _compressed_core(arrays: Any, channel: int, store: BlockStore) -> scipy.sparse.csr_array:
-    """C - I of a channel of a compressed transport in hats."""
-    name = str(arrays.get("basis_0.name", "pixels"))
-    if name != BASIS:
-        raise InputError(
-            f"scan is {store.path}, of strategy {store.attributes['strategy']!r}, in sums of "
-            f"{name}; it must be a sketch, or a scan by pixels or S-matrices"
-        )
+def _compressed_core(arrays: Any, channel: int, W: Any) -> scipy.sparse.csr_array:
+    """C - I of a channel of a sketch; of one of many pixels C is diag(scale) W^T K."""
     core = f"system_{channel}.R.core."
     entries = (
         np.asarray(arrays[f"{core}data"], np.float64),
         arrays[f"{core}indices"],
         arrays[f"{core}indptr"],
     )
-    return scipy.sparse.csr_array(entries, shape=tuple(arrays[f"{core}shape"].tolist()))
+    C: Any = scipy.sparse.csr_array(entries, shape=tuple(arrays[f"{core}shape"].tolist()))
+    out = int(arrays[f"system_{channel}.R.out"])
+    if out >= 0:
+        C = np.asarray(arrays[f"basis_{out}.scale"])[:, None] * (W.T @ C)
+    return scipy.sparse.csr_array(C)
 
 
 def known_pixels(movement: Movement) -> np.ndarray:

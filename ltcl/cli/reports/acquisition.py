@@ -20,7 +20,8 @@ from ltcl.cli.reports.report import Report
 
 RigKind = Annotated[Literal["virtual", "mitsuba", "folder", "live"], "Kind of the rig."]
 Strategy = Annotated[
-    Literal["sketch", "adaptive", "pixel", "block", "hadamard"], "Strategy of the scan."
+    Literal["sketch", "adaptive", "direct", "pixel", "block", "hadamard"],
+    "Strategy of the scan.",
 ]
 Exposures = Annotated[list[float], "Seconds of the photographs of a pattern."]
 
@@ -119,13 +120,20 @@ class ScanReport(FolderReport):
     noise_direct: Annotated[float, "Median relative noise of the first bounce."]
     noise_sum: Annotated[float, "Median relative noise of row sums."]
     sum_deviation: Annotated[
-        float | None, "Deviation of column sums from white; null of a sketch or an adaptive scan."
+        float | None, "Deviation of column sums from white; null for scans that take no columns."
     ]
     judged_error: Annotated[
-        float | None, "Relative error of T p for pictures that no sketch was fitted to; else null."
+        float | None,
+        "Relative error for pictures that a sketch, or a scan of direct light, was not fitted to: "
+        "of T p, or of the direct light; else null.",
     ]
     judged_bound: Annotated[
         float | None, "That of other pictures is below, with a probability of 95 %; else null."
+    ]
+    left_out: Annotated[
+        float | None,
+        "Indirect light that a scan of direct light left out, relative to all light of the median "
+        "pixel under white; null for other scans.",
     ]
     verdict: VerdictReport
     error: Annotated[list[float] | None, "Relative error of T p by channel; virtual rigs only."] = (

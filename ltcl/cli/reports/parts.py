@@ -219,6 +219,7 @@ class VerdictNumbers(Report):
     ] = None
     sum_deviation: Annotated[Measured, "`sum_deviation` of the scan. Good up to 0.03."] = None
     saturation: Annotated[Measured, "`saturated` of the scan. Good up to 0.01."] = None
+    left_out: Annotated[Measured, "`left_out` of the scan. Good up to 0.02."] = None
 
 
 @dataclass(kw_only=True)

@@ -99,6 +99,12 @@ DAMAGES = (
         advice="warm up, and scan again",
     ),
     Damage(
+        name="left_out",
+        threshold=0.02,
+        cause="{p} of the light is indirect and was left out of T",
+        advice="scan with strategy 'sketch', 'adaptive' or 'pixel' for all of it",
+    ),
+    Damage(
         name="ambient",
         threshold=0.05,
         cause="{p} of a bounce is perhaps ambient light left in T",

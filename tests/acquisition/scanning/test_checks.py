@@ -31,6 +31,7 @@ BATCHES = {
     "block": (9, 9),
     "adaptive": (4, 16),
     "sketch": (16, 12),
+    "direct": (16, 3),
 }
 """Patterns of the first batch, and of the second."""
 Shot = tuple[np.ndarray, float]
@@ -102,6 +103,7 @@ def repeated(order: np.ndarray, start: int, n: int) -> np.ndarray:
         "pixel",
         "adaptive",
         "sketch",
+        "direct",
         pytest.param("hadamard", marks=pytest.mark.slow),
         pytest.param("block", marks=pytest.mark.slow),
     ],
