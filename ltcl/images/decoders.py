@@ -171,7 +171,8 @@ def _decode_tiff(data: bytes, memory: int) -> Decoded:
     _check_memory(int(directory[tiff.WIDTH]), int(directory[tiff.HEIGHT]), memory)
     orientation = directory.get(tiff.ORIENTATION) or UPRIGHT
     if tiff.is_grey_with_alpha(directory):
-        codes = _decode_with_pillow(Image.open(io.BytesIO(data), formats=("TIFF",)))
+        file = io.BytesIO(tiff.with_alpha(data, directory))
+        codes = _decode_with_pillow(Image.open(file, formats=("TIFF",)))
     else:
         codes = _decode_with_opencv(data)
     if tiff.is_inverted(directory, codes):

@@ -8,6 +8,7 @@ and others. So what is not known to be right is refused: `check_layout` lists wh
 from __future__ import annotations
 
 import io
+import struct
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ ORIENTATION = 274
 SAMPLES = 277
 PLANAR = 284
 PREDICTOR = 317
+EXTRA_SAMPLES = 338
 SAMPLE_FORMAT = 339
 
 WHITE_IS_ZERO = 0
@@ -71,6 +73,11 @@ COMPRESSIONS = {
     12: {NO_COMPRESSION},
     14: {NO_COMPRESSION},
 }
+
+# Type of 16-bit values; what ExtraSamples says of a channel beyond the colours.
+SHORT = 3
+UNSPECIFIED = 0
+ALPHA = 2
 
 NUMBERS = {1: "uint", 2: "int", 3: "float"}
 CURE = "save it as RGB or grey of 8 or 16 bits or float32, uncompressed or with LZW or Deflate"
@@ -137,3 +144,37 @@ def is_inverted(directory: Directory, codes: np.ndarray) -> bool:
 def is_grey_with_alpha(directory: Directory) -> bool:
     """True for two channels: OpenCV drops the second."""
     return directory.get(SAMPLES, 1) == 2
+
+
+def with_alpha(data: bytes, directory: Directory) -> bytes:
+    """A file of grey with a second channel, which its directory calls alpha or nothing special.
+
+    Pillow decodes no other. But files leave the tag out, or say that the grey is multiplied by
+    alpha, which is the same where that is opaque. The new directory stands at the end.
+    """
+    if directory.get(EXTRA_SAMPLES) in ((UNSPECIFIED,), (ALPHA,)):
+        return data
+    order = "<" if data.startswith(b"II") else ">"
+    is_big_tiff = data[2:3] == b"+"
+    place = 8 if is_big_tiff else 4
+    # Types of offsets and values, and of the number of entries.
+    offset_type = "Q" if is_big_tiff else "I"
+    count_type = "Q" if is_big_tiff else "H"
+    entry_size = 20 if is_big_tiff else 12
+    (start,) = struct.unpack_from(order + offset_type, data, place)
+    (count,) = struct.unpack_from(order + count_type, data, start)
+    first = start + struct.calcsize(count_type)
+    entries = {}
+    for number in range(count):
+        entry = data[first + number * entry_size :][:entry_size]
+        (tag,) = struct.unpack_from(order + "H", entry)
+        entries[tag] = entry
+    alpha = struct.pack(f"{order}HH{offset_type}H", EXTRA_SAMPLES, SHORT, 1, ALPHA)
+    entries[EXTRA_SAMPLES] = alpha.ljust(entry_size, b"\0")
+    sorted_entries = b"".join(entries[tag] for tag in sorted(entries))
+    # Directories begin at an even byte.
+    padded = data + b"\0" * (len(data) % 2)
+    header = padded[:place] + struct.pack(order + offset_type, len(padded))
+    size = struct.pack(order + count_type, len(entries))
+    last = struct.pack(order + offset_type, 0)
+    return header + padded[len(header) :] + size + sorted_entries + last

@@ -16,7 +16,7 @@ import numpy as np
 from ltcl import checks, images
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.images.encoding import from_linear, to_linear
-from ltcl.images.pictures import BITS, as_picture
+from ltcl.images.pictures import BITS, RESIZES, as_picture
 from ltcl.tasks import report
 from ltcl.tasks.compensation import compensate
 from ltcl.tasks.separation import separate
@@ -45,6 +45,8 @@ LARGEST_PICTURE = 3 << 29
 # Uploaded pictures that are kept; an older one is dropped.
 MAX_UPLOADS = 16
 MAX_BOUNCES = 16
+# What becomes of a picture of other proportions, unless the page chooses: nothing is distorted.
+DEFAULT_RESIZE = "crop"
 # Steps of light between black and white, each with a code: a table is faster than powers.
 LIGHT_STEPS = 65535
 SRGB_CODES = from_linear(
@@ -54,11 +56,11 @@ SRGB_CODES = from_linear(
 
 @dataclass(frozen=True, kw_only=True)
 class KeptPicture:
-    """A picture on the grids of camera and projector."""
+    """A picture on the grids of camera and projector, by the way of `RESIZES` that it took."""
 
     name: str
-    for_camera: np.ndarray
-    for_projector: np.ndarray
+    for_camera: dict[str, np.ndarray]
+    for_projector: dict[str, np.ndarray]
 
 
 class ViewerScene:
@@ -124,6 +126,7 @@ class ViewerScene:
                 "device": T.device.name,
                 "square": T.is_square,
                 "compressed": T.is_compressed,
+                "extensions": [*BITS],
             }
         return facts
 
@@ -153,15 +156,18 @@ class ViewerScene:
             rows.append(operator.T.matmat(column))
         return {}, {"pattern": shape.pack(rows, T.grid)}
 
-    def relight(self, pattern: Any = None, picture: Any = None) -> Reply:
+    def relight(
+        self, pattern: Any = None, picture: Any = None, resize: Any = DEFAULT_RESIZE
+    ) -> Reply:
         """Return the picture under a pattern, and let the projector show that.
 
         The pattern is one of sRGB codes, a kept picture, or the present one.
         """
+        checks.one_of("resize", resize, RESIZES)
         if pattern is not None:
             light = self._light_of_codes(pattern)
         elif picture is not None:
-            light = self._picture(picture).for_projector
+            light = self._picture(picture).for_projector[resize]
         else:
             light = self.pattern
         shown = {"picture": self.T @ light}
@@ -182,10 +188,20 @@ class ViewerScene:
             codes = codes[..., 0]
         return to_linear(codes, "auto")
 
-    def bounces(self, callback: Callback, picture: Any = None, count: Any = 4) -> Reply:
+    def bounces(
+        self,
+        callback: Callback,
+        picture: Any = None,
+        count: Any = 4,
+        resize: Any = DEFAULT_RESIZE,
+    ) -> Reply:
         """Return direct light and bounces of a picture, or of the scene under the pattern."""
         checks.count("count", count, least=0, most=MAX_BOUNCES)
-        image = self._photograph(picture)
+        checks.one_of("resize", resize, RESIZES)
+        if picture is None:
+            image = self.T @ self.pattern
+        else:
+            image = self._picture(picture).for_camera[resize]
         result = separate(self.T, image, count, callback=callback)
         bounces = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
         light = {"direct": result.direct, **bounces, "rest": result.rest}
@@ -198,14 +214,20 @@ class ViewerScene:
         return {"shares": shares}, light
 
     def compensate(
-        self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)
+        self,
+        callback: Callback,
+        picture: Any,
+        gain: Any = 1.0,
+        bounds: Any = (0, 1),
+        resize: Any = DEFAULT_RESIZE,
     ) -> Reply:
         """Return the pattern for a picture, and let the projector show it."""
+        checks.one_of("resize", resize, RESIZES)
         desired = self._picture(picture)
         start = time.perf_counter()
         result = compensate(
             self.T,
-            desired.for_camera,
+            desired.for_camera[resize],
             background=None if self.setup is None else self.setup.ambient,
             callback=callback,
             gain=gain,
@@ -224,6 +246,7 @@ class ViewerScene:
             "versions": report.versions(),
             "device": report.device(self.T.device),
             "picture": desired.name,
+            "resize": resize,
             "gain": gain,
             "bounds": bounds,
             **facts,
@@ -232,12 +255,13 @@ class ViewerScene:
         }
         self._compensation = (result, known)
         pictures = {name: getattr(result, name) for name in COMPENSATION_PICTURES}
-        pictures["uncompensated"] = self._uncompensated(desired, result.target)
+        plain = desired.for_projector[resize]
+        pictures["uncompensated"] = self._uncompensated(plain, result.target)
         return facts, pictures
 
-    def _uncompensated(self, picture: KeptPicture, target: np.ndarray) -> np.ndarray:
-        """Return the scene under the picture itself, made as bright as the target."""
-        seen = self.T @ picture.for_projector
+    def _uncompensated(self, light: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Return the scene under a picture as the pattern, made as bright as the target."""
+        seen = self.T @ light
         mean = max(seen.mean(), np.finfo(np.float32).tiny)
         seen *= np.float32(target.mean() / mean)
         return seen
@@ -255,12 +279,14 @@ class ViewerScene:
 
     def add(self, name: str, picture: np.ndarray) -> int:
         """Keep a picture on both grids; return its number."""
+        for_camera = _resized(picture, self.T.camera_grid)
+        for_projector = for_camera
+        if self.T.grid != self.T.camera_grid:
+            for_projector = _resized(picture, self.T.grid)
         self._picture_count += 1
         number = self._picture_count
         self._pictures[number] = KeptPicture(
-            name=name,
-            for_camera=_fit(picture, self.T.camera_grid),
-            for_projector=_fit(picture, self.T.grid),
+            name=name, for_camera=for_camera, for_projector=for_projector
         )
         if number > self._first_pictures + MAX_UPLOADS:
             del self._pictures[number - MAX_UPLOADS]
@@ -308,12 +334,6 @@ class ViewerScene:
         steps = pattern * np.float32(LIGHT_STEPS / white) + np.float32(0.5)
         return SRGB_CODES[np.clip(steps, 0, LIGHT_STEPS).astype(np.uint16)]
 
-    def _photograph(self, number: Any) -> np.ndarray:
-        """Return a kept picture on the camera's grid, or the scene under the pattern."""
-        if number is None:
-            return self.T @ self.pattern
-        return self._picture(number).for_camera
-
     def _picture(self, number: Any) -> KeptPicture:
         return self._pictures[checks.one_of("picture", number, self._pictures)]
 
@@ -331,10 +351,17 @@ def _unit_picture(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
     return unit
 
 
-def _fit(picture: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    if picture.shape[:2] == grid:
-        return picture
-    return images.resize(picture, grid)
+def _resized(picture: np.ndarray, grid: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Return a picture on a grid, by each way of `RESIZES`; one array where all are the same."""
+    h, w = picture.shape[:2]
+    if (h, w) == grid:
+        return dict.fromkeys(RESIZES, picture)
+    if h * grid[1] == w * grid[0]:
+        return dict.fromkeys(RESIZES, images.resize(picture, grid))
+    ways = {}
+    for how in RESIZES:
+        ways[how] = images.resize(picture, grid, how)
+    return ways
 
 
 def _sum(picture: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ltcl import images
 from ltcl.errors import FileError
@@ -132,6 +133,47 @@ def test_grey_with_alpha_keeps_its_bits_or_is_refused(tmp_path):
     path.write_bytes(tiff(codes, BLACK_IS_ZERO, t338=2))
     with pytest.raises(FileError, match="1 transparent"):
         images.read(path)
+
+
+# What the tag ExtraSamples says of alpha: nothing, that grey is multiplied by it, that it is not.
+EXTRAS = [{}, {"t338": 1}, {"t338": 2}]
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+@pytest.mark.parametrize("compression", [NONE, DEFLATE])
+def test_grey_with_alpha_is_read_whatever_it_says_of_alpha(tmp_path, extra, compression):
+    codes = opaque("u1", 2)
+    path = tmp_path / "a.tif"
+    path.write_bytes(tiff(codes, BLACK_IS_ZERO, compression=compression, **extra))
+    np.testing.assert_array_equal(images.read_codes(path), codes[..., 0])
+    codes[1, 2, 1] = 254
+    path.write_bytes(tiff(codes, BLACK_IS_ZERO, compression=compression, **extra))
+    with pytest.raises(FileError, match="1 transparent"):
+        images.read(path)
+
+
+# Compressions of Pillow, and whether it writes BigTIFF, which it does without compression alone.
+WRITERS = [
+    ("raw", False),
+    ("raw", True),
+    ("packbits", False),
+    ("tiff_lzw", False),
+    ("tiff_adobe_deflate", False),
+]
+
+
+@pytest.mark.parametrize(("compression", "is_big"), WRITERS)
+def test_grey_that_another_writer_multiplied_by_alpha_is_read(tmp_path, compression, is_big):
+    codes = opaque("u1", 2)
+    path = tmp_path / "a.tif"
+    Image.fromarray(codes, "LA").save(path, compression=compression, big_tiff=is_big)
+    # The tag says 2, alpha by which grey is not multiplied, and now 1.
+    data = bytearray(path.read_bytes())
+    place = data.index(struct.pack("<HH", 338, 3)) + (12 if is_big else 8)
+    assert data[place] == 2
+    data[place] = 1
+    path.write_bytes(data)
+    np.testing.assert_array_equal(images.read_codes(path), codes[..., 0])
 
 
 @pytest.mark.parametrize(

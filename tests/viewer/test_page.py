@@ -357,6 +357,32 @@ def test_pictures_and_spots_relight(
 
 
 @pytest.mark.slow
+def test_one_choice_for_pictures_of_other_proportions(
+    page: Page, T: ltcl.Transport, tmp_path: Path
+) -> None:
+    h, w = T.grid
+    wide = np.zeros((h, 2 * w, 3), np.float32)
+    wide[:, : w // 2] = (0.6, 0.2, 0.1)
+    wide[:, w:] = (0.1, 0.3, 0.6)
+    ltcl.images.write(tmp_path / "wide.exr", wide)
+    page.locator("#tab-relight").click()
+    page.locator("#relight-file").set_input_files(tmp_path / "wide.exr")
+    shows(page, "relight-seen", T @ wide[:, w // 2 : w // 2 + w])
+    page.locator("#relight-resize").select_option("letterbox")
+    shows(page, "relight-seen", T @ ltcl.images.resize(wide, T.grid, "letterbox"))
+    page.locator("#tab-compensate").click()
+    page.locator("#compensate-source").select_option("wide.exr")
+    page.locator("#compensate-auto").uncheck()
+    page.locator("#compensate-gain").fill("1")
+    shows(page, "compensate-target", ltcl.images.resize(wide, T.grid, "letterbox"))
+    page.locator("#compensate-resize").select_option("stretch")
+    shows(page, "compensate-target", ltcl.images.resize(wide, T.grid, "stretch"))
+    page.locator("#tab-bounces").click()
+    page.locator("#bounces-source").select_option("wide.exr")
+    shows(page, "bounces-mix", ltcl.images.resize(wide, T.grid, "stretch"))
+
+
+@pytest.mark.slow
 def test_a_video_relights_as_it_plays(page: Page, T: ltcl.Transport, tmp_path: Path) -> None:
     film = cv2.VideoWriter(str(tmp_path / "v.webm"), cv2.VideoWriter.fourcc(*"VP80"), 10, (96, 48))
     for k in range(20):  # red moves to the right

@@ -252,6 +252,30 @@ def test_uploads_are_relit_and_wrong_ones_refused(colour):
         assert [each["picture"] for each in pictures] == list(range(25 - answers.MAX_UPLOADS, 25))
 
 
+def test_pictures_of_other_proportions_are_cropped_letterboxed_or_stretched(colour):
+    h, w = colour.grid
+    codes = random.integers(0, 256, (h, 2 * w, 3), dtype=np.uint8)
+    light = images.from_srgb(codes / 255.0)
+    halves = light.reshape(h, w, 2, 3).mean(axis=2)
+    between_bars = np.zeros((h, w, 3))
+    quarters = halves.reshape(h // 2, 2, w, 3).mean(axis=1)
+    between_bars[h // 4 : h // 4 + h // 2] = quarters
+    expected = {"crop": light[:, w // 2 : w // 2 + w], "letterbox": between_bars, "stretch": halves}
+    with viewing(colour) as page:
+        upload(page, "wide.png", png(codes))
+        for how, on_grid in expected.items():
+            reply = page.ask("relight", picture=1, resize=how)
+            near(reply["pattern"], on_grid)
+            near(reply["picture"], whole(colour) @ on_grid.ravel())
+            compensation = page.ask("compensate", picture=1, resize=how)
+            near(compensation["target"], on_grid)
+            with urllib.request.urlopen(f"{page.url}result/report.json") as response:  # noqa: S310
+                assert json.load(response)["resize"] == how
+            parts = page.ask("bounces", picture=1, resize=how, count=1)
+            near(parts["direct"] + parts["bounce_1"] + parts["rest"], on_grid)
+        near(page.ask("relight", picture=1)["pattern"], expected["crop"])
+
+
 def test_projector_windows_show_what_is_relit_and_compensated(colour):
     codes = random.integers(0, 256, (*colour.grid, 3), dtype=np.uint8)
     with viewing(colour, colour @ np.full(colour.grid, 0.5)) as page, Page(page.url) as window:
@@ -297,6 +321,9 @@ def test_a_measured_T_shows_the_codes_of_its_projector(device, tmp_path):
         ("relight", {"pattern": [[1, 2]]}, "pattern"),
         ("bounces", {"count": 17}, "count"),
         ("bounces", {"picture": 2}, "picture"),
+        ("bounces", {"picture": 1, "resize": ["crop"]}, "resize"),
+        ("relight", {"picture": 1, "resize": "fill"}, "resize"),
+        ("compensate", {"picture": 1, "resize": None}, "resize"),
         ("bounces", {"callback": 1}, "callback"),
         ("compensate", {"picture": 7}, "picture"),
         ("compensate", {"picture": 1, "bounds": [1, 0]}, "bounds"),

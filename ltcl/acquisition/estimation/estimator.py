@@ -17,8 +17,10 @@ from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import (
     PRIOR_STEP,
     ROUNDS,
+    Foretold,
     Prior,
     Rows,
+    foretell,
     learn_prior,
     solve_rows,
 )
@@ -119,13 +121,20 @@ class Estimator:
             channels.append((self.coefficients(channel) @ sums[:-1]).T)
         return np.stack(channels, axis=2)
 
-    @property
-    def surprise(self) -> np.ndarray:
-        """By how much each picture differs from what all others foretell, (frames,); 1 as expected.
+    def coarsest(self, pairs: Pairs) -> tuple[Estimator, Pairs]:
+        """Return itself, and the pairs at its pixels, which `RefinedEstimator` averages."""
+        return self, pairs
 
-        The mean square over rows and channels, in units of the variance that is expected.
-        """
-        return np.mean([rows.surprise for rows in self.rows], axis=0)
+    def foretell(self, pairs: Pairs, channel: int) -> Foretold:
+        """Compare each photograph with all others, by the priors that were learned."""
+        return foretell(
+            self.windows,
+            self._sums(pairs.patterns, channel),
+            pairs.photographs[:, :, channel].T,
+            self.priors[channel],
+            self._count,
+            _of_channel(pairs.variance, channel),
+        )
 
     @property
     def noise(self) -> float:

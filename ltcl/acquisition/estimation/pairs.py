@@ -8,6 +8,7 @@ drift        the lamp, or the exposure, changes from pair to pair
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -92,6 +93,12 @@ class Pairs:
             photographs=self.photographs[chosen],
             variance=variance,
         )
+
+    def without(self, numbers: Sequence[int]) -> Self:
+        """The pairs but for those of some numbers; nothing is copied if there are none."""
+        if not numbers:
+            return self
+        return self.select(np.setdiff1d(np.arange(len(self)), numbers))
 
     def resampled(self, resampling: Resampling) -> Self:
         """The pairs with photographs on the pixels of the projector."""

@@ -196,11 +196,6 @@ class RefinedEstimator:
         return self.coarse.mixing
 
     @property
-    def surprise(self) -> np.ndarray:
-        """As `Estimator.surprise`, of pictures averaged under the coarsest hats."""
-        return self.coarse.surprise
-
-    @property
     def noise(self) -> float:
         """As `Estimator.noise`, of the pixels."""
         return float(np.sqrt(np.median(self.stages[-1].noise)))
@@ -217,6 +212,10 @@ class RefinedEstimator:
         self.light = _light_under_white(pairs, self.mixing)
         self.coarse.solve(self._averaged(pairs))
         self._solve_stages(pairs)
+
+    def coarsest(self, pairs: Pairs) -> tuple[Estimator, Pairs]:
+        """The estimator of the coarsest stage, and the pairs at its nodes, relative to white."""
+        return self.coarse, self._averaged(pairs)
 
     def explain(self, patterns: np.ndarray) -> np.ndarray:
         """T p of patterns, (frames, N, channels)."""

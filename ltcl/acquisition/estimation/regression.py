@@ -18,8 +18,8 @@ the light of the pixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.ndimage
@@ -40,8 +40,6 @@ FIRST_NOISE = 0.01
 LEAST_NOISE = 1e-5
 # Variance of a picture from which on it is unknown.
 UNKNOWN_NOISE = 1e9
-# Most that a row counts in the surprise of a picture.
-MAX_SURPRISE = 1e4
 # Numbers of B at once.
 CHUNK_NUMBERS = 1 << 20
 
@@ -75,15 +73,32 @@ class Prior:
 class Rows:
     """Coefficients of rows of T and their variances, (N, q), and the residuals of pictures.
 
-    `residual` is the mean square that the rows leave, (N,), by degrees of freedom. `surprise` is
-    that of each picture if it were foretold from all others, (patterns,): about 1, in units of the
-    variance that is expected then; the mean over rows.
+    `residual` is the mean square that the rows leave, (N,), by degrees of freedom.
     """
 
     mean: np.ndarray
     variance: np.ndarray
     residual: np.ndarray
-    surprise: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Foretold:
+    """Light of pictures beyond what all others foretell, and the variance that is expected of it.
+
+    Both are (N, patterns).
+    """
+
+    error: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Solution:
+    """Some rows, `part` of all, and the pictures that others foretell there."""
+
+    part: slice
+    rows: Rows
+    foretold: Foretold
 
 
 def learn_prior(
@@ -123,12 +138,42 @@ def solve_rows(
     variance: np.ndarray | None = None,
 ) -> Rows:
     """The rows of T, given a prior; the arguments are those of `learn_prior`."""
+    shape = windows.nodes.shape
+    rows = Rows(mean=np.zeros(shape), variance=np.zeros(shape), residual=np.zeros(len(prior.light)))
+    for solution in _solve_in_parts(windows, sums, pictures, prior, progress, variance):
+        rows.mean[solution.part] = solution.rows.mean
+        rows.variance[solution.part] = solution.rows.variance
+        rows.residual[solution.part] = solution.rows.residual
+    return rows
+
+
+def foretell(
+    windows: Windows,
+    sums: np.ndarray,
+    pictures: np.ndarray,
+    prior: Prior,
+    progress: Callable[[int], None],
+    variance: np.ndarray | None = None,
+) -> Foretold:
+    """Compare each picture with all others, given a prior; the arguments are as of `solve_rows`."""
+    foretold = Foretold(error=np.zeros(pictures.shape), variance=np.zeros(pictures.shape))
+    for solution in _solve_in_parts(windows, sums, pictures, prior, progress, variance):
+        foretold.error[solution.part] = solution.foretold.error
+        foretold.variance[solution.part] = solution.foretold.variance
+    return foretold
+
+
+def _solve_in_parts(
+    windows: Windows,
+    sums: np.ndarray,
+    pictures: np.ndarray,
+    prior: Prior,
+    progress: Callable[[int], None],
+    variance: np.ndarray | None,
+) -> Iterator[_Solution]:
+    """The rows of T, as many at once as memory holds."""
     pixels, q = windows.nodes.shape
-    mean = np.zeros((pixels, q))
-    uncertainty = np.zeros((pixels, q))
-    residual = np.zeros(pixels)
     patterns = sums.shape[1]
-    surprise = np.zeros(patterns)
     chunk = max(CHUNK_NUMBERS // (q * (patterns + q)), 1)
     for start in range(0, pixels, chunk):
         part = slice(start, start + chunk)
@@ -137,27 +182,23 @@ def solve_rows(
         noise = np.broadcast_to(left, (len(light), patterns))
         if variance is not None:
             noise = noise + variance[part]
-        mean[part], uncertainty[part], misfit, surprise_of_rows = _solve(
+        rows, foretold = _solve(
             sums[windows.nodes[part]],
             pictures[part],
             np.sqrt(prior.coefficients[part][:, windows.group]) * light,
             noise,
         )
-        residual[part] = misfit * left[:, 0]
-        surprise += np.minimum(surprise_of_rows, MAX_SURPRISE).sum(axis=0)
+        rows = replace(rows, residual=rows.residual * left[:, 0])
+        yield _Solution(part=part, rows=rows, foretold=foretold)
         progress(len(light))
-    return Rows(
-        mean=mean, variance=uncertainty, residual=residual, surprise=surprise / max(pixels, 1)
-    )
 
 
 def _solve(
     B: np.ndarray, pictures: np.ndarray, deviation: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and variance of some rows, and the mean square of what they leave, relative to noise.
+) -> tuple[Rows, Foretold]:
+    """Some rows, with a residual relative to the noise, and what all but one picture foretell.
 
-    Last comes the surprise of each of their pictures, (rows, patterns). B is (rows, q, patterns),
-    `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
+    B is (rows, q, patterns), `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
     """
     whitening = 1.0 / np.sqrt(noise)
     # (rows, functions, patterns): what a standard deviation of x changes, in those of the noise.
@@ -169,10 +210,15 @@ def _solve(
     determined = S.shape[1] - variance.sum(axis=1)
     known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
     freedom = np.maximum(known - determined, 1.0)
-    misfit = (left**2).sum(axis=1) / freedom
+    rows = Rows(
+        mean=deviation * mean,
+        variance=deviation**2 * variance,
+        residual=(left**2).sum(axis=1) / freedom,
+    )
     # Of y given all others the residual is left / precision, its variance 1 / precision.
-    surprise = left**2 / np.maximum(precision, np.finfo(float).tiny)
-    return deviation * mean, deviation**2 * variance, misfit, surprise
+    precision = np.maximum(precision, np.finfo(float).tiny)
+    foretold = Foretold(error=left / precision / whitening, variance=noise / precision)
+    return rows, foretold
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

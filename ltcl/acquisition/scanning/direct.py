@@ -29,11 +29,11 @@ from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import Picture, ScanGrid
 from ltcl.acquisition.scanning.sketch import (
     SEED,
-    check_surprise,
     error_bound,
     like_nature,
     text,
 )
+from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore
 from ltcl.store.block_store import SparseMatrix
 from ltcl.transport.noise import Noise
@@ -165,8 +165,24 @@ def scan(
         variance[1:] += grid.ambient[channel]
         channels.append(separate(grid.grid, lit, value, variance, count))
     surprise = np.mean([light.surprise for light in channels], axis=0)
-    check_surprise(surprise, MAX_SURPRISE_RATIO)
+    _check_surprise(surprise)
     return _judged(grid, channels, judging, pictures[len(fitted) :])
+
+
+def _check_surprise(surprise: np.ndarray) -> None:
+    """Refuse a picture that all others contradict, such as one of another lamp or exposure.
+
+    `surprise` is that of each picture, (frames,), white first, which no pattern is like.
+    """
+    of_patterns = surprise[1:]
+    if not len(of_patterns):
+        return
+    number = int(of_patterns.argmax())
+    if of_patterns[number] > MAX_SURPRISE_RATIO * np.median(of_patterns):
+        raise ScanRefused(
+            f"the picture of pattern {number + 1} of {len(of_patterns)} contradicts those of all "
+            "others: another exposure, another light, or something moved; the scan must be repeated"
+        )
 
 
 class _FitCount:

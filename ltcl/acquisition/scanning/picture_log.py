@@ -24,13 +24,14 @@ class PictureLog:
     The next request depends on nothing but the pictures before. So a scan that was stopped is run
     again from its start with the pictures of the log, to the bit the same, until it asks for a new
     one. Without a camera that is an AcquisitionError. `done` counts the pictures that were asked
-    for.
+    for; `names` are those of their patterns, with the photographs if they were taken now.
     """
 
     def __init__(
         self, store: BlockStore, camera: ScanCamera | None, progress: Callable[[int], None]
     ) -> None:
         self.done = 0
+        self.names: list[str] = []
         self._store = store
         self._camera = camera
         self._progress = progress
@@ -53,6 +54,7 @@ class PictureLog:
         self._batches += 1
         if self._is_written(batch):
             pictures = self._read(batch, len(patterns))
+            self._name([""] * len(patterns))
             self._count(len(patterns))
             return pictures
         if self._camera is None:
@@ -60,6 +62,7 @@ class PictureLog:
                 f"{self._store.path}: the next batch of patterns is not photographed"
             )
         pictures = self._camera.take(patterns, self._count)
+        self._name([f" ({name})" for name in self._camera.names])
         self._camera.keep_lamp_gain(self._store)
         self._write(batch, pictures)
         return pictures
@@ -102,6 +105,11 @@ class PictureLog:
     def _is_written(self, batch: int) -> bool:
         channels = range(self._store.layout.channels)
         return all((channel, batch) in self._store.written for channel in channels)
+
+    def _name(self, photographs: Sequence[str]) -> None:
+        """Name the next patterns, with their photographs."""
+        for photograph in photographs:
+            self.names.append(f"pattern {len(self.names) + 1}{photograph}")
 
     def _count(self, pictures: int) -> None:
         self.done += pictures

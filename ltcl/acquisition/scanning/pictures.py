@@ -199,6 +199,8 @@ class ScanCamera(ScanGrid):
             self._room = values_at(calibration.ambient, calibration.anchor.pixels, "value")
         # Gain of the lamp since the calibration at the last batch; a store keeps it.
         self.lamp_gain = 1.0
+        # Names of the photographs of each pattern of the last batch.
+        self.names: list[str] = []
 
     def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:
         """Announce the patterns that come next to the rig, in batches of `size`."""
@@ -232,6 +234,7 @@ class ScanCamera(ScanGrid):
             exposed.append(replace(photographs, images=[], light=stored))
             progress(1)
         self._check_patterns(patterns, pictures, exposed)
+        self.names = [self._names(photographs) for photographs in exposed]
         blocks = self._photograph(anchor.marked(batch), times[:1])
         first = self.lamp_gain
         self.lamp_gain = self._check_anchor(blocks, exposed)

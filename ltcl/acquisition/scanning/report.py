@@ -7,7 +7,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import scipy.sparse
@@ -55,6 +55,8 @@ class Report:
     left_out : float
         Indirect light that a scan of direct light left out, relative to all light of the median
         pixel under white; NaN for another scan.
+    wrong_patterns : list of int
+        Patterns of a sketch, from 1 on, whose pictures contradict all others, and are not used.
 
     Examples
     --------
@@ -88,6 +90,7 @@ class Report:
     judged_error: float = math.nan
     judged_bound: float = math.nan
     left_out: float = math.nan
+    wrong_patterns: list[int] = field(default_factory=list)
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Report:
@@ -137,6 +140,7 @@ class Report:
             judged_error=_number(judgement.get("error")),
             judged_bound=_number(judgement.get("bound")),
             left_out=_number(judgement.get("left_out")),
+            wrong_patterns=judgement.get("wrong_patterns", []),
         )
 
     def to_json(self) -> str:
@@ -184,6 +188,8 @@ class Report:
                 f"error of {judged} {self.judged_error:.2%} for pictures that it was not fitted "
                 f"to; for others at most {self.judged_bound:.2%}, with a probability of 95 %"
             )
+        for number in self.wrong_patterns:
+            lines.append(f"the picture of pattern {number} contradicts all others: it is left out")
         if not math.isnan(self.sum_deviation):
             photographs = f"single {self.strategy}s"
             if self.strategy == "hadamard":

@@ -11,12 +11,15 @@ off, so that the curve of the projector does not matter. Of each scale s = 2^l t
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
 that of T.
+
+A picture that all others contradict is left out (`estimation.contradiction`); several are refused.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +27,7 @@ import cv2
 import numpy as np
 import scipy.stats
 
+from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
@@ -39,10 +43,6 @@ WALSH = ((0, 0, 1, 1), (0, 1, 1, 0), (0, 1, 0, 1))
 CONFIDENCE = 0.95
 # Pictures that judge.
 JUDGES = 8
-# Surprise of a picture, relative to that of the median one, from which on it is refused. In clean
-# scans of corners and boxes at random it is 2 to 7, once 14; of a picture that is a tenth too dark
-# 18 to 37.
-MAX_SURPRISE_RATIO = 20.0
 # Fields of the checkerboard, and lit patches, along the shorter side.
 CHECKERBOARD_FIELDS = 6
 PATCH_SHARE = 8
@@ -50,6 +50,10 @@ PATCH_SHARE = 8
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
 SEED = 0
+# Why a picture contradicts all others.
+CAUSES = "another light was on, the exposure was another one, or something moved"
+
+logger = logging.getLogger(__name__)
 
 
 def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
@@ -174,6 +178,8 @@ class Sketch:
         Their root mean square.
     bound : float
         What that of other pictures is below, with a probability of 95 %.
+    wrong_patterns : list of int
+        Numbers of patterns, from 1 on, whose pictures contradict all others.
     """
 
     arrays: dict[str, np.ndarray]
@@ -181,6 +187,7 @@ class Sketch:
     errors: np.ndarray
     error: float
     bound: float
+    wrong_patterns: list[int]
 
 
 def scan(
@@ -194,31 +201,39 @@ def scan(
     shown = [*patterns(grid.grid), *judges(grid.grid)]
     log.announce(shown)
     pairs = _photograph(grid, shown, log)
-    fitted = slice(0, len(pairs) - JUDGES)
-    judging = slice(len(pairs) - JUDGES, None)
-    mixing = grid.calibration.mixing
-    known_mixing = _known_mixing(mixing, grid.channels)
-    estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-    estimator.learn(pairs.select(fitted))
-    check_surprise(estimator.surprise)
-    return _judged(estimator, pairs.select(judging))
+    first_judge = len(pairs) - JUDGES
+    known_mixing = _known_mixing(grid.calibration.mixing, grid.channels)
+
+    def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
+        estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
+        # A slice copies no pictures.
+        fitted = pairs.select(slice(0, first_judge))
+        estimator.learn(fitted.without([number for number in wrong if number < first_judge]))
+        return estimator
+
+    wrong, estimator = find_wrong_pictures(pairs, learn)
+    _report_wrong([log.names[number - 1] for number in wrong], len(shown))
+    judging = pairs.select(slice(first_judge, None))
+    wrong_judges = [number - first_judge for number in wrong if number >= first_judge]
+    return _judged(estimator, judging.without(wrong_judges), wrong)
 
 
-def check_surprise(surprise: np.ndarray, most: float = MAX_SURPRISE_RATIO) -> None:
-    """Refuse a picture that all others contradict, such as one of another lamp or exposure.
-
-    `surprise` is that of each picture, (frames,), white first, which no pattern is like; `most` is
-    the largest one relative to that of the median picture.
-    """
-    of_patterns = surprise[1:]
-    if not len(of_patterns):
+def _report_wrong(names: Sequence[str], patterns: int) -> None:
+    """Warn of a picture that contradicts all others, and is left out; refuse several."""
+    if not names:
         return
-    number = int(of_patterns.argmax())
-    if of_patterns[number] > most * np.median(of_patterns):
+    pictures = " and of ".join(names)
+    if len(names) > 1:
         raise ScanRefused(
-            f"the picture of pattern {number + 1} of {len(of_patterns)} contradicts those of all "
-            "others: another exposure, another light, or something moved; the scan must be repeated"
+            f"the pictures of {pictures}, of {patterns} patterns, contradict all others: "
+            f"{CAUSES}; the scan must be repeated"
         )
+    logger.warning(
+        "the picture of %s, of %d patterns, contradicts all others, and is left out: %s",
+        pictures,
+        patterns,
+        CAUSES,
+    )
 
 
 def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
@@ -254,7 +269,9 @@ def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pai
     )
 
 
-def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
+def _judged(
+    estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
+) -> Sketch:
     """The transport of an estimator, and its error for pairs that it has not seen."""
     squares = np.zeros(len(pairs))
     left = np.zeros(estimator.channels)
@@ -278,6 +295,7 @@ def _judged(estimator: Estimator | RefinedEstimator, pairs: Pairs) -> Sketch:
         errors=np.sqrt(squares),
         error=error,
         bound=error_bound(error, len(squares)),
+        wrong_patterns=wrong_patterns,
     )
 
 
@@ -294,6 +312,7 @@ def finish(store: BlockStore, sketch: Sketch) -> None:
             "error": sketch.error,
             "bound": sketch.bound,
             "errors": sketch.errors.tolist(),
+            "wrong_patterns": sketch.wrong_patterns,
         }
     )
     store.finalize(compressed=CompressedRecord(sketch.arrays))

@@ -135,6 +135,9 @@ class ScanReport(FolderReport):
         "Indirect light that a scan of direct light left out, relative to all light of the median "
         "pixel under white; null for other scans.",
     ]
+    wrong_patterns: Annotated[
+        list[int], "Patterns of a sketch, from 1 on, whose pictures contradict all others."
+    ]
     verdict: VerdictReport
     error: Annotated[list[float] | None, "Relative error of T p by channel; virtual rigs only."] = (
         None

@@ -16,7 +16,8 @@ export function bounces({ $, ask, press, hello }) {
     const own = ++turn;
     set(() => 1);
     const count = Number($("bounces-count").value);
-    const of = source.value ? { picture: Number(source.value) } : {}; // what the pattern looks like
+    const kept = { picture: Number(source.value), resize: $("bounces-resize").value };
+    const of = source.value ? kept : {}; // what the pattern looks like
     const answer = await ask("bounces", { ...of, count });
     if (!answer || own !== turn) return;
     const names = ["direct", ...Array.from({ length: count }, (_, k) => `bounce_${k + 1}`), "rest"];

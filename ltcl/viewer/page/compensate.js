@@ -36,9 +36,9 @@ export function compensate({ $, ask, hello }) {
     if (!auto.checked) $("compensate-gain-value").textContent = gain.value;
     const bounds = [low, high].map(({ value }) => Number(value));
     const level = auto.checked ? "auto" : Number(gain.value);
-    const picture = source.value;
-    const answer = await ask("compensate", { picture: Number(picture), gain: level, bounds });
-    if (!answer || picture !== source.value) return;
+    const picture = source.value, resize = $("compensate-resize").value;
+    const answer = await ask("compensate", { picture: Number(picture), gain: level, bounds, resize });
+    if (!answer || picture !== source.value || resize !== $("compensate-resize").value) return;
     const { arrays } = answer, white = arrays.target.white();
     wipe.note = "without ◂ ▸ with compensation";
     wipe.show([arrays.appearance, arrays.uncompensated], [1, 0], white);

@@ -144,6 +144,16 @@ async function known() {
   }
 }
 
+// What becomes of pictures of other proportions: one choice for all views, which the one in sight follows.
+const resizes = [...document.querySelectorAll("select[id$=resize]")];
+for (const select of resizes) {
+  select.onchange = () => {
+    for (const other of resizes) other.value = select.value;
+    const source = $(`${current}-source`);
+    if (source.value) source.dispatchEvent(new Event("change"));
+  };
+}
+
 // Give a file to the view in sight: it takes it itself, or the server does, and the view gets its number.
 async function give(file) {
   const view = current;

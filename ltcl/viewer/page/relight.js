@@ -17,7 +17,7 @@ export function relight({ $, ask, press, hello }) {
   let erasing = false, last = null, changed = false, sending = 0, motion = null, turn = 0;
   Object.assign(video, { muted: true, loop: true, playsInline: true });
   paint.lineCap = "round";
-  const size = $("relight-size"), source = $("relight-source");
+  const size = $("relight-size"), source = $("relight-source"), resize = $("relight-resize");
   size.max = Math.max(8, Math.round(Math.max(h, w) / 3));
   size.value = Math.max(1, Math.round(Math.max(h, w) / 10));
   pattern.values = (row, col) => [...paint.getImageData(col, row, 1, 1).data.slice(0, 3)].map(linear);
@@ -97,11 +97,16 @@ export function relight({ $, ask, press, hello }) {
     fill(glow);
   }
 
-  // Fill the pattern with a picture or a frame, cut to its shape.
-  function cover(image, width, height) {
-    const scale = Math.max(w / width, h / height);
+  // Draw a picture or a frame that only the browser reads, as `ltcl.images.resize` does.
+  function place(image, width, height) {
+    let [across, down] = [w / width, h / height];
+    if (resize.value === "crop") across = down = Math.max(across, down);
+    if (resize.value === "letterbox") across = down = Math.min(across, down);
+    const [wide, high] = [across * width, down * height];
+    paint.fillStyle = "#000";
+    paint.fillRect(0, 0, w, h);
     paint.imageSmoothingQuality = "high";
-    paint.drawImage(image, (w - scale * width) / 2, (h - scale * height) / 2, scale * width, scale * height);
+    paint.drawImage(image, (w - wide) / 2, (h - high) / 2, wide, high);
     send();
   }
 
@@ -109,27 +114,30 @@ export function relight({ $, ask, press, hello }) {
     still();
     if (file.type.startsWith("video/")) {
       begin();
+      source.value = "";
       const own = turn;
       URL.revokeObjectURL(video.src);
       video.src = URL.createObjectURL(file);
       await video.play().catch((error) => { if (own === turn) throw error; });
-      if (own === turn) animate(() => cover(video, video.videoWidth, video.videoHeight));
+      if (own === turn) animate(() => place(video, video.videoWidth, video.videoHeight));
       return true;
     }
-    const own = turn, bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
+    const name = file.name.toLowerCase();
+    if (hello.extensions.some((extension) => name.endsWith(extension))) return false; // the server reads it
+    const own = turn, bitmap = await createImageBitmap(file).catch(() => null);
     if (!bitmap || own !== turn) return Boolean(bitmap);
     begin();
-    cover(bitmap, bitmap.width, bitmap.height);
+    source.value = "";
+    place(bitmap, bitmap.width, bitmap.height);
     return true;
   }
 
-  // What the server has as its pattern, as codes. All white is how it begins, and leaves nothing to paint.
+  // What the server has as its pattern, as codes.
   function shown(light) {
     const layers = new Layers();
     layers.set([light]);
     draw(canvas(), layers, { white: 1, mode: 0, logarithmic: false, weights: [1] });
     layers.clear();
-    if (light.data.every((stored) => stored === light.data[0])) spot(0.15);
   }
 
   async function start(fields = {}) {
@@ -138,7 +146,10 @@ export function relight({ $, ask, press, hello }) {
     const answer = await ask("relight", fields);
     if (!answer || own !== turn) return;
     show(answer.arrays.picture);
-    shown(answer.arrays.pattern);
+    const light = answer.arrays.pattern;
+    shown(light);
+    // All white is how it begins, and leaves nothing to paint.
+    if (!("picture" in fields) && light.data.every((stored) => stored === light.data[0])) spot(0.15);
     pattern.read();
   }
 
@@ -168,7 +179,7 @@ export function relight({ $, ask, press, hello }) {
   };
   source.onchange = () => {
     begin();
-    if (source.value) start({ picture: Number(source.value) });
+    if (source.value) start({ picture: Number(source.value), resize: resize.value });
   };
   return { start: () => start(), stop: still, take };
 }

@@ -156,19 +156,50 @@ def test_auto_sketches_many_pixels(grid: tuple[int, int], strategy: str) -> None
     assert strategy == "adaptive" or "more than 2048" in reason
 
 
+def with_lamp(image: np.ndarray) -> np.ndarray:
+    """A photograph of 12 bits in which another light of 5 % of full scale is on, to the right."""
+    light = np.linspace(0.0, 2 * 0.05 * 4095, image.shape[1])
+    return np.minimum(image + light, 4095.0).astype(image.dtype)
+
+
 def dimmer(image: np.ndarray) -> np.ndarray:
     """A photograph of a lamp, or an exposure, that is a quarter too weak."""
     return (0.75 * image).astype(image.dtype)
 
 
+SMALL = (8, 16)
+# Numbers of patterns, from 1 on; the last ones judge.
+FINE_PATTERN = sketch.count_patterns(SMALL) - sketch.JUDGES - 2
+JUDGE = sketch.count_patterns(SMALL) - 3
+
+
+def scan_with_fault(path: Path, fault: Any, wrong: list[int]) -> tuple[np.ndarray, Report]:
+    """T and the report of a scan in which the photographs of these patterns have a fault."""
+    shown = [*sketch.patterns(SMALL), *sketch.judges(SMALL)]
+    faulty = {shown[number - 1].tobytes() for number in wrong}
+    rig = Unplugged(corner(), SMALL)
+    rig.fault = lambda codes, image: fault(image) if codes.tobytes() in faulty else image
+    T = acquire(rig, geometry="aligned", strategy="sketch", store=path)
+    return dense(T), Report.of(path)
+
+
 @pytest.mark.slow
-def test_a_picture_that_all_others_contradict_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fault", [with_lamp, dimmer])
+@pytest.mark.parametrize("number", [FINE_PATTERN, JUDGE])
+def test_one_picture_that_all_others_contradict_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, fault: Any, number: int
+) -> None:
     """One exposure alone shows no deviation; all pictures together do."""
-    clean = Unplugged(corner(16), (16, 32))
-    acquire(clean, geometry="aligned", strategy="sketch")
-    # In the second batch of three.
-    wrong = clean.count - 30
-    rig = Unplugged(corner(16), (16, 32))
-    rig.fault = lambda codes, image: dimmer(image) if rig.count == wrong else image
-    with pytest.raises(ScanRefused, match="contradicts those of all others"):
-        acquire(rig, geometry="aligned", strategy="sketch", store=tmp_path / "T.zarr")
+    T, report = scan_with_fault(tmp_path / "T.zarr", fault, [number])
+    assert report.wrong_patterns == [number]
+    assert f"pattern {number} (photograph" in caplog.text
+    assert f"pattern {number} contradicts" in str(report)
+    assert relative_error(T, corner(), SMALL) < min(report.judged_bound, 0.03)
+
+
+def test_several_pictures_that_all_others_contradict_are_refused(tmp_path: Path) -> None:
+    wrong = [FINE_PATTERN - 3, FINE_PATTERN]
+    with pytest.raises(ScanRefused, match="contradict all others") as error:
+        scan_with_fault(tmp_path / "T.zarr", with_lamp, wrong)
+    for number in wrong:
+        assert f"pattern {number} (photograph" in str(error.value)
