@@ -349,22 +349,24 @@ class KindSummary:
                 self.missed.append(outcome)
         self.named = len(self.refused) - len(self.misnamed)
 
-    def claims(self) -> list[Claim]:
-        """No fault that counts is kept, and refusals name the photograph."""
-        refused = len(self.refused)
-        none_kept = Claim(
+    def none_kept(self) -> Claim:
+        """No fault that counts is kept."""
+        return Claim(
             text=f"{self.kind}: kept, T p moved by over 1 %, and the error that is stated",
             measured=f"{len(self.missed)} of {len(self.outcomes)}",
             wanted="0",
             holds=not self.missed,
         )
-        are_named = Claim(
+
+    def are_named(self) -> Claim:
+        """Refusals name the photograph."""
+        refused = len(self.refused)
+        return Claim(
             text=f"{self.kind}: refused and named",
             measured=f"{self.named} of {refused}",
             wanted="95 %",
             holds=self.named >= NAMED_SHARE * refused,
         )
-        return [none_kept, are_named]
 
     def facts(self) -> dict[str, list[str]]:
         """Faults that were kept or misnamed."""
@@ -451,7 +453,12 @@ def main() -> None:
     shares = {}
     for kind in kinds:
         summary = KindSummary(kind, outcomes)
-        claims += summary.claims()
+        claims.append(summary.none_kept())
+        if is_random:
+            # Of few faults each, in short set-ups, some are named by what they do to others.
+            facts[f"{kind}, refused and named"] = f"{summary.named} of {len(summary.refused)}"
+        else:
+            claims.append(summary.are_named())
         facts |= summary.facts()
         shares[kind] = summary.shares()
     clean = [outcome for outcome in outcomes if outcome.kind is None]
