@@ -50,6 +50,8 @@ PATCH_SHARE = 8
 # Text is drawn so many times as large; letters of size 1 take so many rows, with their spacing.
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
+# Width of a stroke: thinner ones vanish where letters are drawn so many times as large.
+MIN_STROKE = 2
 SEED = 0
 # Rounds at most, and by which share one must lower the error for another to follow.
 MAX_ROUNDS = 24
@@ -140,12 +142,18 @@ def _half_plane(grid: tuple[int, int], angle: float) -> np.ndarray:
 
 
 def text(grid: tuple[int, int]) -> np.ndarray:
-    """Letters over the whole picture."""
+    """Letters over the whole picture.
+
+    >>> bool(text((8, 24)).sum() > 20)
+    True
+    """
     height, width = grid
-    picture = np.zeros((4 * height, 4 * width), np.uint8)
-    scale = 4 * height / 64
+    rows = TEXT_SCALE * height
+    columns = TEXT_SCALE * width
+    picture = np.zeros((rows, columns), np.uint8)
+    scale = rows / FONT_HEIGHT
     for line in range(2):
-        place = (int(0.04 * 4 * width), int((0.45 + 0.5 * line) * 4 * height))
+        place = (int(0.04 * columns), int((0.45 + 0.5 * line) * rows))
         cv2.putText(
             picture,
             "LIGHT"[line:],
@@ -153,7 +161,7 @@ def text(grid: tuple[int, int]) -> np.ndarray:
             cv2.FONT_HERSHEY_SIMPLEX,
             scale,
             255,
-            max(1, int(3 * scale)),
+            max(MIN_STROKE, int(3 * scale)),
         )
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) > 127
 
@@ -395,6 +403,7 @@ def _judged(
 ) -> _Estimate:
     """The error of an estimator for pairs that it has not seen."""
     squares = np.zeros(len(pairs))
+    is_lit = np.zeros(len(pairs), bool)
     left = np.zeros(estimator.channels)
     for number in range(len(pairs)):
         judge = pairs.select(slice(number, number + 1))
@@ -407,10 +416,12 @@ def _judged(
         light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
         energy = max((light**2).sum(), np.finfo(float).tiny)
         squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        # Letters vanish in a picture of few rows.
+        is_lit[number] = judge.patterns.any()
         left += of_channels
     return _Estimate(
         estimator=estimator,
-        squares=squares,
+        squares=squares[is_lit],
         scales=estimator.scale_of_variance(pairs.patterns, left),
         wrong_patterns=wrong_patterns,
     )
