@@ -25,8 +25,8 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.acquisition.calibration import Calibration, StoredMap, is_calibrated, stored_map
-from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS, ROW_BYTES
-from ltcl.acquisition.estimation.windows import functions_of_row
+from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS
+from ltcl.acquisition.estimation.windows import ROW_BYTES, functions_of_row
 from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, difference, planes
 from ltcl.acquisition.rig import Rig, RigError, Shots
