@@ -10,7 +10,8 @@ off, so that the curve of the projector does not matter. Of each scale s = 2^l t
     products   w(row / s) xor w'(column / s) of Walsh functions w and w' of four steps, repeated
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
-that of T.
+that of T. If it is too large, rounds of other patterns follow (`more_patterns`), each of which
+helps: patterns like nature, and blocks at random.
 
 A picture that all others contradict is left out (`estimation.contradiction`); several are refused.
 """
@@ -52,6 +53,11 @@ FONT_HEIGHT = 64
 # Width of a stroke: thinner ones vanish where letters are drawn so many times as large.
 MIN_STROKE = 2
 SEED = 0
+# Rounds at most, and by which share one must lower the error for another to follow.
+MAX_ROUNDS = 24
+LEAST_GAIN = 0.03
+# Pixels from which on there are patterns for rounds.
+LEAST_PIXELS = 16
 # Why a picture contradicts all others.
 CAUSES = "another light was on, the exposure was another one, or something moved"
 
@@ -160,14 +166,72 @@ def text(grid: tuple[int, int]) -> np.ndarray:
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) > 127
 
 
+def more_patterns(grid: tuple[int, int], number: int) -> list[np.ndarray]:
+    """The patterns (h, w) of a round, of 0 and 1: half like nature, half of random blocks.
+
+    Blocks are squares of 1, 2, 4 ... pixels, half of which are lit.
+
+    >>> len(more_patterns((64, 64), 0))
+    16
+    """
+    random = np.random.default_rng((SEED, 1 + number))
+    shown = [like_nature(grid, random) > 0 for _ in range(BATCH_SIZE // 2)]
+    sizes = max((min(grid) - 1).bit_length() - 1, 1)
+    for place in range(BATCH_SIZE - len(shown)):
+        shown.append(_random_blocks(grid, place % sizes, random))
+    return [picture.astype(np.float32) for picture in shown]
+
+
+def _random_blocks(grid: tuple[int, int], level: int, random: np.random.Generator) -> np.ndarray:
+    """Squares of 2^level pixels, half of which are lit; the first ones are cut at random."""
+    row, column = np.indices(grid)
+    size = 1 << level
+    down, across = random.integers(0, size, 2)
+    rows = (grid[0] - 1 + down >> level) + 1
+    columns = (grid[1] - 1 + across >> level) + 1
+    is_lit = random.permutation(rows * columns) < rows * columns // 2
+    block = (row + down >> level) * columns + (column + across >> level)
+    return is_lit[block]
+
+
 def count_patterns(grid: tuple[int, int]) -> int:
     """Patterns of a sketch, with those that judge it."""
     return len(_sides(grid)) + JUDGES
 
 
-def most_patterns(grid: tuple[int, int]) -> int:
-    """Number of patterns that no sketch exceeds, in whole batches."""
-    return BATCH_SIZE * -(-count_patterns(grid) // BATCH_SIZE)
+def most_patterns(grid: tuple[int, int], rounds: int = 0) -> int:
+    """Number of patterns that no sketch of so many rounds exceeds, in whole batches."""
+    return BATCH_SIZE * (-(-count_patterns(grid) // BATCH_SIZE) + rounds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rounds:
+    """How long a sketch goes on after its first patterns.
+
+    Attributes
+    ----------
+    most : int
+        Rounds at most.
+    rtol : float, optional
+        Error of the judges that is small enough; None: all rounds are taken.
+    """
+
+    most: int = 0
+    rtol: float | None = None
+
+    def go_on(self, errors: list[float]) -> bool:
+        """Whether another round follows, given the errors after the first patterns and each round.
+
+        >>> Rounds(most=3, rtol=0.01).go_on([0.03, 0.02]), Rounds(most=3, rtol=0.01).go_on([0.009])
+        (True, False)
+        """
+        if len(errors) > self.most:
+            return False
+        if self.rtol is None:
+            return True
+        if errors[-1] <= self.rtol:
+            return False
+        return len(errors) < 2 or errors[-1] < (1.0 - LEAST_GAIN) * errors[-2]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,31 +263,58 @@ class Sketch:
 
 
 def scan(
-    grid: ScanGrid, log: PictureLog, progress: Callable[[str, int, int], object] | None = None
+    grid: ScanGrid,
+    log: PictureLog,
+    progress: Callable[[str, int, int], object] | None = None,
+    rounds: Rounds | None = None,
 ) -> Sketch:
     """Photograph the patterns and the judges, and estimate T.
 
     `log` takes the pictures, or has those of an earlier run; `progress` is called with "fit", rows
-    that are done, and all.
+    that are done, and all; `rounds` of other patterns follow if it says so.
     """
+    if rounds is None or math.prod(grid.grid) < LEAST_PIXELS:
+        rounds = Rounds()
     shown = [*patterns(grid.grid), *judges(grid.grid)]
+    judging = np.arange(len(shown) - JUDGES, len(shown)) + 1
     log.announce(shown)
     pairs = _photograph(grid, shown, log)
-    first_judge = len(pairs) - JUDGES
+    estimate = _estimate(grid, pairs, judging, log.names, progress)
+    errors = [estimate.error]
+    while rounds.go_on(errors) and log.can_take:
+        shown = more_patterns(grid.grid, len(errors) - 1)
+        log.announce(shown)
+        pairs = pairs.joined(_photograph(grid, shown, log).select(slice(1, None)))
+        estimate = _estimate(grid, pairs, judging, log.names, progress)
+        errors.append(estimate.error)
+        logger.info("round %d: error of T p %.2f %%", len(errors) - 1, 100 * estimate.error)
+    return estimate.sketch()
+
+
+def _estimate(
+    grid: ScanGrid,
+    pairs: Pairs,
+    judging: np.ndarray,
+    names: Sequence[str],
+    progress: Callable[[str, int, int], object] | None,
+) -> _Estimate:
+    """Estimate T from all pairs that are not `judging`, white first, and judge it by these."""
     known_mixing = _known_mixing(grid.calibration.mixing, grid.channels)
 
     def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
         estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-        # A slice copies no pictures.
-        fitted = pairs.select(slice(0, first_judge))
-        estimator.learn(fitted.without([number for number in wrong if number < first_judge]))
+        if judging[-1] == len(pairs) - 1:
+            # A slice copies no pictures.
+            fitted = pairs.select(slice(0, judging[0]))
+            estimator.learn(fitted.without(wrong))
+        else:
+            left_out = np.union1d(judging, wrong).astype(int)
+            estimator.learn(pairs.select(np.setdiff1d(np.arange(len(pairs)), left_out)))
         return estimator
 
     wrong, estimator = find_wrong_pictures(pairs, learn)
-    _report_wrong([log.names[number - 1] for number in wrong], len(shown))
-    judging = pairs.select(slice(first_judge, None))
-    wrong_judges = [number - first_judge for number in wrong if number >= first_judge]
-    return _judged(estimator, judging.without(wrong_judges), wrong)
+    _report_wrong([names[number - 1] for number in wrong], len(names))
+    return _judged(estimator, pairs.select(np.setdiff1d(judging, wrong)), wrong)
 
 
 def _report_wrong(names: Sequence[str], patterns: int) -> None:
@@ -277,10 +368,40 @@ def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pai
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Estimate:
+    """T as it is estimated, and how it was judged.
+
+    `squares` are those of the relative errors of the judges, `scales` the factors of the variances
+    of T by which they explain these.
+    """
+
+    estimator: Estimator | RefinedEstimator
+    squares: np.ndarray
+    scales: np.ndarray
+    wrong_patterns: list[int]
+
+    @property
+    def error(self) -> float:
+        """The root mean square of the errors of the judges."""
+        return math.sqrt(self.squares.mean())
+
+    def sketch(self) -> Sketch:
+        """The transport, with what the judges say."""
+        return Sketch(
+            arrays=self.estimator.arrays(self.scales),
+            own_variance=self.estimator.own_variance() * self.scales[:, None],
+            errors=np.sqrt(self.squares),
+            error=self.error,
+            bound=error_bound(self.error, len(self.squares)),
+            wrong_patterns=self.wrong_patterns,
+        )
+
+
 def _judged(
     estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
-) -> Sketch:
-    """The transport of an estimator, and its error for pairs that it has not seen."""
+) -> _Estimate:
+    """The error of an estimator for pairs that it has not seen."""
     squares = np.zeros(len(pairs))
     is_lit = np.zeros(len(pairs), bool)
     left = np.zeros(estimator.channels)
@@ -298,15 +419,10 @@ def _judged(
         # Letters vanish in a picture of few rows.
         is_lit[number] = judge.patterns.any()
         left += of_channels
-    squares = squares[is_lit]
-    error = math.sqrt(squares.mean())
-    scales = estimator.scale_of_variance(pairs.patterns, left)
-    return Sketch(
-        arrays=estimator.arrays(scales),
-        own_variance=estimator.own_variance() * scales[:, None],
-        errors=np.sqrt(squares),
-        error=error,
-        bound=error_bound(error, len(squares)),
+    return _Estimate(
+        estimator=estimator,
+        squares=squares[is_lit],
+        scales=estimator.scale_of_variance(pairs.patterns, left),
         wrong_patterns=wrong_patterns,
     )
 
