@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Report, VirtualRig, acquire, camera_map, finalize
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map, finalize
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.plan import choose, plans
@@ -107,6 +107,10 @@ def test_colours_are_told_apart(tmp_path: Path) -> None:
     scale = (measured * expected).sum(axis=(0, 1)) / (measured**2).sum(axis=(0, 1))
     error = np.linalg.norm(scale * measured - expected) / np.linalg.norm(expected)
     assert error < 0.03
+    # In units of the photographs, whose ambient light is that of `Setup`.
+    white = np.asarray(Calibration.of(tmp_path / "T.zarr").white.value)
+    shown = np.asarray(T @ np.ones((8, 16, 3)))
+    np.testing.assert_allclose(shown.mean(axis=(0, 1)), white.mean(axis=(0, 1)), rtol=0.01)
 
 
 def test_a_person_takes_at_most_80_photographs() -> None:
