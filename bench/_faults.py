@@ -74,7 +74,8 @@ Shot = tuple[np.ndarray, float]
 class Setup:
     """A scene T (N, N) of a projector of (h, w) pixels, options of a camera, and how it is scanned.
 
-    `seed` is that of the noise, and of the place of the camera if it is not aligned.
+    `seed` is that of the noise, and of the place of the camera if it is not aligned. Faults are in
+    the last `own_photographs`, those of the scan itself, or anywhere if that is 0.
     """
 
     name: str
@@ -84,6 +85,14 @@ class Setup:
     strategy: str
     seed: int
     is_aligned: bool = False
+    own_photographs: int = 0
+
+    def draw_photograph(self, random: np.random.Generator, photographs: int) -> int:
+        """A number at random among so many photographs, but the last one."""
+        first = 2
+        if self.own_photographs:
+            first = photographs - self.own_photographs + 1
+        return int(random.integers(first, photographs - 1))
 
 
 class Person:

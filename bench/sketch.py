@@ -8,22 +8,34 @@ a channel), for pictures that no scan has seen:
 
     nature         four pictures with the spectrum 1 / f
     text           letters
-    checkerboard   fields of an eighth of the shorter side
+    checkerboard   fields of about a ninth of the shorter side, as patterns have those of 2^k pixels
     patches        nine lit squares of an eighth of the shorter side
 
-and a picture like nature is compensated and shown with the true T. Walls lie side by side in these
-scenes: at their edges light jumps, which is hard for a sketch.
+and a picture like nature is compensated and shown with the true T. Scenes are a corner of two walls
+on the pixel grid, and five in perspective, as a projector sees them (`scenes.perspective`).
 
-Baselines, on a corner of 64 x 64 pixels: an adaptive scan; pairs of pictures like nature with
+Of these, at 32 x 32 pixels, a picture like nature is separated into bounces, with T of a sketch and
+with T of a scan one pixel at a time, and compared with the true bounces. The errors with the true T
+are given, too: pixels are no points, and surfaces that the projector does not light bounce light.
+Scans of direct light alone are compared with the true one, as is the light that they say they left
+out.
+
+Baselines, on the corner of 64 x 64 pixels: an adaptive scan; pairs of pictures like nature with
 `ltcl.fit`, with linear regression of all of T on them (least squares of least norm, with the best
 of some ridges), and with single lit pixels by the kernel Nystroem method (Wang et al. 2009, rows by
 reciprocity, with the best of some powers). The last three have the light itself, with noise of
 0.2 % of white, and pay nothing for a set-up. Neither regression nor Nystroem can find the direct
 light, which is of full rank: they are given the true diagonal of T, and find the rest.
+
+Updates: a larger corner is scanned by a camera with three pixels to a side of one of the
+projector's, whose geometry Gray code shows. Then the projector moves by 3.7 pixels, aslant and
+across, its lamp loses 5 %, and 12 photographs carry the sketch over. T p is compared with the light
+of the corner as it is then (`_moved_corner`), on pixels of which something is known.
 """
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,11 +51,12 @@ import _figures as figures
 import ltcl
 from _figures import Claim
 from _harness import Options, parse_options
-from acquire import corner
+from _moved_corner import AMBIENT, MovedCornerRig
+from acquire import ALBEDO, corner
 from ltcl import Transport
-from ltcl.acquisition import Report, VirtualRig, acquire
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire
 from ltcl.acquisition.scanning.sketch import like_nature, text
-from ltcl.scenes import Block
+from scenes.perspective import SCENES, PerspectiveTransport
 
 # Response and bits of each camera.
 CAMERAS = {"12 bits": ("linear", 12), "8 bits, film": ("film", 8)}
@@ -51,11 +64,25 @@ CAMERAS = {"12 bits": ("linear", 12), "8 bits, film": ("film", 8)}
 MAX_PHOTOGRAPHS = 100
 MAX_ERRORS = {"nature": 0.01, "text": 0.01, "checkerboard": 0.015, "patches": 0.015}
 MAX_COMPENSATED_ERROR = 0.01
+# Pixels along each side of scenes in perspective, and of those whose bounces are compared.
+SIDE = 64
+BOUNCES_SIDE = 32
+SMOKE_SIDE = 8
+# Bounces that are compared, and largest error relative to that with all of T.
+BOUNCES = 3
+MAX_BOUNCE_RATIO = 1.3
+# Largest error of the direct light that a scan of it alone finds, and of the share it leaves out.
+MAX_DIRECT_ERROR = 0.05
 # Noise of the pictures of the baselines, relative to white.
 NOISE = 0.002
 RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
 POWERS = (0.25, 0.5, 1.0)
-COLOURS = (0.7, 0.5, 0.3)
+# Rows and columns by which the projector moves, 3.7 pixels in all, and what its lamp keeps.
+SHIFTS = {"aslant": (2.5, -2.73), "across the crease": (0.0, 3.7)}
+LAMP = 0.95
+# Photographs of an update, and its error relative to that of the scan, at most.
+MAX_UPDATE_PHOTOGRAPHS = 12
+MAX_UPDATE_RATIO = 1.2
 
 
 def pictures(grid: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -67,6 +94,8 @@ def pictures(grid: tuple[int, int]) -> dict[str, np.ndarray]:
         nature.append((noise - noise.min()) / np.ptp(noise))
     height, width = grid
     side = max(min(grid) // 8, 1)
+    # An odd number, for no pattern to be the same.
+    field = max((min(grid) // 9) | 1, 3)
     row, column = np.indices(grid)
     patches = []
     for down in (0.15, 0.45, 0.8):
@@ -78,7 +107,7 @@ def pictures(grid: tuple[int, int]) -> dict[str, np.ndarray]:
     return {
         "nature": np.array(nature),
         "text": text(grid)[None].astype(float),
-        "checkerboard": ((row // side + column // side) % 2)[None].astype(float),
+        "checkerboard": ((row // field + column // field) % 2)[None].astype(float),
         "patches": np.array(patches, float),
     }
 
@@ -153,12 +182,15 @@ def compensated_error(T: Transport, truth: Transport, scale: np.ndarray) -> floa
     return float(np.linalg.norm(picture - desired) / np.linalg.norm(desired))
 
 
-def run_scan(
-    name: str, truth: Transport, camera: str, strategy: str, options: Options, seed: int = 2
-) -> Result:
-    """Scan a scene with a camera, and compare."""
+def make_rig(truth: Transport, camera: str) -> CountingRig:
+    """A camera before a scene."""
     response, bits = CAMERAS[camera]
-    rig = CountingRig(truth, truth.grid, response=response, bits=bits, ambient=0.01, seed=seed)
+    return CountingRig(truth, truth.grid, response=response, bits=bits, ambient=0.01, seed=2)
+
+
+def run_scan(name: str, truth: Transport, camera: str, strategy: str, options: Options) -> Result:
+    """Scan a scene with a camera, and compare."""
+    rig = make_rig(truth, camera)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "T.zarr"
         start = time.perf_counter()
@@ -177,22 +209,101 @@ def run_scan(
         )
 
 
-def scenes(smoke: bool, options: Options) -> dict[str, Transport]:
-    """The true transports by the names of their scenes."""
-    large, small = (6, 4) if smoke else (32, 16)
-    block = Block(corner=(0.35, 0.35, 0.0), size=(0.3, 0.3, 0.4), albedo=0.6)
-    colours = [[r, g, b] for r, g, b in ((0.7, 0.4, 0.3), (0.4, 0.6, 0.4), (0.6, 0.6, 0.6))]
-    glossy = ltcl.scenes.glossy(
-        ltcl.scenes.dihedral(1), small, 0.7, 0.4, 20.0, projector=(1.6, 1.3, 0.5), directions=64
+def transport_of(scene: PerspectiveTransport, options: Options) -> Transport:
+    """The true transport of a scene in perspective."""
+    matrices = [scene.matrix(channel).astype(np.float32) for channel in range(scene.channels)]
+    matrix = matrices if scene.channels == 3 else matrices[0]
+    return Transport(matrix, scene.grid, device=options.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BounceErrors:
+    """Relative errors of direct light and bounces, (1 + BOUNCES,) each.
+
+    `sketched` with T of a sketch, `scanned` of a scan one pixel at a time, `true` with the true T.
+    """
+
+    name: str
+    sketched: np.ndarray
+    scanned: np.ndarray
+    true: np.ndarray
+
+
+def compare_bounces(
+    name: str, scene: PerspectiveTransport, truth: Transport, options: Options
+) -> BounceErrors:
+    """Separate a picture with measured transports, and compare with its true bounces."""
+    pattern = pictures(truth.grid)["nature"][0]
+    exact = scene.bounces(pattern, BOUNCES)
+    picture = shown(truth, pattern)
+
+    def errors(T: Transport) -> np.ndarray:
+        scale = unit(T, truth)
+        image = (picture / scale).reshape(*truth.grid, -1).astype(np.float32)
+        if T.channels == 1:
+            image = image[..., 0]
+        separated = ltcl.separate(T, image, bounces=BOUNCES, rtol=1e-5)
+        parts = np.stack([separated.direct, *separated.bounces]).reshape(exact.shape)
+        left = np.linalg.norm(parts * scale - exact, axis=(1, 2))
+        return left / np.linalg.norm(exact, axis=(1, 2))
+
+    measured = {}
+    for strategy in ("sketch", "pixel"):
+        rig = make_rig(truth, "12 bits")
+        T = acquire(rig, geometry="aligned", strategy=strategy, device=options.device)
+        measured[strategy] = errors(T)
+    return BounceErrors(
+        name=name, sketched=measured["sketch"], scanned=measured["pixel"], true=errors(truth)
     )
-    made = {
-        "dihedral": ltcl.scenes.dihedral(large),
-        "coloured trihedral": ltcl.scenes.box(small, sides=3, albedo=colours),
-        "box with a block": ltcl.scenes.box(small, sides=3, occluder=block, device=options.device),
-        "closed box": ltcl.scenes.box(small, sides=6, albedo=0.5),
-        "glossy corner": glossy,
-    }
-    return {name: scene.transport(device=options.device) for name, scene in made.items()}
+
+
+def direct_claims(
+    name: str, scene: PerspectiveTransport, truth: Transport, options: Options
+) -> list[Claim]:
+    """Check a scan of direct light alone."""
+    white = np.ones(truth.grid)
+    exact = scene.bounces(white, 0)[0]
+    left_out = float(np.median(1.0 - exact.sum(axis=1) / shown(truth, white).sum(axis=1)))
+    rig = make_rig(truth, "12 bits")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "T.zarr"
+        T = acquire(rig, geometry="aligned", strategy="direct", store=path, device=options.device)
+        report = Report.of(path)
+        own = np.atleast_2d(T.first_bounce).T
+    # The camera's unit of light in each channel.
+    scale = (own * exact).sum(axis=0) / (own**2).sum(axis=0)
+    error = float(np.linalg.norm(own * scale - exact) / np.linalg.norm(exact))
+    size = f"{BOUNCES_SIDE} x {BOUNCES_SIDE}"
+    return [
+        Claim(
+            text=f"{name}, {size}: direct light, {rig.count} photographs",
+            measured=f"{error:.2%}, stated {report.judged_error:.2%}",
+            wanted=f"at most {MAX_DIRECT_ERROR:.0%}",
+            holds=error <= MAX_DIRECT_ERROR,
+        ),
+        Claim(
+            text=f"{name}, {size}: indirect light that a scan of direct light says it left out",
+            measured=f"{report.left_out:.1%}, true {left_out:.1%}",
+            wanted=f"within {MAX_DIRECT_ERROR:.0%}",
+            holds=abs(report.left_out - left_out) <= MAX_DIRECT_ERROR,
+        ),
+    ]
+
+
+def bounce_claims(errors: BounceErrors) -> list[Claim]:
+    """Check the bounces of a sketch."""
+    checked = []
+    for bounce, (ours, all_of_T) in enumerate(zip(errors.sketched, errors.scanned, strict=True)):
+        ratio = ours / all_of_T
+        checked.append(
+            Claim(
+                text=f"{errors.name}, {BOUNCES_SIDE} x {BOUNCES_SIDE}: bounce {bounce}",
+                measured=f"{ours:.2%}, with all of T {all_of_T:.2%}: {ratio:.2f}",
+                wanted=f"at most {MAX_BOUNCE_RATIO:g} times",
+                holds=ratio <= MAX_BOUNCE_RATIO,
+            )
+        )
+    return checked
 
 
 def like_nature_pairs(truth: Transport, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -264,6 +375,119 @@ def nystroem(truth: Transport, count: int) -> dict[str, float]:
     return best(truth, [partial(product, power) for power in POWERS])
 
 
+def scan_with_cameras(name: str, truth: Transport, options: Options) -> list[Result]:
+    """Sketches of a scene by all cameras; by one if it is but shown that the bench runs."""
+    cameras = list(CAMERAS)
+    if options.smoke:
+        cameras = cameras[:1]
+    return [run_scan(name, truth, camera, "sketch", options) for camera in cameras]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Updated:
+    """A scan that was carried over: photographs, seconds, and errors of T p for all pictures.
+
+    `still` is the error of the old transport in the new place, `judged` what the update states,
+    `bound` what others are below.
+    """
+
+    name: str
+    photographs: int
+    seconds: float
+    errors: dict[str, float]
+    old_errors: dict[str, float]
+    still: float
+    judged: float
+    bound: float
+    masked: int
+
+    @property
+    def ratio(self) -> float:
+        """Error of the update relative to that of the scan, root mean squares of all kinds."""
+        return root_mean_square(self.errors) / root_mean_square(self.old_errors)
+
+
+def root_mean_square(errors: dict[str, float]) -> float:
+    """Root mean square of the errors of all kinds of pictures."""
+    return float(np.sqrt(np.mean(np.square(list(errors.values())))))
+
+
+def errors_on_camera(store: Path, T: Transport, rig: MovedCornerRig) -> dict[str, float]:
+    """Errors of T p for each kind of picture, in light that the camera sees, on known pixels."""
+    resampling = Calibration.of(store).resampling
+    known = ~T.masked
+    white = resampling.apply(rig.light(np.ones(T.grid)) - AMBIENT).ravel()[known]
+    ours = shown(T, np.ones(T.grid))[known, 0]
+    scale = float(ours @ white / (ours @ ours))
+    errors = {}
+    for kind, patterns in pictures(T.grid).items():
+        squares = []
+        for pattern in patterns:
+            seen = resampling.apply(rig.light(pattern) - AMBIENT).ravel()[known]
+            left = scale * shown(T, pattern)[known, 0] - seen
+            squares.append((left @ left) / (seen @ seen))
+        errors[kind] = float(np.sqrt(np.mean(squares)))
+    return errors
+
+
+def run_updates(side: int, options: Options) -> list[Updated]:
+    """Scan a corner, move the projector, and update, in each direction."""
+    sensor = {"response": "linear", "bits": 12}
+    updates = []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "T.zarr"
+        before = MovedCornerRig(side, ALBEDO, seed=2, **sensor)
+        T = acquire(before, strategy="sketch", store=path, device=options.device)
+        old_errors = errors_on_camera(path, T, before)
+        for name, shift in SHIFTS.items():
+            if options.smoke:
+                shift = (0.25 * shift[0], 0.25 * shift[1])
+            now = MovedCornerRig(side, ALBEDO, shift=shift, lamp=LAMP, seed=9, **sensor)
+            store = Path(folder) / f"{name}.zarr"
+            start = time.perf_counter()
+            update = ltcl.update(now, path, store=store, device=options.device)
+            seconds = time.perf_counter() - start
+            updated = Updated(
+                name=f"update, moved {name}",
+                photographs=now.count,
+                seconds=seconds,
+                errors=errors_on_camera(store, update.transport, now),
+                old_errors=old_errors,
+                still=root_mean_square(errors_on_camera(path, T, now)),
+                judged=update.error,
+                bound=update.bound,
+                masked=update.masked,
+            )
+            updates.append(updated)
+    return updates
+
+
+def update_claims(updated: Updated) -> list[Claim]:
+    """Check an update."""
+    error = root_mean_square(updated.errors)
+    old_error = root_mean_square(updated.old_errors)
+    return [
+        Claim(
+            text=f"{updated.name} by 3.7 pixels, 5 % less light: photographs",
+            measured=str(updated.photographs),
+            wanted=f"at most {MAX_UPDATE_PHOTOGRAPHS}",
+            holds=updated.photographs <= MAX_UPDATE_PHOTOGRAPHS,
+        ),
+        Claim(
+            text=f"{updated.name}: error relative to that of the scan",
+            measured=f"{updated.ratio:.2f}: {error:.2%}, {old_error:.2%} in the scan",
+            wanted=f"at most {MAX_UPDATE_RATIO:.1f}",
+            holds=updated.ratio <= MAX_UPDATE_RATIO,
+        ),
+        Claim(
+            text=f"{updated.name}: its error is within what is stated",
+            measured=f"{error:.2%}, stated {updated.judged:.2%}, at most {updated.bound:.2%}",
+            wanted="below the bound",
+            holds=error <= updated.bound,
+        ),
+    ]
+
+
 def claims(result: Result) -> list[Claim]:
     """Check a sketch."""
     checked = [
@@ -318,14 +542,25 @@ def draw(curves: dict[str, list[tuple[int, float]]]) -> Figure:
 def main() -> None:
     """Run the bench."""
     options = parse_options(__doc__)
-    side = 8 if options.smoke else 64
+    # A noisy T warns.
+    logging.getLogger("ltcl").setLevel(logging.ERROR)
+    side = SMOKE_SIDE if options.smoke else SIDE
+    bounces_side = SMOKE_SIDE if options.smoke else BOUNCES_SIDE
     counts = (20,) if options.smoke else (25, 50, 100, 200)
     square = Transport(corner(side), (side, side), device=options.device)
-    truths = {f"corner {side} x {side}": square, **scenes(options.smoke, options)}
-    results = []
-    for name, truth in truths.items():
-        for camera in CAMERAS:
-            results.append(run_scan(name, truth, camera, "sketch", options))
+    results = scan_with_cameras(f"corner {side} x {side}", square, options)
+    bounces = []
+    direct: list[Claim] = []
+    names = list(SCENES)
+    if options.smoke:
+        names = names[:2]
+    for name in names:
+        truth = transport_of(PerspectiveTransport(name, (side, side)), options)
+        results += scan_with_cameras(name, truth, options)
+        smaller = PerspectiveTransport(name, (bounces_side, bounces_side))
+        truth = transport_of(smaller, options)
+        bounces.append(compare_bounces(name, smaller, truth, options))
+        direct += direct_claims(name, smaller, truth, options)
 
     adaptive = run_scan(f"corner {side} x {side}, adaptive", square, "12 bits", "adaptive", options)
     curves = {
@@ -353,6 +588,19 @@ def main() -> None:
     for result in results:
         facts[f"{result.name}, seconds"] = result.seconds
         checked += claims(result)
+    for errors in bounces:
+        listed = ", ".join(f"{error:.2%}" for error in errors.true)
+        facts[f"{errors.name}: bounces 0 to {BOUNCES} with the true T, off"] = listed
+        checked += bounce_claims(errors)
+    checked += direct
+    for updated in run_updates(2 * side if options.smoke else side, options):
+        facts[f"{updated.name}, seconds"] = updated.seconds
+        facts[f"{updated.name}, error without an update"] = updated.still
+        facts[f"{updated.name}, masked pixels"] = updated.masked
+        for kind, error in updated.errors.items():
+            facts[f"{updated.name}, {kind}"] = error
+            facts[f"{updated.name}, {kind} in the scan"] = updated.old_errors[kind]
+        checked += update_claims(updated)
     if options.smoke:
         # So few pixels show that it runs, not how few photographs a larger scene takes.
         checked = []

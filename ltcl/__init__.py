@@ -42,7 +42,7 @@ from ltcl.transport.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
-    from ltcl.acquisition import acquire, align, fit
+    from ltcl.acquisition import acquire, align, fit, update
     from ltcl.viewer import view
 
 __version__ = "0.1.0"
@@ -82,6 +82,7 @@ __all__ = [
     "solve",
     "solvers",
     "theory",
+    "update",
     "view",
 ]
 
@@ -99,6 +100,7 @@ _FUNCTIONS = {
     "acquire": "acquisition",
     "align": "acquisition",
     "fit": "acquisition",
+    "update": "acquisition",
     "view": "viewer",
 }
 

@@ -46,7 +46,10 @@ SIDEWAYS = {("acquisition", "store")}
 # Folders that stay free of OpenCL, although it stands below them, and the modules in them that
 # open the device of the caller.
 WITHOUT_DEVICE = {"acquisition", "images", "store"}
-OPENS_DEVICE = {("ltcl.acquisition.task", "ltcl.device")}
+OPENS_DEVICE = {
+    ("ltcl.acquisition.task", "ltcl.device"),
+    ("ltcl.acquisition.updating.task", "ltcl.device"),
+}
 DEVICE_UNITS = {"device", "operators"}
 
 # Folders around the core: a scan from the command line passes through some of their files.

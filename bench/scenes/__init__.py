@@ -3,5 +3,6 @@
 
 `tracing` traces T by bounces with Mitsuba 3, `dataset` makes the files of a scene, `scoring` runs
 anybody's method and judges its results, `baselines` are such methods. README.md describes the
-formats.
+formats. `perspective` has T of such scenes without noise and without Mitsuba, from form factors
+(`exchange`) of the pieces that pixels see (`pieces`).
 """

@@ -8,6 +8,7 @@
                   camera's full resolution wait in a file (`scratch`, `radiance`)
     scanning/     patterns in order, and T from the pictures; a plan before, a report after
     estimation/   T from any pairs of pictures and photographs
+    updating/     a finished scan carried over by 12 photographs, after a nudge
     agreement     photographs that deviate from the others are refused by number; `anchor`: did
                   anything move?
     project       an acquisition as a folder with an acquisition.toml
@@ -36,6 +37,7 @@ from ltcl.acquisition.rigs import (
 from ltcl.acquisition.scanning.report import Report
 from ltcl.acquisition.settings import ScanSettings
 from ltcl.acquisition.task import acquire, finalize
+from ltcl.acquisition.updating.task import Update, update
 
 __all__ = [
     "Alignment",
@@ -54,10 +56,12 @@ __all__ = [
     "ScanSettings",
     "Setup",
     "Shots",
+    "Update",
     "VirtualRig",
     "acquire",
     "align",
     "camera_map",
     "finalize",
     "fit",
+    "update",
 ]

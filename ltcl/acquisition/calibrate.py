@@ -26,7 +26,7 @@ import numpy as np
 from ltcl.acquisition import anchor, consistency, radiometry
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
-from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.calibration import Calibration, StoredMap
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness, decode
 from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.metering import (
@@ -322,6 +322,7 @@ def measure(
         resampling=resampling,
         sharpness=view.sharpness,
         anchor=Anchor.of(blocks, resampling),
+        mapping=view.mapping,
     )
 
 
@@ -433,6 +434,7 @@ class _View:
     sharpness: Sharpness | None = None
     stripes: Sequence[Photograph] = ()
     light: PhotographFile | None = None
+    mapping: StoredMap | None = None
 
     @property
     def camera_pixels(self) -> float:
@@ -468,6 +470,7 @@ def _measure_geometry(
         sharpness=Sharpness.of(geometry, resampling, light or ()),
         stripes=stripes,
         light=light,
+        mapping=StoredMap.of(geometry, session.file),
     )
 
 

@@ -24,12 +24,12 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.anchor import Anchor
-from ltcl.acquisition.geometry import Resampling
+from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, on_projector
 from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
-from ltcl.acquisition.scratch import ImageFile
+from ltcl.acquisition.scratch import ImageFile, StoredImage
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
 from ltcl.transport.transport import Transport
@@ -40,13 +40,27 @@ PREFIX = "calibration."
 PART = ".part"
 # Bytes of an extra array: a part is in memory several times when it is written or checked.
 PART_BYTES = 1 << 25
-# Beginnings of the names of pictures.
-PICTURES = ("ambient.", "white.")
+# Beginnings of the names of pictures, and of the map.
+MAP = "map."
+PICTURES = ("ambient.", "white.", MAP)
 # Share of the camera pixels of a projector pixel that must be valid; with less its value is
 # unknown.
 MIN_VALID_SHARE = 0.5
 # Random patterns by which a transport is compared with a known scene.
 COMPARED_PATTERNS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredMap:
+    """The coordinates of a `Correspondence` in a temporary file, NaN where they are not valid."""
+
+    x: StoredImage
+    y: StoredImage
+
+    @classmethod
+    def of(cls, mapping: Correspondence, file: ImageFile) -> StoredMap:
+        """A map, written to a file."""
+        return cls(x=file.append(mapping.x), y=file.append(mapping.y))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -72,6 +86,9 @@ class Calibration:
         None with an aligned camera.
     anchor : Anchor, optional
         The pattern of blocks, which is photographed again during the scan.
+    mapping : StoredMap, optional
+        The map behind the resampling, for a store; `stored_map` reads it again. None with an
+        aligned camera.
     """
 
     exposures: tuple[float, ...]
@@ -85,6 +102,7 @@ class Calibration:
     resampling: Resampling
     sharpness: Sharpness | None = None
     anchor: Anchor | None = None
+    mapping: StoredMap | None = None
 
     @property
     def light(self) -> np.ndarray:
@@ -152,6 +170,10 @@ class Calibration:
             _write_parts(store, name, len(array), array.nbytes, array.__getitem__)
         _write_radiance(store, "ambient.", self.ambient)
         _write_radiance(store, "white.", self.white)
+        if self.mapping is not None:
+            for name, image in (("x", self.mapping.x), ("y", self.mapping.y)):
+                nbytes = 4 * math.prod(image.shape)
+                _write_parts(store, f"{MAP}{name}", image.shape[0], nbytes, image.read)
 
 
 def is_calibrated(store: BlockStore) -> bool:
@@ -160,6 +182,27 @@ def is_calibrated(store: BlockStore) -> bool:
     The strategy of the scan, which the calibration decides, is written last: that commits it.
     """
     return "strategy" in store.attributes
+
+
+def stored_map(store: BlockStore) -> Correspondence:
+    """The map from camera pixels to the projector's in a store of `ltcl.acquire`.
+
+    FileError if it was made before maps were kept.
+    """
+    parts = _parts(name for name in store.extras if name.startswith(PREFIX + MAP))
+    grid = np.shape(store.extra(f"{PREFIX}resampling.coverage"))
+    height, width = grid
+    if not parts:
+        camera_grid = np.array(store.extra(f"{PREFIX}resampling.camera_grid")).tolist()
+        if store.attributes["settings"]["geometry"] != "aligned" or camera_grid != [*grid]:
+            raise FileError(
+                f"{store.path}: does not keep which projector pixel each camera pixel sees; "
+                "ltcl.acquire keeps it now: scan again"
+            )
+        return Correspondence.aligned((height, width))
+    x = _joined(store, parts[f"{MAP}x"])
+    y = _joined(store, parts[f"{MAP}y"])
+    return Correspondence(x, y, np.isfinite(x), (height, width))
 
 
 def _write_parts(

@@ -161,7 +161,9 @@ class Project:
         return "begun" if is_calibrated(store) else "new"
 
     @contextlib.contextmanager
-    def rig(self, *, closed: bool = False, aligned: bool = False) -> Iterator[Any]:
+    def rig(
+        self, *, closed: bool = False, aligned: bool = False, photographs: Path | None = None
+    ) -> Iterator[Any]:
         """The rig, which is closed at the end of the block.
 
         Parameters
@@ -170,6 +172,8 @@ class Project:
             Open no camera and no display: a live rig then has its grid and channels only.
         aligned : bool
             Photograph a virtual rig on the pixels that its transport has.
+        photographs : Path, optional
+            Folder of patterns and photographs of a folder rig, instead of that of the acquisition.
         """
         table = dict(self.table)
         if aligned:
@@ -177,7 +181,10 @@ class Project:
             table.pop("camera_grid", None)
         with self.naming("rig"):
             try:
-                rig = _make_rig(self.folder, table, closed)
+                if self.kind == "folder" and photographs is not None:
+                    rig = _make_rig(photographs, table, closed)
+                else:
+                    rig = _make_rig(self.folder, table, closed)
             except LtclError:
                 raise
             except (TypeError, ValueError) as error:

@@ -47,6 +47,11 @@ class ScanSettings:
         Share of a camera pixel's light under white above which "adaptive" divides a cell.
     sigmas : float
         Standard deviations above which an entry, or a sum of entries, is kept; 0 keeps all.
+    rtol : float, optional
+        Relative error of pictures down to which a sketch goes on with more patterns, while that
+        helps; None: the first patterns are all.
+    photographs : int, optional
+        Photographs that a sketch takes at most; with `rtol` None it goes on up to these.
 
     Examples
     --------
@@ -63,6 +68,8 @@ class ScanSettings:
     order: int = 63
     threshold: float = 0.004
     sigmas: float = 3.0
+    rtol: float | None = None
+    photographs: int | None = None
 
     def for_rig(self, shots: Shots) -> ScanSettings:
         """Check the settings for a rig; `exposures` become those that its camera offers.
@@ -80,6 +87,12 @@ class ScanSettings:
         if checks.count("order", self.order) & (self.order + 1):
             raise InputError(f"order is {self.order}; it must be 2^k - 1: 1, 3, 7, 15, ...")
         checks.one_of("strategy", self.strategy, ("auto", *STRATEGIES))
+        rtol = self.rtol
+        if rtol is not None:
+            rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
+        photographs = self.photographs
+        if photographs is not None:
+            photographs = checks.count("photographs", photographs)
         return replace(
             self,
             exposures=exposures,
@@ -88,6 +101,8 @@ class ScanSettings:
             order=int(self.order),
             threshold=checks.number("threshold", self.threshold, above=0.0, below=1.0),
             sigmas=checks.number("sigmas", self.sigmas, least=0.0),
+            rtol=rtol,
+            photographs=photographs,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -103,6 +118,8 @@ class ScanSettings:
             "order": self.order,
             "threshold": self.threshold,
             "sigmas": self.sigmas,
+            "rtol": self.rtol,
+            "photographs": self.photographs,
         }
 
     @classmethod

@@ -23,7 +23,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
-from ltcl.acquisition.estimation import refinement
+from ltcl.acquisition.estimation import windows
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
@@ -73,6 +73,8 @@ def acquire(
     order: int = ScanSettings.order,
     threshold: float = ScanSettings.threshold,
     sigmas: float = ScanSettings.sigmas,
+    rtol: float | None = ScanSettings.rtol,
+    photographs: int | None = ScanSettings.photographs,
     device: Any = None,
 ) -> Transport:
     """Measure the transport between a projector and a camera, or go on where that was stopped.
@@ -111,6 +113,12 @@ def acquire(
         Share of a camera pixel's light under white, above which a cell is divided by "adaptive";
         standard deviations above which an entry or a sum of entries is light and not noise, 0 keeps
         all.
+    rtol : float, optional
+        Relative error of T p, for pictures that judge it, down to which a sketch goes on with
+        rounds of 16 more patterns, as long as they help.
+    photographs : int, optional
+        Photographs that a sketch takes at most, those of the set-up included; without `rtol` it
+        takes them all.
     device : Device or str, optional
         As in `Transport`; opened before the first photograph.
 
@@ -161,6 +169,8 @@ def acquire(
         order=order,
         threshold=threshold,
         sigmas=sigmas,
+        rtol=rtol,
+        photographs=photographs,
     ).for_rig(shots)
     if device is not None:
         device = open_device(device)
@@ -333,7 +343,8 @@ def _calibrate(
     if settings.strategy == "direct":
         direct.check_memory(shots.grid, shots.channels)
     elif plan.is_sketched(settings.strategy, shots.grid):
-        refinement.check_memory(shots.grid, shots.channels)
+        windows.check_memory(shots.grid, shots.channels)
+        _check_photographs(shots, settings)
     calibration = calibrate.measure(
         shots,
         sparing=plan.is_sparing(settings.strategy, shots.grid),
@@ -352,7 +363,7 @@ def _calibrate(
     # Overwrites the store of a run that ended before its calibration was committed.
     store = BlockStore.create(
         path,
-        **_store_sizes(chosen.strategy, grid, settings.order),
+        **_store_sizes(chosen, grid, settings, len(calibration.exposures)),
         provenance={"acquisition": json.loads(description)},
         overwrite=True,
     )
@@ -363,6 +374,27 @@ def _calibrate(
         settings=settings.to_json(), why=reason, plan=asdict(chosen), strategy=chosen.strategy
     )
     return store
+
+
+def _check_photographs(shots: Shots, settings: ScanSettings) -> None:
+    """Refuse fewer photographs than a sketch takes."""
+    if settings.photographs is None:
+        return
+    planned = plan.plans(
+        shots.grid,
+        (1.0,),
+        channels=shots.channels,
+        frames=settings.frames,
+        aligned=settings.geometry != "graycode",
+        by_hand=shots.keeps_photographs,
+    )
+    least = planned["sketch"].photographs
+    if settings.photographs < least:
+        height, width = shots.grid
+        raise InputError(
+            f"photographs is {settings.photographs}; a sketch of {height} x {width} pixels takes "
+            f"about {least}, so it must be as many or more"
+        )
 
 
 def _choose_plan(
@@ -387,12 +419,16 @@ def _choose_plan(
     return plans[strategy], reason
 
 
-def _store_sizes(strategy: str, grid: ScanGrid, order: int) -> dict[str, Any]:
+def _store_sizes(
+    chosen: plan.Plan, grid: ScanGrid, settings: ScanSettings, exposures: int
+) -> dict[str, Any]:
     """Sizes of the store of a scan: columns of T, or pictures."""
+    strategy = chosen.strategy
     pixels = math.prod(grid.grid)
     if strategy in PICTURE_STRATEGIES:
         if strategy == "sketch":
-            most = sketch.most_patterns(grid.grid)
+            rounds = _most_rounds(settings, chosen.photographs, exposures)
+            most = sketch.most_patterns(grid.grid, rounds)
         elif strategy == "direct":
             most = direct.most_patterns(grid.grid)
         else:
@@ -408,7 +444,7 @@ def _store_sizes(strategy: str, grid: ScanGrid, order: int) -> dict[str, Any]:
         "channels": grid.channels,
         "shape": (pixels, pixels),
         "grid": grid.grid,
-        "block_rows": columns.choose_code(strategy, grid.grid, order).size,
+        "block_rows": columns.choose_code(strategy, grid.grid, settings.order).size,
     }
 
 
@@ -457,7 +493,7 @@ def _run_pictures(
     log = PictureLog(store, camera, count)
     strategy = store.attributes["strategy"]
     if strategy == "sketch":
-        sketched = sketch.scan(grid, log, progress)
+        sketched = sketch.scan(grid, log, progress, _rounds(store, settings))
         store.update(patterns=log.done)
         sketch.finish(store, sketched)
         if sketched.error > NOTABLE_ERROR:
@@ -472,6 +508,22 @@ def _run_pictures(
         store.update(patterns=log.done)
         adaptive.finish(store, grid, core, grid.calibration.mixing, settings.sigmas)
     progress("scan", log.done, log.done)
+
+
+def _rounds(store: BlockStore, settings: ScanSettings) -> sketch.Rounds:
+    """The rounds of a sketch after its first patterns, as the settings ask for them."""
+    planned = store.attributes["plan"]
+    exposures = len(Calibration.of(store).exposures)
+    first = int(planned["photographs"])
+    return sketch.Rounds(most=_most_rounds(settings, first, exposures), rtol=settings.rtol)
+
+
+def _most_rounds(settings: ScanSettings, first: int, exposures: int) -> int:
+    """Rounds of a sketch at most, whose first patterns and set-up take `first` photographs."""
+    if settings.photographs is None:
+        return 0 if settings.rtol is None else sketch.MAX_ROUNDS
+    of_round = exposures * BATCH_SIZE + 1
+    return min(max((settings.photographs - first) // of_round, 0), sketch.MAX_ROUNDS)
 
 
 def _tell_left_out(share: float) -> None:

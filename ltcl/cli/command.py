@@ -34,8 +34,8 @@ INTERNAL = 70
 INTERRUPTED = 130
 EXIT_CODES = (
     "**Exit codes:** 0 done; 1 refused or failed, with one line that tells "
-    "why; 2 wrong usage; 3 'ltcl acquire run' waits for photographs that a "
-    "person has to take; 70 an error in ltcl itself; 130 Ctrl-C.\n\n"
+    "why; 2 wrong usage; 3 'ltcl acquire run', or 'update', waits for photographs "
+    "that a person has to take; 70 an error in ltcl itself; 130 Ctrl-C.\n\n"
     "With **--json** stdout holds one JSON document, also if a command fails: "
     '{"error": the problem, "type": its class in ltcl.errors, '
     '"exit_code": as above}. docs/reference/json.md has all fields.'

@@ -3,7 +3,7 @@
 
 Direct light is from 0 to all of a picture. T of a Lambertian scene is reciprocal, its bounces have
 no negative light (section 8.4, eq. 28 and 29), and no flat wall lights itself, as ambient light
-left in T would suggest.
+left in T would suggest, and light by way of unlit surfaces.
 """
 
 from __future__ import annotations
@@ -120,8 +120,9 @@ def bounce_warning(T: Transport) -> str:
     warnings = []
     if T.ambient_share > LARGEST_AMBIENT:
         warnings.append(
-            f"{T.ambient_share:.0%} of a bounce looks like ambient light left in T, and bounces "
-            "are too bright: subtract black from each picture of T"
+            f"{T.ambient_share:.0%} of a bounce reaches all places alike: unless black was "
+            "subtracted from each picture of T, this is ambient light, and bounces are too bright; "
+            "else it came by way of surfaces that the projector does not light"
         )
     reasons = []
     # Comparisons with NaN, of what is unknown, are false.

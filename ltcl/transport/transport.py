@@ -379,6 +379,11 @@ class Transport:
         """`noise`, or None if it is an estimate from T alone."""
         return None if self._noise is None else self.noise
 
+    @property
+    def is_acquired(self) -> bool:
+        """True if T is of a scan by `ltcl.acquire`, which subtracts black; its noise tells."""
+        return self._noise is not None and self.noise.source == "acquired"
+
     # First bounce and interreflection.
 
     @property
@@ -449,9 +454,12 @@ class Transport:
 
     @cached_property
     def ambient_share(self) -> float:
-        """Ambient light left in T, as a share of a bounce; 0 if T shows no entries, or few."""
+        """Light that reaches all places alike, such as ambient light, as a share of a bounce.
+
+        It is 0 if T shows no entries, or few, and if it is acquired, so that black is subtracted.
+        """
         has_entries = all(isinstance(T, ENTRIES) for T in self.matrices)
-        if not has_entries:
+        if self.is_acquired or not has_entries:
             return 0.0
         return diagnostics.ambient_share(self.systems, self.grid)
 

@@ -14,7 +14,7 @@ import pytest
 
 import ltcl
 from ltcl import images
-from ltcl.acquisition import FolderRig, VirtualRig, rigs
+from ltcl.acquisition import FolderRig, Project, VirtualRig, rigs
 from ltcl.store import BlockStore
 
 GRID = (4, 8)
@@ -242,6 +242,62 @@ def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, tmp_pa
         still_missing = FolderRig(folder, GRID, pattern_bits=16).missing()
         assert not {*missing} & {*still_missing}
     assert relative_error(folder, simulated) < 0.02
+
+
+def dim(scan: Path, lamp: float) -> None:
+    """Replace the scene of a scan by one with an older lamp."""
+    T = ltcl.load(scan / "truth.npz")
+    ltcl.save(scan / "truth.npz", ltcl.Transport(lamp * np.asarray(T.matrices[0]), T.grid))
+
+
+@pytest.mark.slow
+def test_a_scan_is_carried_over_to_an_older_lamp(program, finished):
+    before = program("acquire", "report", finished, "--json").json
+    dim(finished, 0.9)
+    report = program("acquire", "update", finished, "--json").json
+    assert report["store"] == str(finished / "updated.zarr")
+    assert report["scan"] == str(finished / "transport.zarr")
+    assert report["photographs"] == 12
+    assert report["gain"][0] == pytest.approx(0.9, abs=0.01)
+    assert report["largest"] == 0.0
+    assert report["holds"]
+    assert report["previous_error"] is None
+    program("acquire", "update", finished).refused("updated.zarr: exists")
+    printed = program("acquire", "update", finished, "--store", finished / "again.zarr").out
+    for text in ("12 photographs", "nothing has moved", "the update holds", "again.zarr"):
+        assert text in printed
+    # The old scan is as it was, but for the scene that it is compared with.
+    after = program("acquire", "report", finished, "--json").json
+    assert after["photographs"] == before["photographs"]
+    p = random.random(GRID).astype(np.float32)
+    old = np.asarray(ltcl.load(finished / "transport.zarr") @ p)
+    new = np.asarray(ltcl.load(finished / "updated.zarr") @ p)
+    assert np.linalg.norm(new - 0.9 * old) < 0.02 * np.linalg.norm(old)
+
+
+@pytest.mark.slow
+def test_a_person_takes_the_photographs_of_an_update_in_one_round(program, finished):
+    dim(finished, 0.95)
+    with Project.open(finished).rig() as camera:
+        scene = camera
+    path = finished / "acquisition.toml"
+    settings = path.read_text().partition("\n[acquire]\n")[2]
+    by_hand = 'kind = "folder"\nprojector_grid = [4, 8]\npattern_bits = 16\ncamera_bits = 12\n'
+    path.write_text(f"[rig]\n{by_hand}[acquire]\n{settings}")
+    outcome = program("acquire", "update", finished)
+    assert outcome.code == 3
+    folder = finished / "updated.zarr.photographs"
+    for part in (f"ltcl show {folder}", f"ltcl acquire update {finished} --take CARD"):
+        assert part in outcome.out
+    report = program("acquire", "update", finished, "--json").document
+    assert report["missing"] == list(range(1, 13))
+    assert (folder / report["next"]["pattern"]).is_file()
+    for row in (folder / "shots.csv").read_text().splitlines()[1:]:
+        _, pattern, seconds, name = row.split(",")
+        picture = scene.photograph(images.read_codes(folder / pattern) / 65535, float(seconds))
+        cv2.imwrite(str(folder / f"{name}.png"), picture)
+    report = program("acquire", "update", finished, "--json").json
+    assert report["gain"][0] == pytest.approx(0.95, abs=0.02)
 
 
 @pytest.mark.parametrize(

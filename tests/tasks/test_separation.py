@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import ltcl
 from ltcl.errors import ConvergenceError, InputError, InputTypeError, MemoryLimitError
 from ltcl.solvers import Status
+from ltcl.transport.noise import Noise
 from tests.problems import lambertian
 
 GRID = (4, 7)
@@ -197,3 +198,21 @@ def test_ambient_light_left_in_T_is_warned_of_and_no_clean_scene_is(
         assert ("ambient light" in caplog.text) == (ambient > 0)
         assert ("ambient light" in b.warning) == (ambient > 0)
         assert len(caplog.records) <= 1
+
+
+def test_light_by_way_of_unlit_walls_is_not_called_ambient(device):
+    """Three walls of a closed room are seen and lit; nothing is left of black."""
+    full = ltcl.scenes.box(8, albedo=0.7)
+    height, width = full.grid
+    seen = np.arange(height * width).reshape(full.grid)[:, :24].ravel()
+    matrix = full.transport().to_numpy()[np.ix_(seen, seen)]
+    grid = (8, 24)
+    T = ltcl.Transport(matrix, grid, device=device)
+    b = ltcl.separate(T, T @ np.ones(grid), bounces=1)
+    assert "surfaces that the projector does not light" in b.warning
+    # A scan has subtracted black.
+    noise = Noise.uniform(matrix.shape, 1e-8, source="acquired")
+    scanned = ltcl.Transport(matrix, grid, noise=noise, device=device)
+    b = ltcl.separate(scanned, scanned @ np.ones(grid), bounces=1)
+    assert "ambient" not in b.warning
+    assert "ambient" not in ltcl.analyze(scanned).verdict.causes

@@ -117,10 +117,14 @@ class Pairs:
                 f"patterns of {others.grid}; those before are of {self.camera_grid}, "
                 f"{self.channels} and {self.grid}"
             )
+        variance = None
+        if self.variance is not None and others.variance is not None:
+            variance = np.concatenate([self.variance, others.variance])
         return replace(
             self,
             patterns=np.concatenate([self.patterns, others.patterns]),
             photographs=np.concatenate([self.photographs, others.photographs]),
+            variance=variance,
         )
 
     def _check_values(self) -> None:

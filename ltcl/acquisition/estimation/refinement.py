@@ -26,17 +26,15 @@ import numpy as np
 import scipy.ndimage
 import scipy.sparse
 
-from ltcl import checks
+from ltcl.acquisition.estimation import windows
 from ltcl.acquisition.estimation.estimator import (
     BASIS,
     FIRST_BOUNCE_SIGMAS,
     LEAST_SCALE,
-    ROW_BYTES,
     Estimator,
 )
 from ltcl.acquisition.estimation.hats import HatLevels
 from ltcl.acquisition.estimation.near import (
-    COARSE_REACH,
     NearFunctions,
     NearPrior,
     Seen,
@@ -44,16 +42,11 @@ from ltcl.acquisition.estimation.near import (
 )
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import solve_channels
-from ltcl.acquisition.estimation.windows import REACH, functions_of_row
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.noise import Noise
 from ltcl.transport.noise.fit import noise_step
 
-# Pixels up to which all rows are estimated whole, by `Estimator`.
-MAX_WHOLE_PIXELS = 1 << 13
-# Bytes of a channel of a pixel while a transport is refined, but for its pictures.
-PIXEL_BYTES = 1000
 # Nodes of the coarsest stage, and of the one before the pixels, at most.
 MAX_COARSE_NODES = 2500
 MAX_MIDDLE_NODES = 1 << 18
@@ -82,32 +75,10 @@ def make_estimator(
     solves: int = 1,
 ) -> Estimator | RefinedEstimator:
     """The estimator for a grid, with the parameters of `Estimator`."""
-    check_memory(grid, channels)
-    if grid[0] * grid[1] > MAX_WHOLE_PIXELS:
+    windows.check_memory(grid, channels)
+    if grid[0] * grid[1] > windows.MAX_WHOLE_PIXELS:
         return RefinedEstimator(grid, channels, mixing, progress, solves)
     return Estimator(grid, channels, mixing, progress, solves)
-
-
-def check_memory(grid: tuple[int, int], channels: int) -> None:
-    """Refuse a grid whose rows do not fit the memory of the host."""
-    height, width = grid
-    pixels = height * width
-    if pixels > MAX_WHOLE_PIXELS:
-        needed = pixels * channels * PIXEL_BYTES
-    else:
-        needed = pixels * functions_of_row(grid) * (channels + 1) * ROW_BYTES
-    checks.fits_host(f"estimating T of {height} x {width} pixels", needed)
-
-
-def numbers_of_row(grid: tuple[int, int]) -> int:
-    """Numbers that the transport keeps of each row, about.
-
-    >>> numbers_of_row((64, 64)), numbers_of_row((256, 512))
-    (125, 34)
-    """
-    if grid[0] * grid[1] > MAX_WHOLE_PIXELS:
-        return (2 * REACH + 1) ** 2 + (2 * COARSE_REACH + 1) ** 2
-    return functions_of_row(grid)
 
 
 def stage_levels(grid: tuple[int, int]) -> list[int]:

@@ -37,6 +37,11 @@ class PictureLog:
         self._progress = progress
         self._batches = 0
 
+    @property
+    def can_take(self) -> bool:
+        """False if the next batch is not in the store, and there is no camera."""
+        return self._camera is not None or self._is_written(self._batches)
+
     def announce(self, patterns: Iterable[np.ndarray]) -> None:
         """Announce the patterns of the next batches that are not in the store."""
         if self._camera is None:

@@ -10,7 +10,8 @@ off, so that the curve of the projector does not matter. Of each scale s = 2^l t
     products   w(row / s) xor w'(column / s) of Walsh functions w and w' of four steps, repeated
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
-that of T.
+that of T. If it is too large, rounds of other patterns follow (`more_patterns`), each of which
+helps: patterns like nature, and blocks at random.
 
 A picture that all others contradict is left out (`estimation.contradiction`); several are refused.
 """
@@ -49,7 +50,14 @@ PATCH_SHARE = 8
 # Text is drawn so many times as large; letters of size 1 take so many rows, with their spacing.
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
+# Width of a stroke: thinner ones vanish where letters are drawn so many times as large.
+MIN_STROKE = 2
 SEED = 0
+# Rounds at most, and by which share one must lower the error for another to follow.
+MAX_ROUNDS = 24
+LEAST_GAIN = 0.03
+# Pixels from which on there are patterns for rounds.
+LEAST_PIXELS = 16
 # Why a picture contradicts all others.
 CAUSES = "another light was on, the exposure was another one, or something moved"
 
@@ -134,12 +142,18 @@ def _half_plane(grid: tuple[int, int], angle: float) -> np.ndarray:
 
 
 def text(grid: tuple[int, int]) -> np.ndarray:
-    """Letters over the whole picture."""
+    """Letters over the whole picture.
+
+    >>> bool(text((8, 24)).sum() > 20)
+    True
+    """
     height, width = grid
-    picture = np.zeros((4 * height, 4 * width), np.uint8)
-    scale = 4 * height / 64
+    rows = TEXT_SCALE * height
+    columns = TEXT_SCALE * width
+    picture = np.zeros((rows, columns), np.uint8)
+    scale = rows / FONT_HEIGHT
     for line in range(2):
-        place = (int(0.04 * 4 * width), int((0.45 + 0.5 * line) * 4 * height))
+        place = (int(0.04 * columns), int((0.45 + 0.5 * line) * rows))
         cv2.putText(
             picture,
             "LIGHT"[line:],
@@ -147,9 +161,37 @@ def text(grid: tuple[int, int]) -> np.ndarray:
             cv2.FONT_HERSHEY_SIMPLEX,
             scale,
             255,
-            max(1, int(3 * scale)),
+            max(MIN_STROKE, int(3 * scale)),
         )
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) > 127
+
+
+def more_patterns(grid: tuple[int, int], number: int) -> list[np.ndarray]:
+    """The patterns (h, w) of a round, of 0 and 1: half like nature, half of random blocks.
+
+    Blocks are squares of 1, 2, 4 ... pixels, half of which are lit.
+
+    >>> len(more_patterns((64, 64), 0))
+    16
+    """
+    random = np.random.default_rng((SEED, 1 + number))
+    shown = [like_nature(grid, random) > 0 for _ in range(BATCH_SIZE // 2)]
+    sizes = max((min(grid) - 1).bit_length() - 1, 1)
+    for place in range(BATCH_SIZE - len(shown)):
+        shown.append(_random_blocks(grid, place % sizes, random))
+    return [picture.astype(np.float32) for picture in shown]
+
+
+def _random_blocks(grid: tuple[int, int], level: int, random: np.random.Generator) -> np.ndarray:
+    """Squares of 2^level pixels, half of which are lit; the first ones are cut at random."""
+    row, column = np.indices(grid)
+    size = 1 << level
+    down, across = random.integers(0, size, 2)
+    rows = (grid[0] - 1 + down >> level) + 1
+    columns = (grid[1] - 1 + across >> level) + 1
+    is_lit = random.permutation(rows * columns) < rows * columns // 2
+    block = (row + down >> level) * columns + (column + across >> level)
+    return is_lit[block]
 
 
 def count_patterns(grid: tuple[int, int]) -> int:
@@ -157,9 +199,39 @@ def count_patterns(grid: tuple[int, int]) -> int:
     return len(_sides(grid)) + JUDGES
 
 
-def most_patterns(grid: tuple[int, int]) -> int:
-    """Number of patterns that no sketch exceeds, in whole batches."""
-    return BATCH_SIZE * -(-count_patterns(grid) // BATCH_SIZE)
+def most_patterns(grid: tuple[int, int], rounds: int = 0) -> int:
+    """Number of patterns that no sketch of so many rounds exceeds, in whole batches."""
+    return BATCH_SIZE * (-(-count_patterns(grid) // BATCH_SIZE) + rounds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rounds:
+    """How long a sketch goes on after its first patterns.
+
+    Attributes
+    ----------
+    most : int
+        Rounds at most.
+    rtol : float, optional
+        Error of the judges that is small enough; None: all rounds are taken.
+    """
+
+    most: int = 0
+    rtol: float | None = None
+
+    def go_on(self, errors: list[float]) -> bool:
+        """Whether another round follows, given the errors after the first patterns and each round.
+
+        >>> Rounds(most=3, rtol=0.01).go_on([0.03, 0.02]), Rounds(most=3, rtol=0.01).go_on([0.009])
+        (True, False)
+        """
+        if len(errors) > self.most:
+            return False
+        if self.rtol is None:
+            return True
+        if errors[-1] <= self.rtol:
+            return False
+        return len(errors) < 2 or errors[-1] < (1.0 - LEAST_GAIN) * errors[-2]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,31 +263,58 @@ class Sketch:
 
 
 def scan(
-    grid: ScanGrid, log: PictureLog, progress: Callable[[str, int, int], object] | None = None
+    grid: ScanGrid,
+    log: PictureLog,
+    progress: Callable[[str, int, int], object] | None = None,
+    rounds: Rounds | None = None,
 ) -> Sketch:
     """Photograph the patterns and the judges, and estimate T.
 
     `log` takes the pictures, or has those of an earlier run; `progress` is called with "fit", rows
-    that are done, and all.
+    that are done, and all; `rounds` of other patterns follow if it says so.
     """
+    if rounds is None or math.prod(grid.grid) < LEAST_PIXELS:
+        rounds = Rounds()
     shown = [*patterns(grid.grid), *judges(grid.grid)]
+    judging = np.arange(len(shown) - JUDGES, len(shown)) + 1
     log.announce(shown)
     pairs = _photograph(grid, shown, log)
-    first_judge = len(pairs) - JUDGES
+    estimate = _estimate(grid, pairs, judging, log.names, progress)
+    errors = [estimate.error]
+    while rounds.go_on(errors) and log.can_take:
+        shown = more_patterns(grid.grid, len(errors) - 1)
+        log.announce(shown)
+        pairs = pairs.joined(_photograph(grid, shown, log).select(slice(1, None)))
+        estimate = _estimate(grid, pairs, judging, log.names, progress)
+        errors.append(estimate.error)
+        logger.info("round %d: error of T p %.2f %%", len(errors) - 1, 100 * estimate.error)
+    return estimate.sketch()
+
+
+def _estimate(
+    grid: ScanGrid,
+    pairs: Pairs,
+    judging: np.ndarray,
+    names: Sequence[str],
+    progress: Callable[[str, int, int], object] | None,
+) -> _Estimate:
+    """Estimate T from all pairs that are not `judging`, white first, and judge it by these."""
     known_mixing = _known_mixing(grid.calibration.mixing, grid.channels)
 
     def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
         estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-        # A slice copies no pictures.
-        fitted = pairs.select(slice(0, first_judge))
-        estimator.learn(fitted.without([number for number in wrong if number < first_judge]))
+        if judging[-1] == len(pairs) - 1:
+            # A slice copies no pictures.
+            fitted = pairs.select(slice(0, judging[0]))
+            estimator.learn(fitted.without(wrong))
+        else:
+            left_out = np.union1d(judging, wrong).astype(int)
+            estimator.learn(pairs.select(np.setdiff1d(np.arange(len(pairs)), left_out)))
         return estimator
 
     wrong, estimator = find_wrong_pictures(pairs, learn)
-    _report_wrong([log.names[number - 1] for number in wrong], len(shown))
-    judging = pairs.select(slice(first_judge, None))
-    wrong_judges = [number - first_judge for number in wrong if number >= first_judge]
-    return _judged(estimator, judging.without(wrong_judges), wrong)
+    _report_wrong([names[number - 1] for number in wrong], len(names))
+    return _judged(estimator, pairs.select(np.setdiff1d(judging, wrong)), wrong)
 
 
 def _report_wrong(names: Sequence[str], patterns: int) -> None:
@@ -243,19 +342,24 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
 
 
 def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
-    """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
+    """Pairs of all patterns and their pictures; white, which the calibration has, comes first.
+
+    Pictures of a scan are in units of the light that a channel answers to, those of pairs in that
+    of the camera.
+    """
+    light = grid.calibration.light.astype(np.float32)
     frames = len(shown) + 1
     shape = (frames, len(grid.seen), grid.channels)
     photographs = scratch_array(shape, np.float32)
     variance = scratch_array(shape, np.float32)
-    photographs[0] = grid.white.value.T
-    variance[0] = grid.white.variance.T
+    photographs[0] = grid.white.value.T * light
+    variance[0] = grid.white.variance.T * light**2
     frame = 1
     for start in range(0, len(shown), BATCH_SIZE):
         for picture in log.take(shown[start : start + BATCH_SIZE]):
-            photographs[frame] = picture.value.T
+            photographs[frame] = picture.value.T * light
             noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
-            variance[frame] = noise.T
+            variance[frame] = noise.T * light**2
             frame += 1
     lit = np.ones((frames, *grid.grid), np.uint8)
     for number, pattern in enumerate(shown):
@@ -269,11 +373,42 @@ def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pai
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Estimate:
+    """T as it is estimated, and how it was judged.
+
+    `squares` are those of the relative errors of the judges, `scales` the factors of the variances
+    of T by which they explain these.
+    """
+
+    estimator: Estimator | RefinedEstimator
+    squares: np.ndarray
+    scales: np.ndarray
+    wrong_patterns: list[int]
+
+    @property
+    def error(self) -> float:
+        """The root mean square of the errors of the judges."""
+        return math.sqrt(self.squares.mean())
+
+    def sketch(self) -> Sketch:
+        """The transport, with what the judges say."""
+        return Sketch(
+            arrays=self.estimator.arrays(self.scales),
+            own_variance=self.estimator.own_variance() * self.scales[:, None],
+            errors=np.sqrt(self.squares),
+            error=self.error,
+            bound=error_bound(self.error, len(self.squares)),
+            wrong_patterns=self.wrong_patterns,
+        )
+
+
 def _judged(
     estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
-) -> Sketch:
-    """The transport of an estimator, and its error for pairs that it has not seen."""
+) -> _Estimate:
+    """The error of an estimator for pairs that it has not seen."""
     squares = np.zeros(len(pairs))
+    is_lit = np.zeros(len(pairs), bool)
     left = np.zeros(estimator.channels)
     for number in range(len(pairs)):
         judge = pairs.select(slice(number, number + 1))
@@ -286,15 +421,13 @@ def _judged(
         light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
         energy = max((light**2).sum(), np.finfo(float).tiny)
         squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        # Letters vanish in a picture of few rows.
+        is_lit[number] = judge.patterns.any()
         left += of_channels
-    error = math.sqrt(squares.mean())
-    scales = estimator.scale_of_variance(pairs.patterns, left)
-    return Sketch(
-        arrays=estimator.arrays(scales),
-        own_variance=estimator.own_variance() * scales[:, None],
-        errors=np.sqrt(squares),
-        error=error,
-        bound=error_bound(error, len(squares)),
+    return _Estimate(
+        estimator=estimator,
+        squares=squares[is_lit],
+        scales=estimator.scale_of_variance(pairs.patterns, left),
         wrong_patterns=wrong_patterns,
     )
 

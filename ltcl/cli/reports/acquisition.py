@@ -156,11 +156,36 @@ class NextPhotograph(Report):
 
 @dataclass(kw_only=True)
 class PhotographMissing(FolderReport):
-    """`ltcl acquire run` that waits for photographs; the exit code is 3."""
+    """`ltcl acquire run` or `update` that waits for photographs; the exit code is 3."""
 
     next: Annotated[NextPhotograph, "The photograph to take."]
     missing: Annotated[list[int], "Numbers of all missing photographs."]
     exit_code: Annotated[Literal[3], "3."] = 3
+
+
+@dataclass(kw_only=True)
+class UpdateReport(FolderReport):
+    """`ltcl acquire update`: the attributes of `ltcl.acquisition.Update`."""
+
+    store: Annotated[Path, "Folder of the new transport."]
+    scan: Annotated[Path, "Folder of the old one, which is as before."]
+    grid: ProjectorGrid
+    channels: Channels
+    photographs: Annotated[int, "Number of photographs."]
+    shift: Annotated[
+        tuple[float, float], "Rows and columns by which the picture has moved, in its middle."
+    ]
+    largest: Annotated[float, "Largest movement of a pixel, in projector pixels."]
+    gain: Annotated[list[float], "Light of the lamp by channel, relative to that in the scan."]
+    masked: Annotated[int, "Pixels that light places beyond the old picture."]
+    error: Annotated[float, "Relative error of T p for pictures that it was not fitted to."]
+    bound: Annotated[float, "That of other pictures is below, with a probability of 95 %."]
+    previous_error: Annotated[
+        float | None, "Error of the scan for the same pictures; null if they did not judge it."
+    ]
+    holds: Annotated[bool, "False: a new scan is needed."]
+    failing: Annotated[float, "Share of the picture that fails."]
+    judgement: Annotated[str, "The same in words, with the place that fails."]
 
 
 @dataclass(kw_only=True)

@@ -107,8 +107,8 @@ DAMAGES = (
     Damage(
         name="ambient",
         threshold=0.05,
-        cause="{p} of a bounce is perhaps ambient light left in T",
-        advice="subtract black",
+        cause="{p} of a bounce is perhaps ambient light left in T, or came by unlit surfaces",
+        advice="subtract black, unless that was done",
     ),
     Damage(
         name="row_offset",

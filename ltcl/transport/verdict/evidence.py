@@ -95,7 +95,8 @@ class Evidence:
         if not T.is_square:
             nearest = nearest_system(T)
             square = None if nearest is None else Evidence(nearest)
-        if square is not None:
+        # A scan subtracts black: light that reaches all places alike came by unlit surfaces.
+        if square is not None and not T.is_acquired:
             yield from square.measure_ambient()
         # From here on the noise of T is needed.
         for channel in range(T.channels):

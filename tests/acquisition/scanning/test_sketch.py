@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Report, VirtualRig, acquire, camera_map
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map, finalize
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.plan import choose, plans
-from ltcl.errors import MemoryLimitError, ScanRefused
+from ltcl.errors import InputError, MemoryLimitError, ScanRefused
 
 from ..stopping import Unplugged
 from .helpers import corner, dense, relative_error
@@ -107,6 +107,10 @@ def test_colours_are_told_apart(tmp_path: Path) -> None:
     scale = (measured * expected).sum(axis=(0, 1)) / (measured**2).sum(axis=(0, 1))
     error = np.linalg.norm(scale * measured - expected) / np.linalg.norm(expected)
     assert error < 0.03
+    # In units of the photographs, whose ambient light is that of `Setup`.
+    white = np.asarray(Calibration.of(tmp_path / "T.zarr").white.value)
+    shown = np.asarray(T @ np.ones((8, 16, 3)))
+    np.testing.assert_allclose(shown.mean(axis=(0, 1)), white.mean(axis=(0, 1)), rtol=0.01)
 
 
 def test_a_person_takes_at_most_80_photographs() -> None:
@@ -203,3 +207,96 @@ def test_several_pictures_that_all_others_contradict_are_refused(tmp_path: Path)
         scan_with_fault(tmp_path / "T.zarr", with_lamp, wrong)
     for number in wrong:
         assert f"pattern {number} (photograph" in str(error.value)
+
+
+ROUND = 17  # photographs: 16 patterns, and the one that all batches end with
+
+
+@pytest.mark.parametrize("grid", [(4, 4), (5, 9), (16, 32)])
+def test_patterns_of_rounds_are_new(grid: tuple[int, int]) -> None:
+    seen = {pattern.tobytes() for pattern in (*sketch.patterns(grid), *sketch.judges(grid))}
+    for number in range(2):
+        shown = sketch.more_patterns(grid, number)
+        assert len(shown) == 16
+        for pattern in shown:
+            assert set(np.unique(pattern)) == {0.0, 1.0}
+            assert 0.2 < pattern.mean() < 0.8
+        fresh = {pattern.tobytes() for pattern in shown} - seen
+        assert len(fresh) > 12
+        seen |= fresh
+        for again, pattern in zip(sketch.more_patterns(grid, number), shown, strict=True):
+            np.testing.assert_array_equal(again, pattern)
+
+
+@pytest.fixture(scope="module")
+def first_count() -> int:
+    """Photographs of a sketch without rounds."""
+    rig = Unplugged(corner(), SMALL)
+    acquire(rig, geometry="aligned", strategy="sketch")
+    return rig.count
+
+
+@pytest.mark.rare
+def test_rounds_make_the_error_smaller_within_the_photographs_allowed(
+    tmp_path: Path, first_count: int
+) -> None:
+    errors = []
+    for rounds in (0, 3):
+        allowed = first_count + rounds * ROUND + 5
+        rig = Unplugged(corner(), SMALL)
+        path = tmp_path / f"{rounds}.zarr"
+        acquire(rig, geometry="aligned", strategy="sketch", store=path, photographs=allowed)
+        assert rig.count == first_count + rounds * ROUND
+        report = Report.of(path)
+        assert report.patterns == sketch.count_patterns(SMALL) + 16 * rounds
+        errors.append(report.judged_error)
+    assert errors[1] < 0.9 * errors[0]
+
+
+@pytest.mark.rare
+def test_rounds_end_where_the_error_is_small_enough(tmp_path: Path, first_count: int) -> None:
+    counts = []
+    for rtol in (0.5, 1e-4):
+        rig = Unplugged(corner(), SMALL)
+        path = tmp_path / f"{rtol}.zarr"
+        acquire(rig, geometry="aligned", strategy="sketch", store=path, rtol=rtol)
+        counts.append(rig.count)
+        if rtol == 0.5:
+            assert Report.of(path).judged_error < rtol
+    assert counts[0] == first_count
+    # Noise ends it: no round helps any more.
+    assert first_count + ROUND <= counts[1] < first_count + sketch.MAX_ROUNDS * ROUND
+
+
+@pytest.mark.rare
+def test_rounds_are_resumed_to_the_bit(tmp_path: Path, first_count: int) -> None:
+    settings: dict[str, Any] = {
+        "geometry": "aligned", "strategy": "sketch", "photographs": first_count + 2 * ROUND
+    }  # fmt: skip
+    whole = acquire(Unplugged(corner(), SMALL), **settings)
+    path = tmp_path / "T.zarr"
+    stopped = Unplugged(corner(), SMALL, left=first_count + ROUND + 3)
+    with pytest.raises(RuntimeError):
+        acquire(stopped, store=path, **settings)
+    resumed = acquire(Unplugged(corner(), SMALL), store=path, **settings)
+    np.testing.assert_array_equal(dense(resumed), dense(whole))
+
+
+@pytest.mark.slow
+def test_a_sketch_is_finished_with_the_rounds_that_were_photographed(
+    tmp_path: Path, first_count: int
+) -> None:
+    path = tmp_path / "T.zarr"
+    rig = Unplugged(corner(), SMALL, left=first_count + ROUND + 3)
+    allowed = first_count + 2 * ROUND
+    with pytest.raises(RuntimeError):
+        acquire(rig, geometry="aligned", strategy="sketch", store=path, photographs=allowed)
+    finalize(path)
+    assert Report.of(path).patterns == sketch.count_patterns(SMALL) + 16
+
+
+def test_too_few_photographs_are_refused_before_the_first(first_count: int) -> None:
+    rig = Unplugged(corner(), SMALL)
+    with pytest.raises(InputError, match=r"photographs is 20; .* 8 x 16 pixels takes about"):
+        acquire(rig, geometry="aligned", strategy="sketch", photographs=20)
+    assert rig.count == 0

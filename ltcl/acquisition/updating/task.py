@@ -1,0 +1,697 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`update`: a finished scan carried over to where projector and lamp stand now, by 12 photographs.
+
+1. the photographs, with the camera as the scan has measured it
+2. where the light falls now, and the gain of the lamp, by the old transport (`movement`)
+3. the old transport at the new places (`warp`), and what it leaves of the pictures (`change`)
+4. pictures that were not fitted judge it, beside what they said of the scan
+
+Known limit: the camera and the scene must be where they were.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ltcl import checks
+from ltcl.acquisition.calibration import Calibration, StoredMap, is_calibrated, stored_map
+from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS
+from ltcl.acquisition.estimation.windows import ROW_BYTES, functions_of_row
+from ltcl.acquisition.geometry import Correspondence, Resampling
+from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, difference, planes
+from ltcl.acquisition.rig import Rig, RigError, Shots
+from ltcl.acquisition.scanning import sketch
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
+from ltcl.acquisition.scratch import ImageFile
+from ltcl.acquisition.session import ProgressFunction, check_same, ignore_progress
+from ltcl.acquisition.updating.change import ChangedTransport, with_change
+from ltcl.acquisition.updating.movement import (
+    Movement,
+    MovementFit,
+    Views,
+    fit_movement,
+    no_movement,
+    search_shift,
+)
+from ltcl.acquisition.updating.photographs import (
+    JUDGES,
+    PHOTOGRAPHS,
+    UpdateLight,
+    fitted_patterns,
+    judge_places,
+    judging_patterns,
+    photograph,
+)
+from ltcl.acquisition.updating.warp import HostTransport, known_pixels, row_interpolation
+from ltcl.device import open_device
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError
+from ltcl.files import as_path
+from ltcl.store import BlockStore, CompressedRecord, load
+from ltcl.transport import stored
+from ltcl.transport.first_bounce import drop_uncertain
+from ltcl.transport.noise import Noise
+from ltcl.transport.transport import Transport
+
+logger = logging.getLogger(__name__)
+
+# Strategies of scans that can be carried over: blocks are no pixels of the projector, and direct
+# light alone does not explain pictures.
+STRATEGIES = ("sketch", "adaptive", "pixel", "hadamard")
+# Pixels up to which an adaptive scan can be: its cells do not move by parts of a pixel, so that all
+# entries of T are made of them.
+MAX_ADAPTIVE_PIXELS = 1 << 12
+# Largest movement of any pixel, relative to the shorter side of the picture, and how much further a
+# shift is searched for, so that one that is too large is found.
+MAX_MOVEMENT_SHARE = 1 / 8
+SEARCH_RATIO = 1.5
+# What the moved transport may leave of pictures at the median pixel; more is another scene, or
+# another kind of change.
+MAX_MISFIT = 0.1
+# What is left without a movement, relative to that with it, and of the light, up to which there is
+# none: one by a hundredth of a pixel leaves about half a percent of the light.
+NOTABLE_MISFIT_RATIO = 1.1
+NOTABLE_MISFIT = 0.002
+# Change of the light of a camera pixel under white, relative to it and beyond the noise, from which
+# on it does not see what it saw before.
+MAX_WHITE_CHANGE = 0.3
+WHITE_SIGMAS = 5.0
+# Error of an update that holds, relative to that of the scan for the same pictures; and its error
+# if that of the scan is not known.
+MAX_ERROR_RATIO = 1.5
+MAX_UNKNOWN_ERROR = 0.02
+# Cells along each side whose errors are told apart, and the error of one that fails, relative to
+# the largest that holds.
+CELLS = 8
+FAILING_RATIO = 2.0
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Update:
+    """A scan that was carried over, and what pictures say of it to which it was not fitted.
+
+    Attributes
+    ----------
+    transport : Transport
+    store : Path
+        Folder of the transport.
+    photographs : int
+    movement : Movement
+        Where the light of the old projector pixels comes from now.
+    gain : (channels,)
+        Light of the lamp, relative to that in the scan.
+    masked : int
+        Pixels that see places beyond the old picture, of which nothing is known.
+    errors, previous_errors : (judges,)
+        Relative error of T p for each of these pictures, and what that was in the scan; NaN of a
+        scan that no picture has judged.
+    error, previous_error : float
+        Their root mean squares.
+    bound : float
+        What the error of other pictures is below, with a probability of 95 %.
+    holds : bool
+        Whether `error` is at most 1.5 times that of the scan, or 2 % if that is not known.
+    failing : (h, w) bool
+        Pixels in cells whose error is twice that or more; they need a new scan.
+
+    Examples
+    --------
+    >>> import ltcl, pathlib, tempfile
+    >>> from ltcl.acquisition import VirtualRig
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> T = ltcl.scenes.dihedral(8, albedo=0.6).transport()
+    >>> options = {"geometry": "aligned", "strategy": "sketch"}
+    >>> _ = ltcl.acquire(VirtualRig(T, T.grid, bits=12), store=folder / "scan.zarr", **options)
+    >>> aged = VirtualRig([0.9 * T.matrices[0]], T.grid, bits=12)
+    >>> updated = ltcl.update(aged, folder / "scan.zarr", store=folder / "updated.zarr")
+    >>> updated.photographs, updated.gain.round(2), updated.holds
+    (12, array([0.9]), True)
+    """
+
+    transport: Transport
+    store: Path
+    photographs: int
+    movement: Movement
+    gain: np.ndarray
+    masked: int
+    errors: np.ndarray
+    previous_errors: np.ndarray
+    error: float
+    previous_error: float
+    bound: float
+    holds: bool
+    failing: np.ndarray
+
+    def __repr__(self) -> str:
+        return (
+            f"<ltcl Update moved by {self.movement.largest:.2g} pixels, error {self.error:.2%}, "
+            f"of the scan {self.previous_error:.2%}>"
+        )
+
+    def __str__(self) -> str:
+        h, w = self.movement.grid
+        gains = ", ".join(f"{gain:.3f}" for gain in self.gain)
+        moved = "nothing has moved"
+        if not self.movement.is_identity:
+            down, across = self.shift
+            moved = (
+                f"moved by {self.movement.largest:.2f} projector pixels at most, in the middle by "
+                f"{down:+.2f} rows and {across:+.2f} columns"
+            )
+        judged = f"error of T p {self.error:.2%} for pictures that it was not fitted to"
+        if math.isnan(self.previous_error):
+            judged += "; that of the scan is not known"
+        else:
+            judged += f", {self.previous_error:.2%} in the scan"
+        lines = [
+            f"{h} x {w} pixels, {self.photographs} photographs; {moved}; "
+            f"light {gains} times that of the scan",
+            judged,
+        ]
+        if self.masked:
+            lines.append(
+                f"{self.masked} pixels ({self.masked / (h * w):.1%}) are masked: they light places "
+                "beyond the old picture"
+            )
+        lines.append(self.judgement)
+        return "\n".join(lines)
+
+    @property
+    def shift(self) -> tuple[float, float]:
+        """Rows and columns by which the picture has moved over the scene, in its middle."""
+        h, w = self.movement.grid
+        middle = np.array([(h - 1) / 2.0]), np.array([(w - 1) / 2.0])
+        row, column = self.movement.forward(*middle)
+        return float(middle[0][0] - row[0]), float(middle[1][0] - column[0])
+
+    @property
+    def judgement(self) -> str:
+        """Whether the update holds, and what must be measured again, in one line."""
+        place = ""
+        if self.failing.any():
+            rows = np.flatnonzero(self.failing.any(axis=1))
+            columns = np.flatnonzero(self.failing.any(axis=0))
+            place = (
+                f"{self.failing.mean():.0%} of the picture fails, in rows {rows[0]} to {rows[-1]} "
+                f"and columns {columns[0]} to {columns[-1]}"
+            )
+        if self.holds:
+            return f"the update holds; but {place}" if place else "the update holds"
+        if place:
+            return f"the update does not hold: {place}; a new scan is needed"
+        return "the update does not hold; a new scan is needed"
+
+
+def update(
+    rig: Rig,
+    scan: str | os.PathLike[str],
+    *,
+    store: str | os.PathLike[str],
+    progress: ProgressFunction | None = None,
+    device: Any = None,
+) -> Update:
+    """Carry a finished scan over to where things stand now, by 12 photographs.
+
+    For a projector that was bumped, or a lamp that has aged, while the camera and the scene are as
+    they were. The old transport tells what each pattern would look like from another place; that,
+    and the gain of the lamp, are fitted to photographs of black, white and seven patterns. Three
+    more judge the result. The old scan stays as it is.
+
+    Parameters
+    ----------
+    rig : Rig
+        The projector and the camera, as for `ltcl.acquire`. A `FolderRig` must be in a new folder,
+        as its old one has old photographs.
+    scan : path
+        Folder of a finished scan of `ltcl.acquire`: a sketch, one by pixels or S-matrices, or an
+        adaptive one of at most 4096 pixels.
+    store : path
+        Folder of the new transport, where nothing is yet.
+    progress : function of (str, int, int), optional
+        Called with "update", photographs that are done, and all; then with "fit" and rows of T.
+    device : Device or str, optional
+        As in `Transport`; opened before the first photograph.
+
+    Returns
+    -------
+    Update
+        Its transport is like that of `ltcl.acquire`; pixels that light places beyond the old
+        picture are masked. If it does not hold, a new scan is needed.
+
+    Raises
+    ------
+    InputError, InputTypeError, DeviceError
+        Bad arguments; a rig of another size; a scan in functions that cannot be moved.
+    AcquisitionError
+        The rig fails; the projector has moved too far; photographs show another scene.
+        `PhotographMissing`: call again with it.
+    FileError
+        The scan is missing, damaged or not finished; the store exists.
+
+    Examples
+    --------
+    >>> update(None, "scan.zarr", store="scan.zarr")
+    Traceback (most recent call last):
+    ltcl.errors.InputError: store is scan.zarr, which is the scan; it must be another folder
+    """
+    if progress is None:
+        progress = ignore_progress
+    if not callable(progress):
+        raise InputTypeError(
+            f"progress is {progress!r}; it must be a function of (str, int, int), or None"
+        )
+    path = as_path(store, "store")
+    if path.resolve() == as_path(scan, "scan").resolve():
+        raise InputError(f"store is {path}, which is the scan; it must be another folder")
+    if device is not None:
+        device = open_device(device)
+    if path.exists() and not _is_empty_folder(path):
+        raise FileError(f"{path}: exists; store must be a new folder")
+    shots = Shots(rig)
+    previous = _open_scan(scan)
+    T = HostTransport.of(previous)
+    mapping = stored_map(previous)
+    calibration = Calibration.of(previous)
+    _check_rig(previous, shots)
+
+    # 1. The photographs, on the old pixels.
+    seconds = calibration.exposures[0]
+    light = photograph(shots, seconds, calibration.camera, progress)
+    old_grid = ScanGrid(calibration)
+    unit = _unit_of_light(T, old_grid.white)
+
+    # 2. The movement.
+    fit = _find_movement(T, old_grid, mapping, light, unit)
+    movement = fit.movement
+
+    # 3. The transport at the new places.
+    known = known_pixels(movement)
+    now = _moved_calibration(calibration, mapping, fit, light)
+    grid = ScanGrid(now)
+    patterns = _flat([np.ones(shots.grid), *fitted_patterns(shots.grid)])
+    pictures = _Pictures.of(grid, light.black, [light.white, *light.fitted], unit, known)
+    moved = T if movement.is_identity else T.moved(movement)
+    rows = _RowCounter(progress, shots.channels * math.prod(shots.grid))
+    changed = with_change(
+        moved.scaled(fit.gain),
+        patterns,
+        pictures.value,
+        pictures.variance,
+        pictures.value[0],
+        rows.count,
+    )
+
+    # 4. The judges.
+    judging = _Pictures.of(grid, light.black, light.judging, unit, known)
+    shown = _flat(judging_patterns(shots.grid))
+    judgement = _Judgement.of(changed.transport, shown, judging, previous)
+    carried = _CarriedNoise(previous, movement, fit.gain, judgement.ratio)
+    arrays = _arrays(changed, carried, now.mixing)
+
+    # 5. The store.
+    masked = int(np.count_nonzero(~known))
+    description = json.loads(json.dumps(shots.describe(), default=str))
+    written = BlockStore.create(
+        path,
+        channels=shots.channels,
+        shape=previous.layout.shape,
+        grid=shots.grid,
+        provenance={"acquisition": description},
+    )
+    now.write(written)
+    if now.mixing is not None:
+        written.extra("mixing", now.mixing)
+    written.extra("own_variance", carried.own_variance)
+    written.update(
+        settings=previous.attributes["settings"],
+        plan=previous.attributes["plan"],
+        why=f"updated from {previous.path} by {PHOTOGRAPHS} photographs",
+        strategy="sketch",
+        patterns=PHOTOGRAPHS,
+        sketch={
+            "error": judgement.error,
+            "bound": judgement.bound,
+            "errors": judgement.errors.tolist(),
+        },
+        update={
+            "of": str(previous.path),
+            "coefficients": movement.coefficients.tolist(),
+            "gain": fit.gain.tolist(),
+            "masked": masked,
+            "holds": judgement.holds,
+        },
+    )
+    written.finalize(compressed=CompressedRecord(arrays))
+    result = Update(
+        transport=load(path, on_dark="mask", device=device),
+        store=path,
+        photographs=PHOTOGRAPHS,
+        movement=movement,
+        gain=fit.gain,
+        masked=masked,
+        errors=judgement.errors,
+        previous_errors=judgement.previous_errors,
+        error=judgement.error,
+        previous_error=judgement.previous_error,
+        bound=judgement.bound,
+        holds=judgement.holds,
+        failing=judgement.failing,
+    )
+    if not result.holds:
+        logger.warning("%s", result.judgement)
+    return result
+
+
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
+
+
+def _open_scan(scan: str | os.PathLike[str]) -> BlockStore:
+    """The store of a finished scan on the projector's own pixels."""
+    opened = BlockStore.open(scan)
+    if not is_calibrated(opened):
+        raise FileError(f"{opened.path}: holds no calibration; scan must be made by ltcl.acquire")
+    if not opened.final:
+        raise FileError(f"{opened.path}: is still being scanned; it must be a finished scan")
+    strategy = opened.attributes["strategy"]
+    if strategy not in STRATEGIES:
+        raise InputError(
+            f"scan is {opened.path}, of strategy {strategy!r}; it must be one of "
+            f"{', '.join(STRATEGIES)}"
+        )
+    height, width = Calibration.of(opened).resampling.grid
+    if strategy == "adaptive" and height * width > MAX_ADAPTIVE_PIXELS:
+        raise InputError(
+            f"scan is {opened.path}, an adaptive one of {height} x {width} pixels; it must have at "
+            f"most {MAX_ADAPTIVE_PIXELS}, or be a sketch"
+        )
+    numbers = height * width * functions_of_row((height, width)) * (opened.layout.channels + 1)
+    checks.fits_host(f"updating T of {height} x {width} pixels", numbers * ROW_BYTES)
+    return opened
+
+
+def _check_rig(previous: BlockStore, shots: Shots) -> None:
+    """Refuse a rig of another size than that of the scan."""
+    path = previous.path
+    check_same("rig.projector_grid", shots.grid, previous.layout.grid, path, RigError)
+    check_same("rig.channels", shots.channels, previous.layout.channels, path, RigError)
+    facts = previous.provenance["acquisition"]
+    shots.expected = tuple(facts["camera_grid"]), facts["levels"]
+
+
+def _unit_of_light(T: HostTransport, white: Picture) -> np.ndarray:
+    """Light of the pictures of a scan for that of its transport, in each channel, by white."""
+    known = white.known.T
+    seen = np.where(known, white.value.T, 0.0)
+    own = np.where(known, T.products(np.ones((1, len(seen))))[0], 0.0)
+    squares = np.maximum((own**2).sum(axis=0), np.finfo(float).tiny)
+    return (own * seen).sum(axis=0) / squares
+
+
+def _judged_errors(pictures: _Pictures, explained: np.ndarray) -> np.ndarray:
+    """Error of T p for each picture (k, N, channels), relative to it, less the noise, (k,)."""
+    is_known = pictures.variance < KNOWN_VARIANCE
+    left = np.where(is_known, pictures.value - explained, 0.0)
+    noise = np.where(is_known, pictures.variance, 0.0).sum(axis=(1, 2))
+    light = np.where(is_known, pictures.value, 0.0)
+    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
+    return np.sqrt(np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy)
+
+
+def _flat(patterns: Sequence[np.ndarray]) -> np.ndarray:
+    """Patterns (k, N) of pictures (h, w)."""
+    return np.stack([np.ravel(pattern) for pattern in patterns]).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Pictures:
+    """Light less the ambient one, in the units of T, and its variance, (k, N, channels).
+
+    The variance is `UNKNOWN` where nothing is known.
+    """
+
+    value: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        grid: ScanGrid,
+        black: StoredRadiance,
+        lit: Sequence[StoredRadiance],
+        unit: np.ndarray,
+        known: np.ndarray | bool = True,
+    ) -> _Pictures:
+        """Radiance on the pixels of T, as far as these are known, (N,)."""
+        dark = grid.picture(black)
+        values = []
+        variances = []
+        for light in lit:
+            picture = grid.picture(light)
+            is_known = (picture.known & dark.known & known).T
+            value = (picture.value - dark.value).T / unit
+            variance = (picture.variance + dark.variance).T / unit**2
+            values.append(np.where(is_known, value, 0.0))
+            variances.append(np.where(is_known, variance, float(UNKNOWN)))
+        return cls(value=np.stack(values), variance=np.stack(variances))
+
+
+def _find_movement(
+    T: HostTransport,
+    grid: ScanGrid,
+    mapping: Correspondence,
+    light: UpdateLight,
+    unit: np.ndarray,
+) -> MovementFit:
+    """The movement and the gains; AcquisitionError if no small movement explains the pictures."""
+    patterns = _flat([np.ones(grid.grid), *fitted_patterns(grid.grid)])
+    pictures = _Pictures.of(grid, light.black, [light.white, *light.fitted], unit)
+    is_known = pictures.variance < KNOWN_VARIANCE
+    views = Views(
+        grid=grid.grid,
+        patterns=patterns,
+        pictures=pictures.value,
+        variance=np.where(is_known, pictures.variance, np.inf),
+        resampling=grid.calibration.resampling,
+        mapping=mapping,
+    )
+    largest = MAX_MOVEMENT_SHARE * min(grid.grid)
+    first = search_shift(views, SEARCH_RATIO * largest)
+    fit = fit_movement(views, T.products, first)
+    still = no_movement(views, T.products)
+    if still.misfit <= NOTABLE_MISFIT_RATIO * fit.misfit + NOTABLE_MISFIT:
+        fit = still
+    if fit.typical_misfit > MAX_MISFIT:
+        raise AcquisitionError(
+            f"no movement of the projector by up to {largest:.1f} pixels explains the photographs: "
+            f"{fit.typical_misfit:.0%} of their light is left, where at most {MAX_MISFIT:.0%} may "
+            "be; it has moved further, or the camera or the scene has changed; a new scan is needed"
+        )
+    if fit.movement.largest > largest:
+        raise AcquisitionError(
+            f"the projector has moved by {fit.movement.largest:.1f} of its pixels; an update "
+            f"follows {largest:.1f} at most, an eighth of the picture; a new scan is needed"
+        )
+    return fit
+
+
+def _moved_calibration(
+    calibration: Calibration, mapping: Correspondence, fit: MovementFit, light: UpdateLight
+) -> Calibration:
+    """The calibration with the ambient light and white of now, on the pixels of now."""
+    file = ImageFile()
+    white = difference(light.white, light.black, file)
+    now = replace(calibration, ambient=light.black, white=white, anchor=None)
+    if fit.movement.is_identity:
+        return replace(now, mapping=StoredMap.of(mapping, file))
+    row, column = fit.movement.forward(mapping.y, mapping.x)
+    height, width = mapping.grid
+    is_in_rows = (row > -0.5) & (row < height - 0.5)
+    valid = mapping.valid & is_in_rows & (column > -0.5) & (column < width - 0.5)
+    valid &= _lit_as_before(calibration.white, white, fit.gain)
+    moved = Correspondence(column, row, valid, mapping.grid)
+    resampling = Resampling.of(moved).ascertained_by(planes(white, "value"))
+    return replace(now, resampling=resampling, mapping=StoredMap.of(moved, file))
+
+
+def _lit_as_before(before: RadiancePicture, now: RadiancePicture, gain: np.ndarray) -> np.ndarray:
+    """Camera pixels (H, W) that white lights as in the scan, but for the lamp.
+
+    Those just beyond the old picture saw it by light that bounced; they may be in the map all the
+    same, and see the new picture itself.
+    """
+    is_same = np.ones(now.shape[:2], bool)
+    values = zip(planes(before, "value"), planes(now, "value"), gain, strict=True)
+    noise = zip(planes(before, "variance"), planes(now, "variance"), strict=True)
+    for (old, new, factor), (old_variance, new_variance) in zip(values, noise, strict=True):
+        light = factor * old
+        deviation = np.sqrt(factor**2 * old_variance + new_variance)
+        allowed = MAX_WHITE_CHANGE * np.maximum(light, new) + WHITE_SIGMAS * deviation
+        is_same &= np.abs(new - light) <= allowed
+    return is_same
+
+
+class _RowCounter:
+    """Progress of the rows that are solved, of which there are more than can be foretold."""
+
+    def __init__(self, progress: ProgressFunction, rows: int) -> None:
+        self._progress = progress
+        # Those that learn the prior are a quarter in each of eight rounds.
+        self._expected = 3 * rows
+        self._done = 0
+
+    def count(self, rows: int) -> None:
+        """Count rows."""
+        self._done += rows
+        self._progress("fit", self._done, max(self._done, self._expected))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Judgement:
+    """What the judges say, as `Update` has it."""
+
+    errors: np.ndarray
+    previous_errors: np.ndarray
+    error: float
+    previous_error: float
+    bound: float
+    holds: bool
+    failing: np.ndarray
+
+    @classmethod
+    def of(
+        cls, T: HostTransport, patterns: np.ndarray, pictures: _Pictures, previous: BlockStore
+    ) -> _Judgement:
+        """The judgement on T by pictures of patterns that it was not fitted to."""
+        explained = T.products(patterns)
+        errors = _judged_errors(pictures, explained)
+        error = math.sqrt((errors**2).mean())
+        previous_errors = _previous_errors(previous, T.grid)
+        previous_error = math.sqrt((previous_errors**2).mean())
+        allowed = MAX_UNKNOWN_ERROR
+        if not math.isnan(previous_error):
+            allowed = MAX_ERROR_RATIO * previous_error
+        return cls(
+            errors=errors,
+            previous_errors=previous_errors,
+            error=error,
+            previous_error=previous_error,
+            bound=sketch.error_bound(error, len(errors)),
+            holds=error <= allowed,
+            failing=_failing_cells(T.grid, pictures, explained, FAILING_RATIO * allowed),
+        )
+
+    @property
+    def ratio(self) -> float:
+        """By how much errors have grown since the scan, at least 1."""
+        if math.isnan(self.previous_error) or self.previous_error == 0.0:
+            return 1.0
+        return max(self.error / self.previous_error, 1.0)
+
+
+def _previous_errors(previous: BlockStore, grid: tuple[int, int]) -> np.ndarray:
+    """Errors of a scan, or of an update, for the same pictures; NaN if they are not known."""
+    errors = np.array(previous.attributes.get("sketch", {}).get("errors", ()), np.float64)
+    if len(errors) == JUDGES:
+        return errors
+    if len(errors) == sketch.JUDGES:
+        return errors[judge_places(grid)]
+    # Of a sketch that left out one of its judges, which is not known, the mean.
+    return np.full(JUDGES, math.sqrt((errors**2).mean()) if len(errors) else math.nan)
+
+
+def _failing_cells(
+    grid: tuple[int, int], pictures: _Pictures, explained: np.ndarray, most: float
+) -> np.ndarray:
+    """Pixels (h, w) of cells whose error is above `most`, relative to the mean light of a cell."""
+    is_known = pictures.variance < KNOWN_VARIANCE
+    left = np.where(is_known, pictures.value - explained, 0.0)
+    noise = np.where(is_known, pictures.variance, 0.0)
+    light = np.where(is_known, pictures.value, 0.0)
+    row, column = np.indices(grid).reshape(2, -1)
+    cell = (row * CELLS // grid[0]) * CELLS + column * CELLS // grid[1]
+    squares = np.bincount(cell, (left**2 - noise).sum(axis=(0, 2)), CELLS**2)
+    energy = np.bincount(cell, (light**2).sum(axis=(0, 2)), CELLS**2)
+    typical = energy.sum() / max(np.count_nonzero(energy), 1)
+    errors = np.sqrt(np.maximum(squares, 0.0) / np.maximum(energy, max(typical, 1e-30)))
+    return (errors > most)[cell].reshape(grid)
+
+
+class _CarriedNoise:
+    """Noise of the scan at the new places, as much larger as the errors are."""
+
+    def __init__(
+        self, previous: BlockStore, movement: Movement, gain: np.ndarray, ratio: float
+    ) -> None:
+        self._rows = row_interpolation(movement)
+        self._gain = gain
+        self._ratio = ratio
+        names = [name for name in previous.extras if name.startswith("noise_")]
+        self._noise = Noise.from_arrays({name: previous.extra(name) for name in names})
+        first_bounce = np.atleast_2d(previous.extra("first_bounce"))
+        is_there = self._at_new_places(first_bounce > 0)
+        light = self._at_new_places(first_bounce) / np.maximum(is_there, 0.5)
+        self.first_bounce = np.where(is_there > 0.5, gain[:, None] * light, 0.0)
+        variance = self._own_variance(previous, first_bounce)
+        self.own_variance = (gain[:, None] * ratio) ** 2 * self._at_new_places(variance)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of the noise; none if the scan has none."""
+        if self._noise is None:
+            return {}
+        scale = self._gain * self._ratio
+        rows = self._at_new_places(self._noise.rows)
+        columns = self._at_new_places(self._noise.columns)
+        carried = replace(
+            self._noise,
+            photons=self._noise.photons * scale * self._ratio,
+            floor=self._noise.floor * scale,
+            rows=np.where(rows > 0, rows, 1.0),
+            columns=np.where(columns > 0, columns, 1.0),
+            white=np.full_like(self._noise.white, np.inf),
+        )
+        return carried.to_arrays()
+
+    def _own_variance(self, previous: BlockStore, first_bounce: np.ndarray) -> np.ndarray:
+        """Variance of each pixel's own light in the scan, (channels, N)."""
+        if "own_variance" in previous.extras:
+            return np.asarray(previous.extra("own_variance"))
+        noise = self._noise
+        if noise is None:
+            return np.zeros_like(first_bounce)
+        light = noise.photons[:, None] * np.maximum(first_bounce, 0.0) + noise.floor[:, None] ** 2
+        return light * noise.rows * noise.columns * np.asarray(noise.direct)[:, None]
+
+    def _at_new_places(self, pictures: np.ndarray) -> np.ndarray:
+        """Pictures (channels, N) on the pixels of now; 0 where nothing is known."""
+        return (self._rows @ np.asarray(pictures, np.float64).T).T
+
+
+def _arrays(
+    changed: ChangedTransport, carried: _CarriedNoise, mixing: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """The arrays of the transport (`ltcl.transport.stored`), with its noise."""
+    T = changed.transport
+    cores = []
+    diagonals = []
+    for core in T.cores:
+        products: Any = core.multiply(T.W.T)
+        diagonals.append(products.sum(axis=1) - 1.0)
+        identity = scipy.sparse.eye_array(*core.shape, format="csr")
+        cores.append(scipy.sparse.csr_array(core - identity))
+    direct = carried.first_bounce
+    direct = np.where(direct > 0, direct + changed.own, 0.0)
+    first_bounce = drop_uncertain(direct, carried.own_variance, FIRST_BOUNCE_SIGMAS)
+    transport = stored.arrays_of_scan(
+        T.grid, cores, np.stack(diagonals), first_bounce, mixing, BASIS
+    )
+    return transport | carried.arrays()

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A scan carried over by 12 photographs: after a nudge, an aged lamp, and what must be refused."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl import scenes
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire
+from ltcl.acquisition.calibration import stored_map
+from ltcl.acquisition.updating.movement import Movement, interpolation
+from ltcl.errors import AcquisitionError, FileError, InputError
+from ltcl.store import BlockStore
+from tests.acquisition.moved_corner import AMBIENT, GRID, camera_transport, rig
+
+Scan = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """Finished scans of the corner by their strategies, each made once."""
+    folder = tmp_path_factory.mktemp("scans")
+
+    def make(strategy: str) -> Path:
+        path = folder / f"{strategy}.zarr"
+        if not path.exists():
+            acquire(rig(), strategy=strategy, store=path)
+        return path
+
+    return make
+
+
+def true_error(store: Path, transport: ltcl.Transport, truth: np.ndarray) -> float:
+    """Relative error of T p for pictures like nature, on pixels that are not masked."""
+    resampling = Calibration.of(store).resampling
+    random = np.random.default_rng(3)
+    camera = rig(truth)
+    black = camera.radiance(np.zeros(GRID))
+    squares = []
+    for _ in range(4):
+        pattern = (random.random((4, 4)) < 0.5).repeat(4, 0).repeat(4, 1).astype(np.float32)
+        seen = resampling.apply(camera.radiance(pattern) - black)
+        told = np.asarray(transport @ pattern, np.float64)
+        known = ~transport.masked.reshape(GRID)
+        scale = (told * seen)[known].sum() / (told**2)[known].sum()
+        left = scale * told - seen
+        squares.append((left[known] ** 2).sum() / (seen[known] ** 2).sum())
+    return math.sqrt(np.mean(squares))
+
+
+@pytest.mark.rare
+@pytest.mark.parametrize("strategy", ["sketch", "pixel", "adaptive"])
+def test_a_nudge_and_an_older_lamp(scan: Scan, tmp_path: Path, strategy: str) -> None:
+    """Shift and gain are found, and T p is right for the scene as it is now."""
+    old = scan(strategy)
+    before = BlockStore.open(old).attributes
+    truth = 0.95 * camera_transport(0.7, -1.4)
+    store = tmp_path / "new.zarr"
+    steps = []
+    result = ltcl.update(rig(truth), old, store=store, progress=lambda *step: steps.append(step))
+    assert result.photographs == 12
+    assert ("update", 12, 12) in steps
+    assert result.shift == pytest.approx((0.7, -1.4), abs=0.05)
+    assert result.gain == pytest.approx(0.95, abs=0.02)
+    # The first column and the last row see places where nothing was lit.
+    assert result.masked == 31
+    assert result.transport.masked.sum() == 31
+    assert f"{result.masked} pixels" in str(result)
+    error = true_error(store, result.transport, truth)
+    assert error < 0.03
+    assert error < 0.1 * true_error(store, ltcl.load(old), truth)
+    assert result.error < 0.03
+    assert BlockStore.open(old).attributes == before
+    report = Report.of(store)
+    assert report.judged_error == result.error
+    assert report.masked == pytest.approx(31 / 256)
+    assert "updated from" in report.why
+
+
+@pytest.mark.rare
+def test_an_update_is_updated(scan: Scan, tmp_path: Path) -> None:
+    """The way back, by one update after the other, is no movement of the first scan."""
+    there = ltcl.update(
+        rig(camera_transport(0.0, 1.0)), scan("sketch"), store=tmp_path / "there.zarr"
+    )
+    back = ltcl.update(rig(), tmp_path / "there.zarr", store=tmp_path / "back.zarr")
+    assert there.shift == pytest.approx((0.0, 1.0), abs=0.05)
+    assert back.shift == pytest.approx((0.0, -1.0), abs=0.05)
+    assert back.previous_error == there.error
+    assert true_error(tmp_path / "back.zarr", back.transport, camera_transport()) < 0.03
+
+
+@pytest.mark.rare
+@pytest.mark.parametrize(("lamp", "ambient"), [(0.9, AMBIENT), (1.0, 5 * AMBIENT)])
+def test_what_did_not_move_stays(scan: Scan, tmp_path: Path, lamp: float, ambient: float) -> None:
+    camera = rig(lamp * camera_transport(), ambient=ambient)
+    result = ltcl.update(camera, scan("sketch"), store=tmp_path / "new.zarr")
+    assert result.movement.is_identity
+    assert result.gain == pytest.approx(lamp, abs=0.01)
+    assert result.masked == 0
+    assert result.holds
+    assert "nothing has moved" in str(result)
+
+
+@pytest.mark.rare
+def test_a_wider_picture(scan: Scan, tmp_path: Path) -> None:
+    """A movement that is no shift: 4 % wider, and higher, from the middle."""
+    truth = camera_transport(spread=0.04)
+    result = ltcl.update(rig(truth), scan("sketch"), store=tmp_path / "new.zarr")
+    # From the middle to the corner, 7.5 pixels each way.
+    assert result.movement.largest == pytest.approx(0.04 / 1.04 * 7.5 * 2**0.5, abs=0.1)
+    assert result.shift == pytest.approx((0.0, 0.0), abs=0.05)
+    assert true_error(tmp_path / "new.zarr", result.transport, truth) < 0.03
+
+
+def textured(T: np.ndarray) -> np.ndarray:
+    """A scene of other paint, which reflects less from place to place."""
+    paint = np.random.default_rng(1).random((11, 11)).repeat(6, 0).repeat(6, 1)
+    return (0.2 + 0.8 * paint).reshape(-1, 1) * T
+
+
+@pytest.mark.rare
+@pytest.mark.parametrize(
+    ("truth", "reason"),
+    [
+        (camera_transport(2.6, 0.0), r"has moved by 2\.\d of its pixels; .* 2\.0 at most"),
+        (textured(camera_transport()), "the camera or the scene has changed"),
+    ],
+)
+def test_too_far_and_another_scene_are_refused(
+    scan: Scan, tmp_path: Path, truth: np.ndarray, reason: str
+) -> None:
+    store = tmp_path / "new.zarr"
+    with pytest.raises(AcquisitionError, match=f"{reason}.*a new scan is needed"):
+        ltcl.update(rig(truth), scan("sketch"), store=store)
+    assert not store.exists()
+
+
+@pytest.mark.rare
+def test_a_place_that_has_changed_is_named(
+    scan: Scan, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A mirror in the upper left corner sends light of pixels there elsewhere."""
+    truth = camera_transport().copy()
+    changed = truth.reshape(66, 66, 16, 16)
+    # Camera pixels of the first four rows and columns of projector pixels.
+    changed[8:20, 8:20, :8, :8] = changed[8:20, 8:20, :8, :8][:, :, ::-1]
+    result = ltcl.update(rig(truth), scan("sketch"), store=tmp_path / "new.zarr")
+    assert not result.holds
+    assert result.failing[:4, :4].mean() > 0.5
+    assert result.failing[8:, 8:].mean() < 0.1
+    assert "a new scan is needed" in caplog.text
+
+
+@pytest.mark.rare
+def test_colours(tmp_path: Path) -> None:
+    """Each channel has a lamp of its own."""
+    lamps = (0.9, 0.95, 1.0)
+    albedos = (0.6, 0.5, 0.4)
+    mixing = np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.1, 0.9]])
+
+    def camera(rows: float, gains: tuple[float, ...]) -> VirtualRig:
+        matrices = []
+        for albedo, gain in zip(albedos, gains, strict=True):
+            T = gain * camera_transport(rows, 0.0, albedo=albedo)
+            matrices.append(T.astype(np.float32))
+        return VirtualRig(
+            matrices, GRID, mixing=mixing, bits=12, ambient=AMBIENT, camera_grid=(66, 66)
+        )
+
+    acquire(camera(0.0, (1.0, 1.0, 1.0)), strategy="sketch", store=tmp_path / "old.zarr")
+    result = ltcl.update(camera(1.3, lamps), tmp_path / "old.zarr", store=tmp_path / "new.zarr")
+    assert result.shift == pytest.approx((1.3, 0.0), abs=0.05)
+    assert result.gain == pytest.approx(lamps, abs=0.02)
+    assert result.error < 0.03
+    assert result.transport.channels == 3
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan that cannot be carried over: its pixels are blocks."""
+    path = tmp_path_factory.mktemp("small") / "block.zarr"
+    acquire(small_rig(), geometry="aligned", strategy="block", store=path)
+    return path
+
+
+def small_rig(side: int = 4) -> VirtualRig:
+    T = scenes.dihedral(side, albedo=0.6).transport()
+    return VirtualRig(T, T.grid, bits=12)
+
+
+def test_what_cannot_be_updated_is_refused_before_the_first_photograph(
+    small: Path, tmp_path: Path
+) -> None:
+    camera: Any = small_rig()
+    camera.photograph = None
+    new = tmp_path / "new.zarr"
+    with pytest.raises(InputError, match="'block'; it must be one of sketch, adaptive"):
+        ltcl.update(camera, small, store=new)
+    with pytest.raises(InputError, match=r"store is .*, which is the scan"):
+        ltcl.update(camera, small, store=small)
+    with pytest.raises(FileError, match="exists; store must be a new folder"):
+        ltcl.update(camera, small, store=small.parent)
+    with pytest.raises(FileError, match="no such folder"):
+        ltcl.update(camera, tmp_path / "nowhere.zarr", store=new)
+    with pytest.raises(ltcl.errors.InputTypeError, match="progress is 3"):
+        ltcl.update(camera, small, store=new, progress=cast("Any", 3))
+
+
+def test_a_scan_that_is_not_finished_or_of_another_rig_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "T.zarr"
+    acquire(small_rig(), geometry="aligned", strategy="pixel", store=path)
+    with pytest.raises(InputError, match=r"rig.projector_grid is .*3, 6.*4, 8"):
+        ltcl.update(small_rig(3), path, store=tmp_path / "new.zarr")
+    unfinished = BlockStore.create(tmp_path / "begun.zarr", shape=(4, 4), grid=(2, 2))
+    with pytest.raises(FileError, match="holds no calibration"):
+        ltcl.update(small_rig(), unfinished.path, store=tmp_path / "new.zarr")
+
+
+@pytest.mark.slow
+def test_a_scan_without_its_map_is_refused(scan: Scan, tmp_path: Path) -> None:
+    """Scans kept no map once."""
+    path = tmp_path / "old.zarr"
+    shutil.copytree(scan("sketch"), path)
+    store = BlockStore.open(path)
+    names = [name for name in store._places if name.startswith("extra.calibration.map.")]
+    assert len(names) == 2
+    for name in names:
+        del store._places[name]
+    with pytest.raises(FileError, match=r"ltcl.acquire keeps it now: scan again"):
+        stored_map(store)
+
+
+def test_a_movement_and_its_inverse() -> None:
+    random = np.random.default_rng(0)
+    coefficients = random.normal(0.0, 1.0, (2, 6))
+    movement = Movement(grid=(48, 64), coefficients=coefficients)
+    row, column = np.indices(movement.grid).reshape(2, -1)
+    there = movement.forward(row, column)
+    back = movement.backward(*there)
+    np.testing.assert_allclose(back, (row, column), atol=1e-6)
+    assert movement.largest == pytest.approx(np.hypot(there[0] - row, there[1] - column).max())
+
+
+def test_interpolation_keeps_pictures_that_are_linear_and_all_light() -> None:
+    grid = (5, 7)
+    row, column = np.indices(grid).reshape(2, -1).astype(float)
+    picture = 2.0 + 0.5 * row - 0.25 * column
+    random = np.random.default_rng(0)
+    y = random.uniform(0.0, 4.0, 50)
+    x = random.uniform(0.0, 6.0, 50)
+    weights = interpolation(y, x, grid)
+    np.testing.assert_allclose(weights @ picture, 2.0 + 0.5 * y - 0.25 * x)
+    # Beyond the picture there is nothing, or its rim.
+    outside = np.array([-3.0])
+    assert interpolation(outside, outside, grid).nnz == 0
+    assert (interpolation(outside, outside, grid, to_rim=True) @ picture).item() == picture[0]
+    # A narrow aperture sees one square, but at its edge.
+    narrow = interpolation(np.array([1.3, 1.5]), np.array([2.0, 2.0]), grid, aperture=0.2)
+    assert narrow.toarray().max(axis=1) == pytest.approx([1.0, 0.5])
