@@ -52,8 +52,9 @@ MAX_COARSE_NODES = 2500
 MAX_MIDDLE_NODES = 1 << 18
 # Levels from one stage to the next, but for the pixels.
 LEVELS_OF_STAGE = 2
-# Nodes that are solved, or pixels that are looked at, at once.
+# Nodes that are solved, and rows of T that are made, at once.
 CHUNK_NODES = 512
+ROWS_AT_ONCE = 1 << 13
 # Pixels between which the noise of entries is looked at, about.
 NOISE_PIXELS = 4096
 # Light of a near function that is left out, relative to that of the camera pixel.
@@ -427,7 +428,7 @@ class RefinedEstimator:
         """Values of all stages times sums under all hats, at all pixels, (N, frames)."""
         total = np.zeros((self.pixels, sums.shape[1]))
         answers = [of_stage @ sums for of_stage in values]
-        for numbers in _chunks(self.pixels):
+        for numbers in _chunks(self.pixels, ROWS_AT_ONCE):
             for stage, answer in zip(self.stages, answers, strict=True):
                 total[numbers] += self.hats.between(stage.level, 0, numbers) @ answer
         return total
@@ -469,7 +470,7 @@ class RefinedEstimator:
         """The diagonal of T, (N,)."""
         means = [stage.mean[channel] for stage in self.stages]
         diagonal = np.empty(self.pixels)
-        for numbers in _chunks(self.pixels):
+        for numbers in _chunks(self.pixels, ROWS_AT_ONCE):
             hats: Any = self.hats.at_pixels(numbers)
             diagonal[numbers] = hats.multiply(self._rows(means, numbers)).sum(axis=1)
         return self.light[:, channel] * diagonal
@@ -672,7 +673,7 @@ def _without_own(values: Any, first: int) -> Any:
     return scipy.sparse.csr_array(kept, shape=coo.shape)
 
 
-def _chunks(count: int) -> list[np.ndarray]:
+def _chunks(count: int, size: int = CHUNK_NODES) -> list[np.ndarray]:
     """Numbers below `count`, some at a time."""
-    starts = range(0, count, CHUNK_NODES)
-    return [np.arange(start, min(start + CHUNK_NODES, count)) for start in starts]
+    starts = range(0, count, size)
+    return [np.arange(start, min(start + size, count)) for start in starts]
