@@ -36,6 +36,8 @@ PIXEL_BYTES = 1000
 def hat_levels(grid: tuple[int, int]) -> list[tuple[int, int]]:
     """Nodes (rows, columns) of each level over a grid, as `ltcl.operators.Hats` has them.
 
+    It stands here once more, as acquisition needs no device, and operators do.
+
     >>> hat_levels((4, 9))
     [(4, 9), (3, 5), (2, 3), (2, 2)]
     """
