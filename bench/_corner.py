@@ -86,10 +86,19 @@ class TexturedCorner(scipy.sparse.linalg.LinearOperator):
     Light bounces between n x 2 n cells by the form factors A of `Bounce`. V averages the pixels of
     each cell, `step` along both sides, and U interpolates between the middles of cells; for a step
     of 1 both are the identity, and T is exact. The first and the last `margin` columns of pixels
-    are left out: neither lit nor seen. The albedo has texture like nature, and bricks.
+    are left out: neither lit nor seen. The albedo, one number or one a column of pixels, has
+    texture like nature, and bricks.
     """
 
-    def __init__(self, n: int, albedo: float, *, step: int = 1, margin: int = 0, seed: int = 0):
+    def __init__(
+        self,
+        n: int,
+        albedo: float | np.ndarray,
+        *,
+        step: int = 1,
+        margin: int = 0,
+        seed: int = 0,
+    ):
         self.bounce = Bounce(n, 1.0)
         self.cells = (n, 2 * n)
         self.full_grid = (n * step, 2 * n * step)

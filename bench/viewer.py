@@ -12,6 +12,7 @@ to its own process, which takes as long as all the rest.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
@@ -228,6 +229,21 @@ class Chromium(contextlib.AbstractContextManager):
         self._request("Page.navigate", url=url)
         if "#" not in url:
             self.wait("#probe-camera-canvas[data-frame]")
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the page another size, in pixels."""
+        self._request(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+
+    def screenshot(self, quality: int) -> bytes:
+        """A JPEG file of the page."""
+        answer = self._request("Page.captureScreenshot", format="jpeg", quality=quality)
+        return base64.b64decode(answer["data"])
 
     def evaluate(self, function: str, *arguments: Any) -> Any:
         """The awaited result of a JavaScript function in the page."""

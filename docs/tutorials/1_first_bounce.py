@@ -16,14 +16,14 @@ opens it with ``figure.show()``.
 # ------------------------------
 #
 # ltcl can compute rooms. This one is the corner of a room: a red wall, a yellow wall and a pink
-# floor. Each has 16 x 16 small squares, *pixels* of the projector. The numbers are the red, green
+# floor. Each has 32 x 32 small squares, *pixels* of the projector. The numbers are the red, green
 # and blue light that a wall gives back.
 
 import ltcl
 from ltcl.plots import pictures
 
 walls = [(0.85, 0.35, 0.25), (0.85, 0.75, 0.35), (0.85, 0.5, 0.7)]  # left, right, floor
-corner = ltcl.scenes.box(16, sides=3, albedo=walls)
+corner = ltcl.scenes.box(32, sides=3, albedo=walls)
 photo = ltcl.scenes.landscape(480, 480)  # any picture, as numbers of linear light from 0 to 1
 wanted = 0.25 + 0.75 * corner.sample(photo)  # its pixels on the three walls, as seen from in front
 
@@ -134,6 +134,6 @@ figure
 #
 # Where to go on: :doc:`with a matrix that you have <2_my_matrix>`, :doc:`with a corner of your own
 # <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser
-# with sliders. ``ltcl demo`` makes the pictures of this page with more pixels.
+# with sliders. A picture of 256 x 512 pixels stands at the end of :doc:`another page <6_large>`.
 
 # sphinx_gallery_thumbnail_number = 9

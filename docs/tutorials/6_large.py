@@ -102,6 +102,27 @@ for claim in record["claims"][:4]:
     print(f"{claim['text'].replace(' of 131072 pixels in colour', ''):9} {claim['measured']:>24}")
 
 # %%
+# From photographs
+# ----------------
+#
+# No rows have to be known. ``bench/pictures.py`` photographs two tiled walls of 256 x 512 pixels
+# under the patterns of a sketch (:doc:`../guide/photographs`), estimates T, and compensates a
+# picture with it. The camera and the walls are simulated, so that the error is known.
+
+record = json.loads(Path("../../bench/results/pictures.json").read_text())
+facts = record["facts"]
+print(record["device"], "- 2 cores\n")
+print(f"photographs               {facts['photographs']:8.0f}")
+print(f"T                         {facts['bytes of T'] / 1e6:8.1f} MB")
+print(f"to scan and estimate it   {facts['scan, s'] / 60:8.1f} minutes")
+for claim in record["claims"]:
+    print(f"error, {claim['text']:18} {claim['measured']:>9}")
+
+# %%
+# .. image:: ../../bench/figures/corner.jpg
+#    :alt: Two tiled walls under a picture, under the pattern that ltcl finds, and its bounces
+
+# %%
 # Where to go from here
 # ---------------------
 #

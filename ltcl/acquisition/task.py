@@ -23,7 +23,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition import calibrate, session
 from ltcl.acquisition.calibration import Calibration, is_calibrated
-from ltcl.acquisition.estimation import refinement
+from ltcl.acquisition.estimation import windows
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
@@ -343,7 +343,7 @@ def _calibrate(
     if settings.strategy == "direct":
         direct.check_memory(shots.grid, shots.channels)
     elif plan.is_sketched(settings.strategy, shots.grid):
-        refinement.check_memory(shots.grid, shots.channels)
+        windows.check_memory(shots.grid, shots.channels)
         _check_photographs(shots, settings)
     calibration = calibrate.measure(
         shots,

@@ -30,7 +30,8 @@ def view(
     T : Transport
     picture : array or dict of arrays, optional
         Linear light (h, w[, 3]), or a dict of such pictures by names, to compensate for, separate
-        or relight with.
+        or relight with. Those of other proportions than the grid are cropped, until Fit on the page
+        says otherwise.
     host, port : str, int
         Address of the page; by default a free port of this machine. Beyond this machine whoever has
         the URL can look and compute. A page of a viewer that ended finds the next one on the same

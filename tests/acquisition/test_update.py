@@ -57,7 +57,7 @@ def true_error(store: Path, transport: ltcl.Transport, truth: np.ndarray) -> flo
 
 
 @pytest.mark.rare
-@pytest.mark.parametrize("strategy", ["sketch", "pixel"])
+@pytest.mark.parametrize("strategy", ["sketch", "pixel", "adaptive"])
 def test_a_nudge_and_an_older_lamp(scan: Scan, tmp_path: Path, strategy: str) -> None:
     """Shift and gain are found, and T p is right for the scene as it is now."""
     old = scan(strategy)
@@ -186,9 +186,9 @@ def test_colours(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scan that cannot be carried over: its rows are in cells."""
-    path = tmp_path_factory.mktemp("small") / "adaptive.zarr"
-    acquire(small_rig(), geometry="aligned", strategy="adaptive", store=path)
+    """A scan that cannot be carried over: its pixels are blocks."""
+    path = tmp_path_factory.mktemp("small") / "block.zarr"
+    acquire(small_rig(), geometry="aligned", strategy="block", store=path)
     return path
 
 
@@ -203,7 +203,7 @@ def test_what_cannot_be_updated_is_refused_before_the_first_photograph(
     camera: Any = small_rig()
     camera.photograph = None
     new = tmp_path / "new.zarr"
-    with pytest.raises(InputError, match="'adaptive'; it must be one of sketch, pixel"):
+    with pytest.raises(InputError, match="'block'; it must be one of sketch, adaptive"):
         ltcl.update(camera, small, store=new)
     with pytest.raises(InputError, match=r"store is .*, which is the scan"):
         ltcl.update(camera, small, store=small)

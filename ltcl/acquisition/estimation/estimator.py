@@ -44,8 +44,6 @@ BASIS = "hats"
 FIRST_BOUNCE_SIGMAS = 5.0
 # Least factor of the variances of entries.
 LEAST_SCALE = 1e-4
-# Bytes of a function of a row while it is learned: mean, variance, node, and what is made of them.
-ROW_BYTES = 40
 # Light of a function that is left out, relative to that of the camera pixel.
 NEGLIGIBLE_LIGHT = 1e-6
 

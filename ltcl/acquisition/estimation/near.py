@@ -26,10 +26,8 @@ from ltcl.acquisition.estimation.regression import (
     ROUNDS,
     solve_channels,
 )
-from ltcl.acquisition.estimation.windows import REACH
+from ltcl.acquisition.estimation.windows import COARSE_REACH, REACH
 
-# Hats of the coarser level to each side.
-COARSE_REACH = 1
 # Nodes at which the prior is learned, about, and the least step between them along a side. Steps
 # are odd: patterns are alike at multiples of powers of 2.
 PRIOR_NODES = 4096

@@ -26,17 +26,15 @@ import numpy as np
 import scipy.ndimage
 import scipy.sparse
 
-from ltcl import checks
+from ltcl.acquisition.estimation import windows
 from ltcl.acquisition.estimation.estimator import (
     BASIS,
     FIRST_BOUNCE_SIGMAS,
     LEAST_SCALE,
-    ROW_BYTES,
     Estimator,
 )
 from ltcl.acquisition.estimation.hats import HatLevels
 from ltcl.acquisition.estimation.near import (
-    COARSE_REACH,
     NearFunctions,
     NearPrior,
     Seen,
@@ -44,23 +42,19 @@ from ltcl.acquisition.estimation.near import (
 )
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import solve_channels
-from ltcl.acquisition.estimation.windows import REACH, functions_of_row
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.noise import Noise
 from ltcl.transport.noise.fit import noise_step
 
-# Pixels up to which all rows are estimated whole, by `Estimator`.
-MAX_WHOLE_PIXELS = 1 << 13
-# Bytes of a channel of a pixel while a transport is refined, but for its pictures.
-PIXEL_BYTES = 1000
 # Nodes of the coarsest stage, and of the one before the pixels, at most.
 MAX_COARSE_NODES = 2500
 MAX_MIDDLE_NODES = 1 << 18
 # Levels from one stage to the next, but for the pixels.
 LEVELS_OF_STAGE = 2
-# Nodes that are solved, or pixels that are looked at, at once.
+# Nodes that are solved, and rows of T that are made, at once.
 CHUNK_NODES = 512
+ROWS_AT_ONCE = 1 << 13
 # Pixels between which the noise of entries is looked at, about.
 NOISE_PIXELS = 4096
 # Light of a near function that is left out, relative to that of the camera pixel.
@@ -82,32 +76,10 @@ def make_estimator(
     solves: int = 1,
 ) -> Estimator | RefinedEstimator:
     """The estimator for a grid, with the parameters of `Estimator`."""
-    check_memory(grid, channels)
-    if grid[0] * grid[1] > MAX_WHOLE_PIXELS:
+    windows.check_memory(grid, channels)
+    if grid[0] * grid[1] > windows.MAX_WHOLE_PIXELS:
         return RefinedEstimator(grid, channels, mixing, progress, solves)
     return Estimator(grid, channels, mixing, progress, solves)
-
-
-def check_memory(grid: tuple[int, int], channels: int) -> None:
-    """Refuse a grid whose rows do not fit the memory of the host."""
-    height, width = grid
-    pixels = height * width
-    if pixels > MAX_WHOLE_PIXELS:
-        needed = pixels * channels * PIXEL_BYTES
-    else:
-        needed = pixels * functions_of_row(grid) * (channels + 1) * ROW_BYTES
-    checks.fits_host(f"estimating T of {height} x {width} pixels", needed)
-
-
-def numbers_of_row(grid: tuple[int, int]) -> int:
-    """Numbers that the transport keeps of each row, about.
-
-    >>> numbers_of_row((64, 64)), numbers_of_row((256, 512))
-    (125, 34)
-    """
-    if grid[0] * grid[1] > MAX_WHOLE_PIXELS:
-        return (2 * REACH + 1) ** 2 + (2 * COARSE_REACH + 1) ** 2
-    return functions_of_row(grid)
 
 
 def stage_levels(grid: tuple[int, int]) -> list[int]:
@@ -456,7 +428,7 @@ class RefinedEstimator:
         """Values of all stages times sums under all hats, at all pixels, (N, frames)."""
         total = np.zeros((self.pixels, sums.shape[1]))
         answers = [of_stage @ sums for of_stage in values]
-        for numbers in _chunks(self.pixels):
+        for numbers in _chunks(self.pixels, ROWS_AT_ONCE):
             for stage, answer in zip(self.stages, answers, strict=True):
                 total[numbers] += self.hats.between(stage.level, 0, numbers) @ answer
         return total
@@ -498,7 +470,7 @@ class RefinedEstimator:
         """The diagonal of T, (N,)."""
         means = [stage.mean[channel] for stage in self.stages]
         diagonal = np.empty(self.pixels)
-        for numbers in _chunks(self.pixels):
+        for numbers in _chunks(self.pixels, ROWS_AT_ONCE):
             hats: Any = self.hats.at_pixels(numbers)
             diagonal[numbers] = hats.multiply(self._rows(means, numbers)).sum(axis=1)
         return self.light[:, channel] * diagonal
@@ -701,7 +673,7 @@ def _without_own(values: Any, first: int) -> Any:
     return scipy.sparse.csr_array(kept, shape=coo.shape)
 
 
-def _chunks(count: int) -> list[np.ndarray]:
+def _chunks(count: int, size: int = CHUNK_NODES) -> list[np.ndarray]:
     """Numbers below `count`, some at a time."""
-    starts = range(0, count, CHUNK_NODES)
-    return [np.arange(start, min(start + CHUNK_NODES, count)) for start in starts]
+    starts = range(0, count, size)
+    return [np.arange(start, min(start + size, count)) for start in starts]

@@ -19,8 +19,18 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl import checks
+
 # Hats to each side of a pixel, of each level.
 REACH = 2
+# Hats of the next coarser stage to each side, where T is refined.
+COARSE_REACH = 1
+# Pixels up to which all rows are estimated whole.
+MAX_WHOLE_PIXELS = 1 << 13
+# Bytes of a function of a row while it is learned: mean, variance, node, and what is made of them.
+ROW_BYTES = 40
+# Bytes of a channel of a pixel while T is refined, but for its pictures.
+PIXEL_BYTES = 1000
 
 
 def hat_levels(grid: tuple[int, int]) -> list[tuple[int, int]]:
@@ -50,6 +60,28 @@ def functions_of_row(grid: tuple[int, int]) -> int:
             return count + rows * columns
         count += (2 * REACH + 1) ** 2
     return count
+
+
+def check_memory(grid: tuple[int, int], channels: int) -> None:
+    """Refuse a grid whose rows do not fit the memory of the host."""
+    height, width = grid
+    pixels = height * width
+    if pixels > MAX_WHOLE_PIXELS:
+        needed = pixels * channels * PIXEL_BYTES
+    else:
+        needed = pixels * functions_of_row(grid) * (channels + 1) * ROW_BYTES
+    checks.fits_host(f"estimating T of {height} x {width} pixels", needed)
+
+
+def numbers_of_row(grid: tuple[int, int]) -> int:
+    """Numbers that the transport keeps of each row, about.
+
+    >>> numbers_of_row((64, 64)), numbers_of_row((256, 512))
+    (125, 34)
+    """
+    if grid[0] * grid[1] > MAX_WHOLE_PIXELS:
+        return (2 * REACH + 1) ** 2 + (2 * COARSE_REACH + 1) ** 2
+    return functions_of_row(grid)
 
 
 def hat_matrix(grid: tuple[int, int]) -> scipy.sparse.csr_array:

@@ -28,8 +28,7 @@ import numpy as np
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.estimation.neighbours import OFFSETS
-from ltcl.acquisition.estimation.refinement import numbers_of_row
-from ltcl.acquisition.estimation.windows import functions_of_row
+from ltcl.acquisition.estimation.windows import functions_of_row, numbers_of_row
 from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.radiance import valid_values
 from ltcl.acquisition.radiometry import NoiseModel

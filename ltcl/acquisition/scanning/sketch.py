@@ -347,19 +347,24 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
 
 
 def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
-    """Pairs of all patterns and their pictures; white, which the calibration has, comes first."""
+    """Pairs of all patterns and their pictures; white, which the calibration has, comes first.
+
+    Pictures of a scan are in units of the light that a channel answers to, those of pairs in that
+    of the camera.
+    """
+    light = grid.calibration.light.astype(np.float32)
     frames = len(shown) + 1
     shape = (frames, len(grid.seen), grid.channels)
     photographs = scratch_array(shape, np.float32)
     variance = scratch_array(shape, np.float32)
-    photographs[0] = grid.white.value.T
-    variance[0] = grid.white.variance.T
+    photographs[0] = grid.white.value.T * light
+    variance[0] = grid.white.variance.T * light**2
     frame = 1
     for start in range(0, len(shown), BATCH_SIZE):
         for picture in log.take(shown[start : start + BATCH_SIZE]):
-            photographs[frame] = picture.value.T
+            photographs[frame] = picture.value.T * light
             noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
-            variance[frame] = noise.T
+            variance[frame] = noise.T * light**2
             frame += 1
     lit = np.ones((frames, *grid.grid), np.uint8)
     for number, pattern in enumerate(shown):

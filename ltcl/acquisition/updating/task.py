@@ -25,13 +25,13 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.acquisition.calibration import Calibration, StoredMap, is_calibrated, stored_map
-from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS, ROW_BYTES
-from ltcl.acquisition.estimation.windows import functions_of_row
+from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS
+from ltcl.acquisition.estimation.windows import ROW_BYTES, functions_of_row
 from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, difference, planes
 from ltcl.acquisition.rig import Rig, RigError, Shots
+from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
-from ltcl.acquisition.scanning.sketch import error_bound
 from ltcl.acquisition.scratch import ImageFile
 from ltcl.acquisition.session import ProgressFunction, check_same, ignore_progress
 from ltcl.acquisition.updating.change import ChangedTransport, with_change
@@ -64,9 +64,12 @@ from ltcl.transport.transport import Transport
 
 logger = logging.getLogger(__name__)
 
-# Strategies of scans that can be carried over: cells of an adaptive scan do not move by parts of a
-# pixel, blocks are no pixels of the projector, and direct light alone does not explain pictures.
-STRATEGIES = ("sketch", "pixel", "hadamard")
+# Strategies of scans that can be carried over: blocks are no pixels of the projector, and direct
+# light alone does not explain pictures.
+STRATEGIES = ("sketch", "adaptive", "pixel", "hadamard")
+# Pixels up to which an adaptive scan can be: its cells do not move by parts of a pixel, so that all
+# entries of T are made of them.
+MAX_ADAPTIVE_PIXELS = 1 << 12
 # Largest movement of any pixel, relative to the shorter side of the picture, and how much further a
 # shift is searched for, so that one that is too large is found.
 MAX_MOVEMENT_SHARE = 1 / 8
@@ -229,7 +232,8 @@ def update(
         The projector and the camera, as for `ltcl.acquire`. A `FolderRig` must be in a new folder,
         as its old one has old photographs.
     scan : path
-        Folder of a finished scan of `ltcl.acquire`: a sketch, or one by pixels or S-matrices.
+        Folder of a finished scan of `ltcl.acquire`: a sketch, one by pixels or S-matrices, or an
+        adaptive one of at most 4096 pixels.
     store : path
         Folder of the new transport, where nothing is yet.
     progress : function of (str, int, int), optional
@@ -385,6 +389,11 @@ def _open_scan(scan: str | os.PathLike[str]) -> BlockStore:
             f"{', '.join(STRATEGIES)}"
         )
     height, width = Calibration.of(opened).resampling.grid
+    if strategy == "adaptive" and height * width > MAX_ADAPTIVE_PIXELS:
+        raise InputError(
+            f"scan is {opened.path}, an adaptive one of {height} x {width} pixels; it must have at "
+            f"most {MAX_ADAPTIVE_PIXELS}, or be a sketch"
+        )
     numbers = height * width * functions_of_row((height, width)) * (opened.layout.channels + 1)
     checks.fits_host(f"updating T of {height} x {width} pixels", numbers * ROW_BYTES)
     return opened
@@ -576,7 +585,7 @@ class _Judgement:
             previous_errors=previous_errors,
             error=error,
             previous_error=previous_error,
-            bound=error_bound(error, len(errors)),
+            bound=sketch.error_bound(error, len(errors)),
             holds=error <= allowed,
             failing=_failing_cells(T.grid, pictures, explained, FAILING_RATIO * allowed),
         )
@@ -594,9 +603,10 @@ def _previous_errors(previous: BlockStore, grid: tuple[int, int]) -> np.ndarray:
     errors = np.array(previous.attributes.get("sketch", {}).get("errors", ()), np.float64)
     if len(errors) == JUDGES:
         return errors
-    if len(errors) > JUDGES:
+    if len(errors) == sketch.JUDGES:
         return errors[judge_places(grid)]
-    return np.full(JUDGES, np.nan)
+    # Of a sketch that left out one of its judges, which is not known, the mean.
+    return np.full(JUDGES, math.sqrt((errors**2).mean()) if len(errors) else math.nan)
 
 
 def _failing_cells(

@@ -29,10 +29,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.estimation.estimator import BASIS
 from ltcl.acquisition.estimation.windows import REACH, hat_levels, hat_matrix
+from ltcl.acquisition.scanning.adaptive import Cells
 from ltcl.acquisition.updating.movement import Movement, interpolation
 from ltcl.errors import FileError
-from ltcl.store import BlockStore, StoredRows
+from ltcl.store import BlockStore
 from ltcl.store.block_store import read
 
 # Light of a coefficient that is left out, relative to that of its row.
@@ -62,7 +64,7 @@ class HostTransport:
 
     @classmethod
     def of(cls, store: BlockStore) -> HostTransport:
-        """T of a finished scan: a sketch, or one by pixels or S-matrices."""
+        """T of a finished scan: a sketch, in hats, or another one, in pixels."""
         record: Any = read(store.path)
         grid = store.layout.grid
         if grid is None:
@@ -71,14 +73,14 @@ class HostTransport:
         nodes = W.shape[0]
         cores = []
         for channel in range(store.layout.channels):
-            if store.layout.kind == "compressed":
-                core: Any = _compressed_core(record.arrays, channel, W)
-                cores.append(core + scipy.sparse.eye_array(*core.shape, format="csr"))
+            if store.layout.kind != "compressed":
+                cores.append(_in_pixels(record.matrices[channel].tocsr(), nodes))
                 continue
-            rows: StoredRows = record.matrices[channel]
-            pixels: Any = rows.tocsr()
-            entries = pixels.data.astype(np.float64), pixels.indices, pixels.indptr
-            cores.append(scipy.sparse.csr_array(entries, shape=(pixels.shape[0], nodes)))
+            core: Any = _compressed_core(record.arrays, channel, W)
+            core = core + scipy.sparse.eye_array(*core.shape, format="csr")
+            if str(record.arrays["basis_0.name"]) != BASIS:
+                core = _in_pixels(core @ Cells(grid).W, nodes)
+            cores.append(core)
         return cls(grid=grid, cores=cores, W=W)
 
     def products(self, patterns: np.ndarray) -> np.ndarray:
@@ -97,8 +99,15 @@ class HostTransport:
         return HostTransport(grid=self.grid, cores=[warp.core(C) for C in self.cores], W=self.W)
 
 
+def _in_pixels(T: Any, nodes: int) -> scipy.sparse.csr_array:
+    """C of T (N, N): pixels are the first of the nodes."""
+    matrix: Any = scipy.sparse.csr_array(T)
+    entries = matrix.data.astype(np.float64), matrix.indices, matrix.indptr
+    return scipy.sparse.csr_array(entries, shape=(matrix.shape[0], nodes))
+
+
 def _compressed_core(arrays: Any, channel: int, W: Any) -> scipy.sparse.csr_array:
-    """C - I of a channel of a sketch; of one of many pixels C is diag(scale) W^T K."""
+    """C - I of a channel, in hats or cells; in a sketch of many pixels C is diag(scale) W^T K."""
     core = f"system_{channel}.R.core."
     entries = (
         np.asarray(arrays[f"{core}data"], np.float64),

@@ -44,7 +44,8 @@ connection.addEventListener("open", async ({ detail: hello }) => {
   app.hello = hello;
   say("");
   $("title").textContent = document.title = hello.title;
-  const compressed = hello.compressed && `compressed, error ${(100 * hello.error).toPrecision(2)} %`;
+  const error = hello.error ? `, error ${(100 * hello.error).toPrecision(2)} %` : ""; // 0 of a sketch
+  const compressed = hello.compressed && `compressed${error}`;
   const size = hello.grid && `${hello.grid.join(" × ")} projector pixels`;
   const colours = hello.grid && (hello.channels === 3 ? "colour" : "grey");
   $("facts").textContent = [size, colours, compressed, hello.device].filter(Boolean).join(" · ");

@@ -15,10 +15,10 @@ from ltcl.acquisition.estimation.near import NearFunctions
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import (
     RefinedEstimator,
-    check_memory,
     make_estimator,
     stage_levels,
 )
+from ltcl.acquisition.estimation.windows import check_memory
 from ltcl.acquisition.scanning import sketch
 from ltcl.errors import MemoryLimitError
 from ltcl.transport.noise import Noise

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Report, VirtualRig, acquire, camera_map, finalize
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map, finalize
 from ltcl.acquisition.calibrate import expected_photographs
+from ltcl.acquisition.estimation import refinement, windows
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.plan import choose, plans
 from ltcl.errors import InputError, MemoryLimitError, ScanRefused
@@ -94,7 +95,13 @@ def test_it_is_compensated_with(scanned: Any) -> None:
     assert "not fitted" in str(report)
 
 
-def test_colours_are_told_apart(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_refined", [False, True])
+def test_colours_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_refined: bool
+) -> None:
+    if is_refined:
+        monkeypatch.setattr(windows, "MAX_WHOLE_PIXELS", 64)
+        monkeypatch.setattr(refinement, "MAX_COARSE_NODES", 60)
     scene = [corner(8), corner(8, 0.5), corner(8, 0.4)]
     mixing = np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.1, 0.9]])
     truth = ltcl.Transport(scene, (8, 16), mixing=mixing)
@@ -107,6 +114,10 @@ def test_colours_are_told_apart(tmp_path: Path) -> None:
     scale = (measured * expected).sum(axis=(0, 1)) / (measured**2).sum(axis=(0, 1))
     error = np.linalg.norm(scale * measured - expected) / np.linalg.norm(expected)
     assert error < 0.03
+    # In units of the photographs, whose ambient light is that of `Setup`.
+    white = np.asarray(Calibration.of(tmp_path / "T.zarr").white.value)
+    shown = np.asarray(T @ np.ones((8, 16, 3)))
+    np.testing.assert_allclose(shown.mean(axis=(0, 1)), white.mean(axis=(0, 1)), rtol=0.01)
 
 
 def test_a_person_takes_at_most_80_photographs() -> None:
