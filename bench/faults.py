@@ -433,6 +433,15 @@ def bound_claim(clean: Sequence[Outcome], facts: dict[str, Any]) -> Claim:
     )
 
 
+def within_stated(outcomes: Sequence[Outcome]) -> list[str]:
+    """Changes of T p by over 1 % that sketches kept, within the error that they state."""
+    moved = []
+    for outcome in outcomes:
+        if not outcome.refused and HARM < outcome.change <= outcome.stated:
+            moved.append(f"{outcome.where}: {outcome.change:.1%} of {outcome.stated:.1%}")
+    return moved
+
+
 def left_out_facts(outcomes: Sequence[Outcome]) -> list[str]:
     """Changes of T p by over 1 % in sketches that left a picture out."""
     moved = []
@@ -470,6 +479,7 @@ def main() -> None:
     wrong = [outcome for outcome in clean if outcome.refused]
     facts["refused without a fault"] = [f"{one.scan}: {one.message}" for one in wrong]
     facts["left out, T p moved by over 1 %"] = left_out_facts(outcomes)
+    facts["kept, T p moved by over 1 % within the error that is stated"] = within_stated(outcomes)
     none_refused = Claim(
         text="scans without a fault, refused or with a picture left out",
         measured=f"{len(wrong)} of {len(clean)}",

@@ -288,6 +288,8 @@ def scan(
         estimate = _estimate(grid, pairs, judging, log.names, progress)
         errors.append(estimate.error)
         logger.info("round %d: error of T p %.2f %%", len(errors) - 1, 100 * estimate.error)
+    # Once, not in each round.
+    _warn_of_wrong(estimate.wrong_patterns, log.names)
     return estimate.sketch()
 
 
@@ -313,26 +315,29 @@ def _estimate(
         return estimator
 
     wrong, estimator = find_wrong_pictures(pairs, learn)
-    _report_wrong([names[number - 1] for number in wrong], len(names))
+    _refuse_several(wrong, names)
     return _judged(estimator, pairs.select(np.setdiff1d(judging, wrong)), wrong)
 
 
-def _report_wrong(names: Sequence[str], patterns: int) -> None:
-    """Warn of a picture that contradicts all others, and is left out; refuse several."""
-    if not names:
-        return
-    pictures = " and of ".join(names)
-    if len(names) > 1:
+def _refuse_several(wrong: Sequence[int], names: Sequence[str]) -> None:
+    """Refuse several pictures that contradict all others."""
+    if len(wrong) > 1:
+        pictures = " and of ".join(names[number - 1] for number in wrong)
         raise ScanRefused(
-            f"the pictures of {pictures}, of {patterns} patterns, contradict all others: "
+            f"the pictures of {pictures}, of {len(names)} patterns, contradict all others: "
             f"{CAUSES}; the scan must be repeated"
         )
-    logger.warning(
-        "the picture of %s, of %d patterns, contradicts all others, and is left out: %s",
-        pictures,
-        patterns,
-        CAUSES,
-    )
+
+
+def _warn_of_wrong(wrong: Sequence[int], names: Sequence[str]) -> None:
+    """Warn of a picture that contradicts all others, and is left out."""
+    for number in wrong:
+        logger.warning(
+            "the picture of %s, of %d patterns, contradicts all others, and is left out: %s",
+            names[number - 1],
+            len(names),
+            CAUSES,
+        )
 
 
 def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
