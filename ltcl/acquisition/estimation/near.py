@@ -32,6 +32,8 @@ from ltcl.acquisition.estimation.windows import COARSE_REACH, REACH
 # are odd: patterns are alike at multiples of powers of 2.
 PRIOR_NODES = 4096
 LEAST_PRIOR_STEP = 7
+# Nodes that are solved at once while it is learned.
+NODES_AT_ONCE = 512
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -118,7 +120,7 @@ def learn_prior(near: NearFunctions, seen: Callable[[np.ndarray], Seen]) -> Near
     numbers = np.arange(height * width).reshape(near.size)[::step, ::step]
     shape = numbers.shape
     chosen = numbers.ravel()
-    B = near.sums(chosen).astype(np.float64)
+    B = near.sums(chosen)
     is_there = near.columns(chosen) >= 0
     known = seen(chosen)
     share = np.full(len(near.area), FIRST_SHARE)
@@ -126,22 +128,35 @@ def learn_prior(near: NearFunctions, seen: Callable[[np.ndarray], Seen]) -> Near
     coefficients = np.tile((share / near.area) ** 2, (len(chosen), 1))
     noise = np.full(len(chosen), FIRST_NOISE**2)
     for _ in range(ROUNDS):
-        rows = solve_channels(
-            B, known.pictures, np.sqrt(coefficients)[:, near.group], noise[:, None] + known.variance
-        )
-        squares = (rows.mean**2).mean(axis=2) + rows.variance
+        squares, misfit = _solve_some(near, B, known, coefficients, noise)
         for group in range(len(near.area)):
             members = near.group == group
             total = np.where(is_there[:, members], squares[:, members], 0.0).sum(axis=1)
             count = np.count_nonzero(is_there[:, members], axis=1).astype(float)
             nearby = _nearby(count, shape)
             coefficients[:, group] = _nearby(total, shape) / np.maximum(nearby, 1e-6)
-        noise = np.maximum(_nearby(rows.misfit * noise, shape), LEAST_NOISE**2)
+        noise = np.maximum(_nearby(misfit * noise, shape), LEAST_NOISE**2)
     return NearPrior(
         step=step,
         coefficients=coefficients.reshape(*shape, -1),
         noise=noise.reshape(shape),
     )
+
+
+def _solve_some(
+    near: NearFunctions, B: np.ndarray, known: Seen, coefficients: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean squares of the coefficients of nodes, (nodes, q), and misfits, (nodes,), by a prior."""
+    squares = np.empty(B.shape[:2])
+    misfit = np.empty(len(B))
+    for start in range(0, len(B), NODES_AT_ONCE):
+        part = slice(start, start + NODES_AT_ONCE)
+        deviation = np.sqrt(coefficients[part])[:, near.group]
+        variance = noise[part, None] + known.variance[part]
+        rows = solve_channels(B[part], known.pictures[part], deviation, variance)
+        squares[part] = (rows.mean**2).mean(axis=2) + rows.variance
+        misfit[part] = rows.misfit
+    return squares, misfit
 
 
 def _rings(reach: int) -> np.ndarray:

@@ -57,11 +57,11 @@ CHUNK_NODES = 512
 CHUNKS_OF_WORKER = 16
 ROWS_AT_ONCE = 1 << 13
 # Pixels between which the noise of entries is looked at, about.
-NOISE_PIXELS = 4096
+NOISE_PIXELS = 2048
 # Light of a near function that is left out: relative to that of the camera pixel, and in standard
 # deviations. To keep all would lower the error of pictures by a quarter, of four times the bytes.
 NEGLIGIBLE_SHARE = 5e-4
-LEAST_SIGMAS = 0.5
+LEAST_SIGMAS = 0.6
 # Light under white of pixels that the camera does not see, relative to the brightest.
 UNSEEN_LIGHT = 1e-6
 # Change of light by the mixing of colours up to which it is the same.
