@@ -205,11 +205,11 @@ def draw(result: LargeSketch) -> Figure:
         f"A sketch of {height} x {width} pixels in colour",
         f"{result.photographs} photographs; errors of T p, and their limits (dashes).",
     )
-    axes = figures.graph(figure, (80, 120, 820, 250), "", "relative error", "")
+    axes = figures.graph(figure, (80, 120, 820, 250), "error of T p, %", "", "", "linear")
     kinds = list(result.errors)
-    axes.bar(kinds, [result.errors[kind] for kind in kinds], width=0.5)
+    axes.bar(kinds, [100 * result.errors[kind] for kind in kinds], width=0.5)
     for place, kind in enumerate(kinds):
-        axes.hlines(MAX_ERRORS[kind], place - 0.35, place + 0.35, figures.FAINT, "--")
+        axes.hlines(100 * MAX_ERRORS[kind], place - 0.35, place + 0.35, figures.FAINT, "--")
     return figure
 
 
