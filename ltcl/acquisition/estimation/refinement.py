@@ -64,8 +64,6 @@ NEGLIGIBLE_SHARE = 5e-4
 LEAST_SIGMAS = 0.6
 # Light under white of pixels that the camera does not see, relative to the brightest.
 UNSEEN_LIGHT = 1e-6
-# Change of light by the mixing of colours up to which it is the same.
-SAME_LIGHT = 1e-6
 # Variance relative to the square of white from which on a value is unknown, and that of such.
 MAX_RELATIVE_VARIANCE = 1e3
 UNKNOWN_VARIANCE = 1e12
@@ -209,7 +207,7 @@ class RefinedEstimator:
         """As `Estimator.scale_of_variance`."""
         scales = []
         for channel in range(self.channels):
-            squares = self._pictures(patterns, channel).astype(np.float64) ** 2
+            squares = self._pictures(patterns, channel) ** 2
             sums = self.hats.sums_from(0, squares, power=2)
             shares = self._at_pixels(sums, [stage.variance[channel] for stage in self.stages])
             light = self.light[:, channel] ** 2
@@ -324,11 +322,12 @@ class RefinedEstimator:
 
     def _solve_near(self, pairs: Pairs, level: int, channels: list[int]) -> Stage:
         """The rows of some channels at the nodes of a level; coarser stages are solved."""
-        patterns = self._pictures(pairs.patterns, channels[0])
+        patterns, _ = self._patterns(pairs.patterns, channels[0])
+        factors = [self._patterns(pairs.patterns, channel)[1] for channel in channels]
         before = self.stages[-1].level
         near = NearFunctions(self.hats, level, before, patterns)
         photographs = _Photographs(self, pairs, level, channels)
-        far = self._far_answers(patterns, channels)
+        far = self._far_answers(patterns, factors, channels)
 
         def seen(numbers: np.ndarray) -> Seen:
             pictures, variance = photographs.at(numbers)
@@ -341,19 +340,25 @@ class RefinedEstimator:
         key = (level, channels[0])
         if key not in self._priors:
             self._priors[key] = learn_prior(near, seen)
-        return self._solve_rows(near, seen, self._priors[key], level, len(channels))
+        return self._solve_rows(near, seen, self._priors[key], level, factors)
 
-    def _far_answers(self, patterns: np.ndarray, channels: list[int]) -> list[list[np.ndarray]]:
-        """What the rows of each stage say of patterns, (nodes, frames) of each channel."""
+    def _far_answers(
+        self, patterns: np.ndarray, factors: list[float], channels: list[int]
+    ) -> list[list[np.ndarray]]:
+        """What the rows of each stage say of patterns, (nodes, frames) of each channel.
+
+        Channels answer to the patterns times their factors.
+        """
         first_level = self.stages[-1].level
         first = self.hats.first[first_level]
         sums = self.hats.sums_from(first_level, patterns, dtype=np.float32)
         answers = []
         for stage in self.stages:
             of_channels = []
-            for channel in channels:
+            for channel, factor in zip(channels, factors, strict=True):
                 coefficients: Any = stage.mean[channel]
-                of_channels.append(coefficients[:, first:].astype(np.float32) @ sums)
+                of_light = np.float32(factor) * coefficients[:, first:].astype(np.float32)
+                of_channels.append(of_light @ sums)
             answers.append(of_channels)
         return answers
 
@@ -363,11 +368,14 @@ class RefinedEstimator:
         seen: Callable[[np.ndarray], Seen],
         prior: NearPrior,
         level: int,
-        channels: int,
+        factors: list[float],
     ) -> Stage:
-        """The near rows of some channels at all nodes of a level."""
+        """The near rows of channels at all nodes of a level.
+
+        Channels answer to the patterns of `near` times their factors.
+        """
         count = self.hats.nodes_of(level)
-        collected = [_Rows((count, self.hats.nodes)) for _ in range(channels)]
+        collected = [_Rows((count, self.hats.nodes)) for _ in factors]
         noise = np.empty(count)
 
         def solve(numbers: np.ndarray) -> _Solved:
@@ -389,7 +397,8 @@ class RefinedEstimator:
                 matters = (columns >= 0) & is_light & is_known
                 # The first function is the node's own.
                 matters[:, 0] = True
-                rows.add(columns, matters, mean[:, :, channel], variance)
+                factor = factors[channel]
+                rows.add(columns, matters, mean[:, :, channel] / factor, variance / factor**2)
             self._count(len(numbers))
         matrices = [rows.matrices() for rows in collected]
         return Stage(
@@ -424,11 +433,18 @@ class RefinedEstimator:
 
     def _pictures(self, patterns: np.ndarray, channel: int) -> np.ndarray:
         """The light (frames, h, w) that a channel answers to."""
-        if _are_grey(patterns) and abs(self.mixing[channel].sum() - 1.0) < SAME_LIGHT:
-            light = patterns[:, :, 0]
-        else:
-            light = patterns @ self.mixing[channel]
-        return light.reshape(-1, *self.grid)
+        shown, factor = self._patterns(patterns, channel)
+        return factor * shown
+
+    def _patterns(self, patterns: np.ndarray, channel: int) -> tuple[np.ndarray, float]:
+        """Patterns (frames, h, w), and their factor in the light that a channel answers to.
+
+        Grey ones are as they were given, of a byte a pixel if they are on or off.
+        """
+        mixing = self.mixing[channel]
+        if _are_grey(patterns):
+            return patterns[:, :, 0].reshape(-1, *self.grid), float(mixing.sum())
+        return (patterns @ mixing).reshape(-1, *self.grid), 1.0
 
     # Rows of T.
 

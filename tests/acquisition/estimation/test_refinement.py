@@ -142,6 +142,19 @@ def test_channels_of_the_same_light_are_alike(T: np.ndarray) -> None:
     np.testing.assert_allclose(explained[..., 1], 0.5 * explained[..., 0], rtol=0, atol=1e-8)
 
 
+def test_rows_of_the_mixing_need_not_add_up_to_one(T: np.ndarray) -> None:
+    mixing = np.array([[0.7, 0.1, 0.0], [0.1, 1.0, 0.1], [0.0, 0.3, 1.2]])
+    pairs = make_pairs(T, channels=3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refinement, "MAX_COARSE_NODES", COARSE_NODES)
+        mixed = estimate(RefinedEstimator(GRID, 3, mixing, None), pairs)
+        plain = estimate(RefinedEstimator(GRID, 3, np.eye(3), None), pairs)
+    pictures = shown()[-3:, :, None] * np.ones(3)
+    explained = plain.explain(pictures)
+    # Priors begin with the light of the patterns.
+    assert np.linalg.norm(mixed.explain(pictures) - explained) < 1e-3 * np.linalg.norm(explained)
+
+
 def test_colours_whose_patterns_differ_are_solved_one_by_one(T: np.ndarray) -> None:
     """The same pictures, of which one channel sees the complement."""
     grey = make_pairs(T)
