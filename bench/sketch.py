@@ -488,26 +488,40 @@ def update_claims(updated: Updated) -> list[Claim]:
     ]
 
 
-def claims(result: Result) -> list[Claim]:
-    """Check a sketch."""
+def budget_claims(
+    prefix: str, photographs: int, most: int, errors: dict[str, float], compensated: float
+) -> list[Claim]:
+    """Check the photographs of a sketch, its errors, and that of a compensated picture."""
     checked = [
         Claim(
-            text=f"{result.name}: photographs",
-            measured=str(result.photographs),
-            wanted=f"at most {MAX_PHOTOGRAPHS}",
-            holds=result.photographs <= MAX_PHOTOGRAPHS,
+            text=f"{prefix}photographs",
+            measured=str(photographs),
+            wanted=f"at most {most}",
+            holds=photographs <= most,
         )
     ]
     limits = {**MAX_ERRORS, "compensated": MAX_COMPENSATED_ERROR}
-    for kind, error in {**result.errors, "compensated": result.compensated}.items():
+    for kind, error in {**errors, "compensated": compensated}.items():
         checked.append(
             Claim(
-                text=f"{result.name}: {kind}",
+                text=f"{prefix}{kind}",
                 measured=f"{error:.2%}",
                 wanted=f"at most {limits[kind]:.1%}",
                 holds=error <= limits[kind],
             )
         )
+    return checked
+
+
+def claims(result: Result) -> list[Claim]:
+    """Check a sketch."""
+    checked = budget_claims(
+        f"{result.name}: ",
+        result.photographs,
+        MAX_PHOTOGRAPHS,
+        result.errors,
+        result.compensated,
+    )
     nature = result.errors["nature"]
     checked.append(
         Claim(

@@ -30,9 +30,9 @@ from _figures import Claim
 from _harness import Options, parse_options
 from ltcl.acquisition import Report, acquire
 from sketch import (
-    MAX_COMPENSATED_ERROR,
     MAX_ERRORS,
     CountingRig,
+    budget_claims,
     compensated_error,
     errors_of,
     shown,
@@ -151,24 +151,9 @@ def run(grid: tuple[int, int], step: int, options: Options) -> LargeSketch:
 
 def claims(result: LargeSketch, is_large: bool) -> list[Claim]:
     """Check a sketch."""
-    checked = [
-        Claim(
-            text="photographs",
-            measured=str(result.photographs),
-            wanted=f"at most {MAX_PHOTOGRAPHS}",
-            holds=result.photographs <= MAX_PHOTOGRAPHS,
-        )
-    ]
-    limits = {**MAX_ERRORS, "compensated": MAX_COMPENSATED_ERROR}
-    for kind, error in {**result.errors, "compensated": result.compensated}.items():
-        checked.append(
-            Claim(
-                text=kind,
-                measured=f"{error:.2%}",
-                wanted=f"at most {limits[kind]:.1%}",
-                holds=error <= limits[kind],
-            )
-        )
+    checked = budget_claims(
+        "", result.photographs, MAX_PHOTOGRAPHS, result.errors, result.compensated
+    )
     if is_large:
         amounts = [
             ("memory of the estimate", result.cost.bytes / 1e6, MAX_LARGE_BYTES / 1e6, "MB"),
