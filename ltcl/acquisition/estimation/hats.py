@@ -67,10 +67,6 @@ class HatLevels:
                 sums[nodes, number] = self.sums(coarser, picture, power).ravel()
         return sums
 
-    def area(self, level: int) -> np.ndarray:
-        """Pixels under each hat of a level, (rows, columns); fewer at the rim."""
-        return self.sums(level, np.ones(self.grid))
-
     def between(self, level: int, fine: int, numbers: np.ndarray) -> scipy.sparse.csr_array:
         """Hats of a level at nodes of a finer one, (len(numbers), nodes of the level).
 

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
 
 from ltcl.acquisition.estimation.hats import HatLevels
 from ltcl.acquisition.estimation.regression import (
@@ -24,6 +23,8 @@ from ltcl.acquisition.estimation.regression import (
     LEAST_NOISE,
     OWN_SHARE,
     ROUNDS,
+    between,
+    nearby,
     solve_channels,
 )
 from ltcl.acquisition.estimation.windows import COARSE_REACH, REACH
@@ -109,8 +110,8 @@ class NearPrior:
     def at(self, numbers: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
         """Variances of coefficients, (nodes, groups), and of noise, (nodes,), at some nodes."""
         places = np.stack(np.divmod(numbers, columns)) / self.step
-        groups = [_between(values, places) for values in np.moveaxis(self.coefficients, 2, 0)]
-        return np.stack(groups, axis=1), _between(self.noise, places)
+        groups = [between(values, places) for values in np.moveaxis(self.coefficients, 2, 0)]
+        return np.stack(groups, axis=1), between(self.noise, places)
 
 
 def learn_prior(near: NearFunctions, seen: Callable[[np.ndarray], Seen]) -> NearPrior:
@@ -133,9 +134,9 @@ def learn_prior(near: NearFunctions, seen: Callable[[np.ndarray], Seen]) -> Near
             members = near.group == group
             total = np.where(is_there[:, members], squares[:, members], 0.0).sum(axis=1)
             count = np.count_nonzero(is_there[:, members], axis=1).astype(float)
-            nearby = _nearby(count, shape)
-            coefficients[:, group] = _nearby(total, shape) / np.maximum(nearby, 1e-6)
-        noise = np.maximum(_nearby(misfit * noise, shape), LEAST_NOISE**2)
+            mean_count = nearby(count, shape)
+            coefficients[:, group] = nearby(total, shape) / np.maximum(mean_count, 1e-6)
+        noise = np.maximum(nearby(misfit * noise, shape), LEAST_NOISE**2)
     return NearPrior(
         step=step,
         coefficients=coefficients.reshape(*shape, -1),
@@ -193,13 +194,3 @@ def _with_zero(hats: HatLevels, level: int, patterns: np.ndarray) -> np.ndarray:
     for number, pattern in enumerate(patterns):
         sums[:-1, number] = hats.sums(level, pattern).ravel()
     return sums
-
-
-def _nearby(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Means over places nearby."""
-    return scipy.ndimage.gaussian_filter(values.reshape(shape), 1.0, mode="nearest").ravel()
-
-
-def _between(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Values of a grid at places between, (2, places)."""
-    return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")

@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
 import scipy.sparse
 
 from ltcl.acquisition.estimation import windows
@@ -41,7 +40,7 @@ from ltcl.acquisition.estimation.near import (
     learn_prior,
 )
 from ltcl.acquisition.estimation.pairs import Pairs
-from ltcl.acquisition.estimation.regression import solve_channels
+from ltcl.acquisition.estimation.regression import between, solve_channels
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.noise import Noise
@@ -239,12 +238,13 @@ class RefinedEstimator:
         noise = Noise.fit((len(chosen), len(chosen)), samples, "acquired")
         rows = []
         columns = []
+        places = np.indices(self.grid).reshape(2, -1) / step
         for channel in range(self.channels):
             light = self.light[:, channel] ** 2
             relative = noise.rows[channel] / light[chosen]
-            rows.append(light * _between(relative.reshape(sparse.shape), step, self.grid))
+            rows.append(light * between(relative.reshape(sparse.shape), places))
             of_columns = noise.columns[channel].reshape(sparse.shape)
-            columns.append(_between(of_columns, step, self.grid))
+            columns.append(between(of_columns, places))
         white = np.full((self.channels, self.pixels), np.inf)
         spread = replace(noise, rows=np.stack(rows), columns=np.stack(columns), white=white)
         return self._with_true_sums(spread, scales)
@@ -332,9 +332,9 @@ class RefinedEstimator:
         def seen(numbers: np.ndarray) -> Seen:
             pictures, variance = photographs.at(numbers)
             for stage, answers in zip(self.stages, far, strict=True):
-                between = self.hats.between(stage.level, level, numbers)
+                shares = self.hats.between(stage.level, level, numbers)
                 for place, answer in enumerate(answers):
-                    pictures[:, :, place] -= between @ answer
+                    pictures[:, :, place] -= shares @ answer
             return Seen(pictures=pictures, variance=variance)
 
         key = (level, channels[0])
@@ -673,12 +673,6 @@ def _light_under_white(pairs: Pairs, mixing: np.ndarray) -> np.ndarray:
 def _odd_step(grid: tuple[int, int], pixels: int) -> int:
     """The step along both sides of a grid that leaves about so many pixels, odd."""
     return int(np.sqrt(grid[0] * grid[1] / pixels)) | 1
-
-
-def _between(values: np.ndarray, step: int, grid: tuple[int, int]) -> np.ndarray:
-    """Values at every `step`-th pixel, interpolated to all pixels of a grid, (N,)."""
-    places = np.indices(grid).reshape(2, -1) / step
-    return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
 
 
 def _are_grey(patterns: np.ndarray) -> bool:

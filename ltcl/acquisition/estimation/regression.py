@@ -121,11 +121,13 @@ def learn_prior(
     for _ in range(ROUNDS):
         rows = solve_rows(some, sums, pictures[chosen], prior, progress, variance_of_some)
         prior = _more_likely(some, rows, prior)
-    coefficients = [_between(group, some.grid, windows.grid) for group in prior.coefficients.T]
+    places = np.indices(windows.grid).reshape(2, -1) / PRIOR_STEP
+    groups = prior.coefficients.T.reshape(-1, *some.grid)
+    coefficients = [between(group, places) for group in groups]
     return Prior(
         light=light,
         coefficients=np.stack(coefficients, axis=1),
-        noise=_between(prior.noise, some.grid, windows.grid),
+        noise=between(prior.noise.reshape(some.grid), places),
     )
 
 
@@ -294,10 +296,10 @@ def _more_likely(windows: Windows, rows: Rows, prior: Prior) -> Prior:
         members = windows.group == group
         count = np.count_nonzero(is_there[:, members], axis=1)
         total = np.where(is_there[:, members], squares[:, members], 0.0).sum(axis=1)
-        nearby_total = _nearby(total, windows.grid)
-        nearby_count = _nearby(count.astype(float), windows.grid)
+        nearby_total = nearby(total, windows.grid)
+        nearby_count = nearby(count.astype(float), windows.grid)
         learned[:, group] = nearby_total / np.maximum(nearby_count, 1e-6)
-    noise = _nearby(rows.residual / light**2, windows.grid)
+    noise = nearby(rows.residual / light**2, windows.grid)
     return Prior(
         light=prior.light,
         coefficients=learned,
@@ -305,14 +307,16 @@ def _more_likely(windows: Windows, rows: Rows, prior: Prior) -> Prior:
     )
 
 
-def _nearby(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """Means over pixels nearby, (N,), of values at every `PRIOR_STEP`-th one."""
+def nearby(values: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """Means over places nearby, (N,), of values at those of a grid."""
     sigma = NEIGHBOURHOOD / PRIOR_STEP
     return scipy.ndimage.gaussian_filter(values.reshape(grid), sigma, mode="nearest").ravel()
 
 
-def _between(values: np.ndarray, some: tuple[int, int], grid: tuple[int, int]) -> np.ndarray:
-    """Values at every `PRIOR_STEP`-th pixel, interpolated to all pixels of a grid, (N,)."""
-    places = np.indices(grid) / PRIOR_STEP
-    shown = values.reshape(some)
-    return scipy.ndimage.map_coordinates(shown, places, order=1, mode="nearest").ravel()
+def between(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Values (rows, columns) of a grid at places between its nodes, (2, N), bilinearly.
+
+    >>> between(np.array([[0.0, 2.0]]), np.array([[0.0, 0.0], [0.5, 3.0]])).tolist()
+    [1.0, 2.0]
+    """
+    return scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
