@@ -278,10 +278,51 @@ def update(
         raise FileError(f"{path}: exists; store must be a new folder")
     shots = Shots(rig)
     previous = _open_scan(scan)
+    _check_rig(previous, shots)
+    carried = _carry_over(shots, previous, progress)
+    _write(path, shots, previous, carried)
+    judgement = carried.judgement
+    result = Update(
+        transport=load(path, on_dark="mask", device=device),
+        store=path,
+        photographs=PHOTOGRAPHS,
+        movement=carried.fit.movement,
+        gain=carried.fit.gain,
+        masked=carried.masked,
+        errors=judgement.errors,
+        previous_errors=judgement.previous_errors,
+        error=judgement.error,
+        previous_error=judgement.previous_error,
+        bound=judgement.bound,
+        holds=judgement.holds,
+        failing=judgement.failing,
+    )
+    if not result.holds:
+        logger.warning("%s", result.judgement)
+    return result
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Carried:
+    """A scan that was carried over.
+
+    `masked` counts the pixels that light places beyond the old picture; `own_variance` is that of
+    the light of each pixel's own, (channels, N); `arrays` are those of the transport.
+    """
+
+    fit: MovementFit
+    calibration: Calibration
+    masked: int
+    judgement: _Judgement
+    own_variance: np.ndarray
+    arrays: dict[str, np.ndarray]
+
+
+def _carry_over(shots: Shots, previous: BlockStore, progress: ProgressFunction) -> _Carried:
+    """Photograph, and carry the transport of a scan over to where things stand now."""
     T = HostTransport.of(previous)
     mapping = stored_map(previous)
     calibration = Calibration.of(previous)
-    _check_rig(previous, shots)
 
     # 1. The photographs, on the old pixels.
     seconds = calibration.exposures[0]
@@ -314,11 +355,19 @@ def update(
     judging = _Pictures.of(grid, light.black, light.judging, unit, known)
     shown = _flat(judging_patterns(shots.grid))
     judgement = _Judgement.of(changed.transport, shown, judging, previous)
-    carried = _CarriedNoise(previous, movement, fit.gain, judgement.ratio)
-    arrays = _arrays(changed, carried, now.mixing)
+    noise = _CarriedNoise(previous, movement, fit.gain, judgement.ratio)
+    return _Carried(
+        fit=fit,
+        calibration=now,
+        masked=int(np.count_nonzero(~known)),
+        judgement=judgement,
+        own_variance=noise.own_variance,
+        arrays=_arrays(changed, noise, now.mixing),
+    )
 
-    # 5. The store.
-    masked = int(np.count_nonzero(~known))
+
+def _write(path: Path, shots: Shots, previous: BlockStore, carried: _Carried) -> None:
+    """Write the store of a scan that was carried over."""
     description = json.loads(json.dumps(shots.describe(), default=str))
     written = BlockStore.create(
         path,
@@ -327,10 +376,11 @@ def update(
         grid=shots.grid,
         provenance={"acquisition": description},
     )
-    now.write(written)
-    if now.mixing is not None:
-        written.extra("mixing", now.mixing)
+    carried.calibration.write(written)
+    if carried.calibration.mixing is not None:
+        written.extra("mixing", carried.calibration.mixing)
     written.extra("own_variance", carried.own_variance)
+    judgement = carried.judgement
     written.update(
         settings=previous.attributes["settings"],
         plan=previous.attributes["plan"],
@@ -344,31 +394,13 @@ def update(
         },
         update={
             "of": str(previous.path),
-            "coefficients": movement.coefficients.tolist(),
-            "gain": fit.gain.tolist(),
-            "masked": masked,
+            "coefficients": carried.fit.movement.coefficients.tolist(),
+            "gain": carried.fit.gain.tolist(),
+            "masked": carried.masked,
             "holds": judgement.holds,
         },
     )
-    written.finalize(compressed=CompressedRecord(arrays))
-    result = Update(
-        transport=load(path, on_dark="mask", device=device),
-        store=path,
-        photographs=PHOTOGRAPHS,
-        movement=movement,
-        gain=fit.gain,
-        masked=masked,
-        errors=judgement.errors,
-        previous_errors=judgement.previous_errors,
-        error=judgement.error,
-        previous_error=judgement.previous_error,
-        bound=judgement.bound,
-        holds=judgement.holds,
-        failing=judgement.failing,
-    )
-    if not result.holds:
-        logger.warning("%s", result.judgement)
-    return result
+    written.finalize(compressed=CompressedRecord(carried.arrays))
 
 
 def _is_empty_folder(path: Path) -> bool:
