@@ -62,6 +62,8 @@ from scenes.perspective import SCENES, PerspectiveTransport
 CAMERAS = {"12 bits": ("linear", 12), "8 bits, film": ("film", 8)}
 # Largest number of photographs, and largest errors of each kind of picture.
 MAX_PHOTOGRAPHS = 100
+# Photographs of a sketch that goes on in rounds.
+LONGER_SCAN = 150
 MAX_ERRORS = {"nature": 0.01, "text": 0.01, "checkerboard": 0.015, "patches": 0.015}
 MAX_COMPENSATED_ERROR = 0.01
 # Pixels along each side of scenes in perspective, and of those whose bounces are compared.
@@ -188,13 +190,27 @@ def make_rig(truth: Transport, camera: str) -> CountingRig:
     return CountingRig(truth, truth.grid, response=response, bits=bits, ambient=0.01, seed=2)
 
 
-def run_scan(name: str, truth: Transport, camera: str, strategy: str, options: Options) -> Result:
-    """Scan a scene with a camera, and compare."""
+def run_scan(
+    name: str,
+    truth: Transport,
+    camera: str,
+    strategy: str,
+    options: Options,
+    photographs: int | None = None,
+) -> Result:
+    """Scan a scene with a camera, and compare; a sketch may go on to so many photographs."""
     rig = make_rig(truth, camera)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "T.zarr"
         start = time.perf_counter()
-        T = acquire(rig, geometry="aligned", strategy=strategy, store=path, device=options.device)
+        T = acquire(
+            rig,
+            geometry="aligned",
+            strategy=strategy,
+            store=path,
+            photographs=photographs,
+            device=options.device,
+        )
         seconds = time.perf_counter() - start
         report = Report.of(path)
         scale = unit(T, truth)
@@ -534,6 +550,14 @@ def claims(result: Result) -> list[Claim]:
     return checked
 
 
+def error_facts(name: str, photographs: int, errors: dict[str, float]) -> dict[str, float]:
+    """Name the errors of each kind of picture by the method and its photographs."""
+    facts = {}
+    for kind, error in errors.items():
+        facts[f"{name}, {photographs} photographs, {kind}"] = error
+    return facts
+
+
 def draw(curves: dict[str, list[tuple[int, float]]]) -> Figure:
     """Draw the error of pictures like nature over photographs."""
     figure = figures.page(
@@ -577,8 +601,11 @@ def main() -> None:
         direct += direct_claims(name, smaller, truth, options)
 
     adaptive = run_scan(f"corner {side} x {side}, adaptive", square, "12 bits", "adaptive", options)
+    longer = run_scan(
+        f"corner {side} x {side}, rounds", square, "12 bits", "sketch", options, LONGER_SCAN
+    )
     curves = {
-        "sketch": [(results[0].photographs, results[0].errors["nature"])],
+        "sketch": [(scan.photographs, scan.errors["nature"]) for scan in (results[0], longer)],
         "adaptive scan": [(adaptive.photographs, adaptive.errors["nature"])],
         "fit": [],
         "linear regression": [],
@@ -594,10 +621,9 @@ def main() -> None:
         }
         for name, errors in baselines.items():
             curves[name].append((count, errors["nature"]))
-            for kind, error in errors.items():
-                facts[f"{name}, {count} photographs, {kind}"] = error
-    for kind, error in adaptive.errors.items():
-        facts[f"adaptive scan, {adaptive.photographs} photographs, {kind}"] = error
+            facts |= error_facts(name, count, errors)
+    facts |= error_facts("adaptive scan", adaptive.photographs, adaptive.errors)
+    facts |= error_facts("sketch in rounds", longer.photographs, longer.errors)
     checked = []
     for result in results:
         facts[f"{result.name}, seconds"] = result.seconds

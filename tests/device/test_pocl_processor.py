@@ -2,6 +2,7 @@
 """Processors that PoCL's compiler does not know get the name of an older one."""
 
 import ctypes
+from types import SimpleNamespace
 
 import pytest
 
@@ -69,5 +70,17 @@ def test_the_newest_name_whose_instructions_are_there() -> None:
     assert pocl_processor.known_name(set()) == oldest
 
 
-def test_other_drivers_are_left_alone() -> None:
-    pocl_processor.provide("NVIDIA CUDA 550", None)
+@pytest.mark.parametrize(
+    ("driver", "count"), [("NVIDIA CUDA 550", 0), ("Portable Computing Language 3.0", 1)]
+)
+def test_only_descriptions_of_pocl_are_searched(
+    monkeypatch: pytest.MonkeyPatch, driver: str, count: int
+) -> None:
+    searched: list[int] = []
+    monkeypatch.setattr(pocl_processor.sys, "platform", "linux")
+    monkeypatch.setattr(pocl_processor.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(
+        pocl_processor, "name_unnamed", lambda description, name: searched.append(description)
+    )
+    pocl_processor.provide(driver, SimpleNamespace(int_ptr=64))
+    assert searched == [64] * count

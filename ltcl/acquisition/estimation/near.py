@@ -151,12 +151,12 @@ def _solve_some(
     squares = np.empty(B.shape[:2])
     misfit = np.empty(len(B))
     for start in range(0, len(B), NODES_AT_ONCE):
-        part = slice(start, start + NODES_AT_ONCE)
-        deviation = np.sqrt(coefficients[part])[:, near.group]
-        variance = noise[part, None] + known.variance[part]
-        rows = solve_channels(B[part], known.pictures[part], deviation, variance)
-        squares[part] = (rows.mean**2).mean(axis=2) + rows.variance
-        misfit[part] = rows.misfit
+        chosen = slice(start, start + NODES_AT_ONCE)
+        deviation = np.sqrt(coefficients[chosen])[:, near.group]
+        variance = noise[chosen, None] + known.variance[chosen]
+        rows = solve_channels(B[chosen], known.pictures[chosen], deviation, variance)
+        squares[chosen] = (rows.mean**2).mean(axis=2) + rows.variance
+        misfit[chosen] = rows.misfit
     return squares, misfit
 
 

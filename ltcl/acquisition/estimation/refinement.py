@@ -284,15 +284,14 @@ class RefinedEstimator:
         for level in self.levels[1:]:
             before = self.stages[-1]
             self.stages[-1] = before.without_own(self.hats.first[before.level])
-            parts = [
-                self._solve_near(pairs, level, c) for c in self._alike_channels(pairs.patterns)
-            ]
+            groups = self._alike_channels(pairs.patterns)
+            solved = [self._solve_near(pairs, level, channels) for channels in groups]
             mean: list[Any] = []
             variance: list[Any] = []
-            for part in parts:
-                mean += part.mean
-                variance += part.variance
-            noise = np.mean([part.noise for part in parts], axis=0)
+            for stage in solved:
+                mean += stage.mean
+                variance += stage.variance
+            noise = np.mean([stage.noise for stage in solved], axis=0)
             self.stages.append(Stage(level=level, mean=mean, variance=variance, noise=noise))
 
     def _coarsest_stage(self) -> Stage:
@@ -687,8 +686,8 @@ def _without_own(values: Any, first: int) -> Any:
     coo = scipy.sparse.coo_array(values)
     row, column = coo.coords
     is_other = column != row + first
-    kept = (coo.data[is_other], (row[is_other], column[is_other]))
-    return scipy.sparse.csr_array(kept, shape=coo.shape)
+    others = (coo.data[is_other], (row[is_other], column[is_other]))
+    return scipy.sparse.csr_array(others, shape=coo.shape)
 
 
 def _in_threads(

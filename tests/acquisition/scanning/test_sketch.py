@@ -304,6 +304,6 @@ def test_a_sketch_is_finished_with_the_rounds_that_were_photographed(
 
 def test_too_few_photographs_are_refused_before_the_first(first_count: int) -> None:
     rig = Unplugged(corner(), SMALL)
-    with pytest.raises(InputError, match=r"photographs is 20; .* 8 x 16 pixels takes about"):
+    with pytest.raises(InputError, match="photographs is 20"):
         acquire(rig, geometry="aligned", strategy="sketch", photographs=20)
     assert rig.count == 0
