@@ -11,6 +11,7 @@ from ltcl.operators.bases import (
     multiresolution_order,
     restrict_to_support,
 )
+from ltcl.operators.diagonal_blocks import BlockDiagonal, Planes, block_diagonal
 from ltcl.operators.compressed import Compressed
 from ltcl.operators.conversion import as_operator
 from ltcl.operators.coupled import Coupled
@@ -33,6 +34,7 @@ from ltcl.operators.wavelets import Wavelet, basis
 __all__ = [
     "CSR",
     "Basis",
+    "BlockDiagonal",
     "Compressed",
     "Coupled",
     "Dense",
@@ -45,6 +47,7 @@ __all__ = [
     "Norms",
     "Operator",
     "Parts",
+    "Planes",
     "Pyramid",
     "RowBlocks",
     "ScaledBasis",
@@ -55,6 +58,7 @@ __all__ = [
     "Wavelet",
     "as_operator",
     "basis",
+    "block_diagonal",
     "interreflections",
     "multiresolution_order",
     "rank_device",

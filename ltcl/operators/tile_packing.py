@@ -13,6 +13,7 @@ fraction: float16 holds such a number exactly.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +32,8 @@ PRECISION_WITHOUT_SCALES = {"float32": "float32", "float16": "float16", "int8": 
 # The smallest float16 that is not subnormal.
 MIN_NORMAL_FLOAT16 = 2.0**-14
 MAX_INT8_CODE = 127
+# Bits of the smallest scale, 2^-14.
+SMALLEST_SCALE_BITS = 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,6 +130,69 @@ def smallest(matrix: Any, tolerance: float) -> Packed:
                 best = packed
     assert best is not None  # noqa: S101 - float32 is always allowed
     return best
+
+
+def joined_diagonally(blocks: Sequence[Packed]) -> Packed | None:
+    """diag(A_1, ...) of matrices in tiles, number by number the same; None if that cannot be.
+
+    >>> eye = pack(scipy.sparse.eye_array(2, format="csr"), 1)
+    >>> joined = joined_diagonally([eye, eye])
+    >>> joined.matrix().toarray().tolist() == np.eye(4).tolist()
+    True
+    """
+    first = blocks[0]
+    for packed in blocks:
+        if packed.width != first.width or packed.precision != first.precision:
+            return None
+    unit = max(packed.unit for packed in blocks)
+    height, width = first.shape
+    codes = []
+    scales = []
+    columns = []
+    pointers = [np.zeros(1, np.int64)]
+    tile_count = 0
+    for number, packed in enumerate(blocks):
+        in_unit = _in_unit(packed, unit)
+        if in_unit is None:
+            return None
+        codes.append(in_unit[0])
+        scales.append(in_unit[1])
+        columns.append(packed.columns.astype(np.int64) + number * width)
+        pointers.append(packed.pointers[1:] + tile_count)
+        tile_count += len(packed.columns)
+    total_width = len(blocks) * width
+    frobenius = [packed.difference[0] for packed in blocks]
+    bounds = [packed.difference[1] for packed in blocks]
+    return Packed(
+        shape=(len(blocks) * height, total_width),
+        pointers=np.concatenate(pointers),
+        columns=np.concatenate(columns).astype(_column_type(total_width)),
+        precision=first.precision,
+        codes=np.concatenate(codes),
+        scales=np.concatenate(scales),
+        unit=unit,
+        difference=(float(np.linalg.norm(frobenius)), max(bounds)),
+    )
+
+
+def _in_unit(packed: Packed, unit: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Codes and scales of the same numbers in a larger unit; None where rounding would change them.
+
+    Units are powers of two.
+    """
+    ratio = packed.unit / unit
+    if ratio == 1.0:
+        return packed.codes, packed.scales
+    if packed.precision == "int8":
+        # Three bits of a scale are its fraction.
+        scales = packed.scales.astype(int) + 8 * round(np.log2(ratio))
+        if np.min(scales, initial=SMALLEST_SCALE_BITS) < SMALLEST_SCALE_BITS:
+            return None
+        return packed.codes, scales.astype(np.uint8)
+    codes = packed.codes * packed.codes.dtype.type(ratio)
+    smallest = np.finfo(codes.dtype).tiny
+    is_too_small = (np.abs(codes) < smallest) & (packed.codes != 0)
+    return None if is_too_small.any() else (codes, packed.scales)
 
 
 def _pack(matrix: Any, width: int, precision: str, unit: float | None = None) -> Packed:
@@ -234,8 +300,8 @@ def _scale_bits(numbers: np.ndarray) -> np.ndarray:
     fraction, exponent = np.frexp(largest / MAX_INT8_CODE)
     # Fractions are in 1/2 .. 1.
     bits = (exponent + 14) * 8 + np.ceil(16 * fraction - 8).astype(np.int64)
-    smallest_bits = 8
-    return np.where(fraction > 0, np.maximum(bits, smallest_bits), smallest_bits).astype(np.uint8)
+    bits = np.maximum(bits, SMALLEST_SCALE_BITS)
+    return np.where(fraction > 0, bits, SMALLEST_SCALE_BITS).astype(np.uint8)
 
 
 def _scale_of_bits(bits: np.ndarray) -> np.ndarray:
