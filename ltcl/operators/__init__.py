@@ -11,12 +11,12 @@ from ltcl.operators.bases import (
     multiresolution_order,
     restrict_to_support,
 )
-from ltcl.operators.diagonal_blocks import BlockDiagonal, Planes, block_diagonal
 from ltcl.operators.compressed import Compressed
 from ltcl.operators.conversion import as_operator
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
+from ltcl.operators.diagonal_blocks import BlockDiagonal, Planes, block_diagonal
 from ltcl.operators.distributed import Distributed, rank_device
 from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.identity_plus import IdentityPlus
