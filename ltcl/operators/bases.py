@@ -179,11 +179,21 @@ class SubsetBasis(Basis):
             return self._bind_gather(x, out, a, b, y, transpose)
         coefficients = self.device.empty((self.of.shape[0], *x.shape[1:]))
         if transpose:
-            gather = self._bind_gather(x, coefficients, 1.0, 0.0, x, transpose)
+            # The places of a subset never change: the others stay 0.
+            vectors.fill(coefficients, 0.0)
+            scatter = self._bind_scatter(x, coefficients)
             synthesis = self.of._bind_product(coefficients, out, Epilogue(a, b, y), True)
-            return in_order([gather, synthesis])
+            return in_order([scatter, synthesis])
         analysis = self.of._bind_product(x, coefficients, PLAIN, False)
         return in_order([analysis, self._bind_gather(coefficients, out, a, b, y, transpose)])
+
+    def _bind_scatter(self, x: Array, out: Array) -> Launch:
+        """The launch that writes x to its places in `out`, and nothing else."""
+        kernel, pieces = self._kernel("ordered", "scatter", x.columns)
+        count = self._order.size
+        items = (pieces, min(count, MAX_STRIDING_ITEMS))
+        group = (1, GROUP_ITEMS)
+        return kernel.bind(items, group, rows=count, k=x.columns, order=self._order, x=x, out=out)
 
     def _bind_gather(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool

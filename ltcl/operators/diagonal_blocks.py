@@ -9,7 +9,7 @@ format become one core, so that a product is one launch.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -33,14 +33,21 @@ from ltcl.operators.wavelets import Wavelet
 MAX_JOINED_BYTES = 1 << 26
 
 
+class Place(NamedTuple):
+    """The rows of x and of the result with which the part of a block begins."""
+
+    of_x: int
+    of_out: int
+
+
 class BlockDiagonal(Operator):
-    """diag(A_1, ..., A_c), (c M, c N), of operators of one shape on one device.
+    """diag(A_1, ..., A_c) of operators on one device.
 
     `block_diagonal` finds a faster form where there is one.
 
     Parameters
     ----------
-    blocks : sequence of Operator, (M, N)
+    blocks : sequence of Operator
 
     Examples
     --------
@@ -53,21 +60,22 @@ class BlockDiagonal(Operator):
     """
 
     def __init__(self, blocks: Sequence[Operator]) -> None:
-        first = check_blocks(blocks)
-        rows, columns = first.shape
-        count = len(blocks)
-        super().__init__(first.device, (count * rows, count * columns), *blocks)
+        device = check_blocks(blocks).device
         self.blocks = tuple(blocks)
+        # Where each block begins, and the last one ends.
+        self._rows = np.cumsum([0, *(block.shape[0] for block in blocks)]).tolist()
+        self._columns = np.cumsum([0, *(block.shape[1] for block in blocks)]).tolist()
+        super().__init__(device, (self._rows[-1], self._columns[-1]), *blocks)
         self.error = max(block.error for block in blocks)
         self.solution_error = max(block.solution_error for block in blocks)
         self.error_bound = max(block.error_bound for block in blocks)
         weights = [block.weights for block in blocks if block.weights is not None]
-        if len(weights) == count:
+        if len(weights) == len(blocks):
             self.weights = np.concatenate(weights)
 
     def diagonal(self) -> np.ndarray:
         """The diagonals of the blocks, one behind the other."""
-        if self.shape[0] != self.shape[1]:
+        if self._rows != self._columns:
             raise InputError(f"{type(self).__name__} of {self.shape} does not know its diagonal")
         return np.concatenate([block.diagonal() for block in self.blocks])
 
@@ -81,13 +89,15 @@ class BlockDiagonal(Operator):
         self._bind_product(x, out, epilogue, transpose)()
 
     def _bind_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
+        to, of = (self._columns, self._rows) if transpose else (self._rows, self._columns)
         launches = []
         for number, block in enumerate(self.blocks):
             rows = _rows_of_product(block, transpose)
-            if rows is not None and x.columns == 1 and x.shape == out.shape:
-                launches += _bind_rows(rows, number * rows.shape[0], x, out, epilogue)
+            if rows is not None and x.columns == 1 and to[number] == of[number]:
+                launches += _bind_rows(rows, to[number], x, out, epilogue)
             else:
-                launches.append(_bind_copies(block, number, x, out, epilogue, transpose))
+                place = Place(of[number], to[number])
+                launches.append(_bind_copies(block, place, x, out, epilogue, transpose))
         return in_order(launches)
 
 
@@ -96,8 +106,8 @@ def block_diagonal(blocks: Sequence[Operator]) -> Operator:
 
     Parameters
     ----------
-    blocks : sequence of Operator, (M, N)
-        Of one shape, on one device; InputError for others. One operator alone comes back.
+    blocks : sequence of Operator
+        On one device; InputError for others. One operator alone comes back.
 
     Examples
     --------
@@ -119,15 +129,14 @@ def block_diagonal(blocks: Sequence[Operator]) -> Operator:
 
 
 def check_blocks(blocks: Sequence[Operator]) -> Operator:
-    """The first block; InputError unless all have one shape and one device."""
+    """The first block; InputError unless all have one device."""
     if not blocks:
         raise InputError("blocks is empty; there must be at least one operator")
     first = blocks[0]
     for block in blocks:
-        if block.shape != first.shape or block.device is not first.device:
+        if block.device is not first.device:
             raise InputError(
-                f"blocks have shapes {first.shape} and {block.shape} on {first.device} and "
-                f"{block.device}; all must have one shape, on one device"
+                f"blocks are on {first.device} and {block.device}; all must be on one device"
             )
     return first
 
@@ -158,23 +167,52 @@ class Planes(Basis):
             return self.of.bind_planes(x, out, a, b, y, transpose, self.count)
         epilogue = Epilogue(a, b, y)
         launches = []
+        height, width = self.of.shape
+        if transpose:
+            height, width = width, height
         for number in range(self.count):
-            launches.append(_bind_copies(self.of, number, x, out, epilogue, transpose))
+            place = Place(number * width, number * height)
+            launches.append(_bind_copies(self.of, place, x, out, epilogue, transpose))
         return in_order(launches)
 
 
-def planes(W: Basis, count: int) -> Basis:
-    """W of `count` pictures one below the other."""
-    if not isinstance(W, SubsetBasis):
-        return Planes(W, count)
+def planes(bases: Sequence[Basis]) -> Basis | None:
+    """Bases of pictures one below the other; None where they have nothing in common.
+
+    Subsets of one basis may pick other coefficients of each picture.
+    """
+    first = bases[0]
+    count = len(bases)
+    if not isinstance(first, SubsetBasis):
+        return Planes(first, count) if all(is_same(W, first) for W in bases) else None
+    subsets = [W for W in bases if isinstance(W, SubsetBasis)]
+    if len(subsets) < count or any(W.grid != first.grid for W in bases):
+        return None
     of = None
-    height = count * W.grid[0]
-    coefficients = W.shape[1]
-    if W.of is not None:
-        of = Planes(W.of, count)
-        coefficients = W.of.shape[0]
-    places = [W.places + number * coefficients for number in range(count)]
-    return SubsetBasis(W.device, (height, W.grid[1]), np.concatenate(places), of)
+    coefficients = first.shape[1]
+    if first.of is not None:
+        if any(W.of is None or not is_same(W.of, first.of) for W in subsets):
+            return None
+        of = Planes(first.of, count)
+        coefficients = first.of.shape[0]
+    elif any(W.of is not None for W in subsets):
+        return None
+    places = [W.places + number * coefficients for number, W in enumerate(subsets)]
+    grid = (count * first.grid[0], first.grid[1])
+    return SubsetBasis(first.device, grid, np.concatenate(places), of)
+
+
+def is_same(a: Basis, b: Basis) -> bool:
+    """True if two bases make the same coefficients."""
+    if a is b:
+        return True
+    if type(a) is not type(b) or a.shape != b.shape:
+        return False
+    ours = a.to_arrays()
+    theirs = b.to_arrays()
+    if ours.keys() != theirs.keys():
+        return False
+    return all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
 def _join_systems(blocks: Sequence[Operator]) -> Operator | None:
@@ -197,18 +235,19 @@ def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
     compressed = [block for block in blocks if isinstance(block, Compressed)]
     if len(compressed) != len(blocks):
         return None
-    first = compressed[0]
-    if any(R.out is not first.out or R.into is not first.into for R in compressed):
+    has_sides = {(R.out is not None, R.into is not None) for R in compressed}
+    if len(has_sides) > 1 or has_sides == {(False, False)}:
         return None
-    if first.out is None and first.into is None:
-        return None
-    count = len(blocks)
-    out = None if first.out is None else planes(first.out, count)
+    out_bases = [R.out for R in compressed if R.out is not None]
+    into_bases = [R.into for R in compressed if R.into is not None]
+    out = planes(out_bases) if out_bases else None
     into = out
-    if first.into is not first.out:
-        into = None if first.into is None else planes(first.into, count)
+    if any(R.into is not R.out for R in compressed):
+        into = planes(into_bases) if into_bases else None
+    if (out_bases and out is None) or (into_bases and into is None):
+        return None
     diagonals = [R.known_diagonal for R in compressed if R.known_diagonal is not None]
-    diagonal = np.concatenate(diagonals) if len(diagonals) == count else None
+    diagonal = np.concatenate(diagonals) if len(diagonals) == len(blocks) else None
     error = max(R.error for R in compressed)
     core = block_diagonal([R.core for R in compressed])
     return Compressed(core, out, into, error, diagonal=diagonal)
@@ -227,12 +266,11 @@ def _join_csr(blocks: Sequence[Operator]) -> Operator | None:
 
 
 def _join_tiles(blocks: Sequence[Operator]) -> Operator | None:
-    """One matrix of tiles, where it is small and a common unit changes no number."""
+    """One matrix of tiles, where it is small."""
     packed: list[Packed] = [block.packed for block in blocks if isinstance(block, Tiles)]
     if len(packed) != len(blocks) or _are_large(blocks):
         return None
-    joined = joined_diagonally(packed)
-    return None if joined is None else Tiles(blocks[0].device, joined)
+    return Tiles(blocks[0].device, joined_diagonally(packed))
 
 
 def _are_large(blocks: Sequence[Operator]) -> bool:
@@ -263,7 +301,7 @@ def _bind_rows(
 
 
 def _bind_copies(
-    block: Operator, number: int, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+    block: Operator, place: Place, x: Array, out: Array, epilogue: Epilogue, transpose: bool
 ) -> Queued:
     """The product of a block with copies of its part of x and out."""
     height, width = block.shape
@@ -275,10 +313,10 @@ def _bind_copies(
     bound = block._bind_product(part, product, Epilogue(a, b, product, c), transpose)
 
     def multiply() -> None:
-        x.copy_rows(number * width, part)
+        x.copy_rows(place.of_x, part)
         if b and y is not None:
-            y.copy_rows(number * height, product)
+            y.copy_rows(place.of_out, product)
         bound()
-        out.set_rows(number * height, product)
+        out.set_rows(place.of_out, product)
 
     return multiply

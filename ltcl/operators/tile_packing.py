@@ -132,8 +132,10 @@ def smallest(matrix: Any, tolerance: float) -> Packed:
     return best
 
 
-def joined_diagonally(blocks: Sequence[Packed]) -> Packed | None:
-    """diag(A_1, ...) of matrices in tiles, number by number the same; None if that cannot be.
+def joined_diagonally(blocks: Sequence[Packed]) -> Packed:
+    """diag(A_1, ...) of matrices in tiles.
+
+    Numbers stay as they are, but for those that float32 does not tell from 0 beside the largest.
 
     >>> eye = pack(scipy.sparse.eye_array(2, format="csr"), 1)
     >>> joined = joined_diagonally([eye, eye])
@@ -141,42 +143,54 @@ def joined_diagonally(blocks: Sequence[Packed]) -> Packed | None:
     True
     """
     first = blocks[0]
-    for packed in blocks:
-        if packed.width != first.width or packed.precision != first.precision:
-            return None
     unit = max(packed.unit for packed in blocks)
-    height, width = first.shape
+    frobenius = float(np.linalg.norm([packed.difference[0] for packed in blocks]))
+    difference = (frobenius, max(packed.difference[1] for packed in blocks))
+    formats = {(packed.width, packed.precision) for packed in blocks}
+    scaled = [_in_unit(packed, unit) for packed in blocks]
+    if len(formats) > 1 or any(codes is None for codes in scaled):
+        return _packed_anew(blocks, unit, difference)
+    height = 0
+    width = 0
     codes = []
     scales = []
     columns = []
     pointers = [np.zeros(1, np.int64)]
     tile_count = 0
-    for number, packed in enumerate(blocks):
-        in_unit = _in_unit(packed, unit)
-        if in_unit is None:
-            return None
+    for packed, in_unit in zip(blocks, scaled, strict=True):
+        assert in_unit is not None  # noqa: S101 - as was seen above
         codes.append(in_unit[0])
         scales.append(in_unit[1])
-        columns.append(packed.columns.astype(np.int64) + number * width)
+        columns.append(packed.columns.astype(np.int64) + width)
         pointers.append(packed.pointers[1:] + tile_count)
         tile_count += len(packed.columns)
-    total_width = len(blocks) * width
-    frobenius = [packed.difference[0] for packed in blocks]
-    bounds = [packed.difference[1] for packed in blocks]
+        height += packed.shape[0]
+        width += packed.shape[1]
     return Packed(
-        shape=(len(blocks) * height, total_width),
+        shape=(height, width),
         pointers=np.concatenate(pointers),
-        columns=np.concatenate(columns).astype(_column_type(total_width)),
+        columns=np.concatenate(columns).astype(_column_type(width)),
         precision=first.precision,
         codes=np.concatenate(codes),
         scales=np.concatenate(scales),
         unit=unit,
-        difference=(float(np.linalg.norm(frobenius)), max(bounds)),
+        difference=difference,
     )
 
 
+def _packed_anew(blocks: Sequence[Packed], unit: float, difference: tuple[float, float]) -> Packed:
+    """The same in the narrowest tiles of the blocks, and without scales."""
+    precisions = {PRECISION_WITHOUT_SCALES[packed.precision] for packed in blocks}
+    precision = "float32" if "float32" in precisions else "float16"
+    matrices: list[Any] = [packed.matrix() for packed in blocks]
+    matrix = scipy.sparse.csr_array(scipy.sparse.block_diag(matrices, format="csr"))
+    width = min(packed.width for packed in blocks)
+    packed = _pack(_nonzeros(matrix), width, precision, unit if precision == "float16" else None)
+    return dataclasses.replace(packed, difference=difference)
+
+
 def _in_unit(packed: Packed, unit: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Codes and scales of the same numbers in a larger unit; None where rounding would change them.
+    """Codes and scales of the same numbers in a larger unit; None where that is out of range.
 
     Units are powers of two.
     """
@@ -190,9 +204,9 @@ def _in_unit(packed: Packed, unit: float) -> tuple[np.ndarray, np.ndarray] | Non
             return None
         return packed.codes, scales.astype(np.uint8)
     codes = packed.codes * packed.codes.dtype.type(ratio)
-    smallest = np.finfo(codes.dtype).tiny
-    is_too_small = (np.abs(codes) < smallest) & (packed.codes != 0)
-    return None if is_too_small.any() else (codes, packed.scales)
+    # Subnormal numbers are below what float32 tells from 0 beside the largest.
+    is_subnormal = np.abs(codes) < np.finfo(codes.dtype).tiny
+    return np.where(is_subnormal, codes.dtype.type(0), codes), packed.scales
 
 
 def _pack(matrix: Any, width: int, precision: str, unit: float | None = None) -> Packed:

@@ -23,6 +23,7 @@ from ltcl.operators import (
     Wavelet,
     block_diagonal,
 )
+from tests.conftest import launched_as
 from tests.operators import helpers
 
 GRID = (7, 9)
@@ -49,8 +50,13 @@ def three(device, kind: str) -> list:
         return [Dense(device, sparse(seed, scale).toarray()) for seed, scale in enumerate(scales)]
     if kind in ("float32", "float16", "int8"):
         return [Tiles(device, sparse(s, scale), 8, kind) for s, scale in enumerate(scales)]
+    if kind == "tiles":
+        formats = ((8, "int8"), (1, "float16"), (8, "float16"))
+        return [Tiles(device, sparse(s, scales[s]), *f) for s, f in enumerate(formats)]
     if kind == "mixed":
         return [Dense(device, np.eye(N)), CSR(device, sparse(1)), Tiles(device, sparse(2))]
+    if kind == "sizes":
+        return [Dense(device, sparse(seed).toarray()[:n, :n]) for seed, n in enumerate((5, 9, 2))]
     if kind == "wide":
         return [Dense(device, sparse(seed).toarray()[:5]) for seed in range(3)]
     bases = {
@@ -67,11 +73,11 @@ def three(device, kind: str) -> list:
         padded = np.zeros((W.shape[0], W.shape[0]))
         padded[:N, :N] = core
         return [Compressed(Dense(device, scale * padded), W, W, 0.0) for scale in scales]
-    W = bases[kind]()
-    return [compressed(device, scale, W) for scale in scales]
+    # Each has a basis of its own, as from a file, and a support of its own.
+    return [compressed(device, scale, bases[kind]()) for scale in scales]
 
 
-KINDS = ("csr", "dense", "float32", "float16", "int8", "mixed", "wide")
+KINDS = ("csr", "dense", "float32", "float16", "int8", "tiles", "mixed", "wide", "sizes")
 COMPRESSED = ("wavelets", "hats", "pixels", "support")
 
 
@@ -99,7 +105,7 @@ def test_systems_stay_systems(device, kind):
         np.testing.assert_allclose(x[channel], expected, rtol=0, atol=1e-4 * abs(expected).max())
 
 
-@pytest.mark.parametrize("kind", ["csr", "float32", "float16", "int8"])
+@pytest.mark.parametrize("kind", ["csr", "float32", "float16", "int8", "tiles"])
 def test_one_launch_of_small_rows(device, kind):
     blocks = three(device, kind)
     joined = block_diagonal(blocks)
@@ -140,8 +146,9 @@ def test_facts_of_blocks(device):
     assert joined.norm_bound().value == max(block.norm_bound().value for block in blocks)
 
 
-def test_blocks_of_one_shape(device):
-    with pytest.raises(InputError, match="blocks have shapes"):
-        block_diagonal([Dense(device, np.eye(2)), Dense(device, np.eye(3))])
+def test_blocks_on_one_device(device):
+    another = launched_as(device, "gpu")
+    with pytest.raises(InputError, match="blocks are on"):
+        block_diagonal([Dense(device, np.eye(2)), Dense(another, np.eye(2))])
     with pytest.raises(InputError, match="blocks is empty"):
         block_diagonal([])

@@ -42,7 +42,7 @@ class CodeTable:
     Attributes
     ----------
     thresholds : (channels, count)
-        Ascending light; none where codes are light.
+        Ascending light, with an infinite one at the end, which no light reaches.
     starts : (channels, cells)
     first_light, cells_per_light : float
         Where the first cell begins, and how many there are in a unit of light.
@@ -81,7 +81,8 @@ class CodeTable:
             largest = np.iinfo(dtype).max
             codes = (np.arange(largest) + 0.5) / largest
         rows = [np.asarray(curve(codes), np.float32) for curve in curves]
-        thresholds = np.stack(rows)
+        beyond = np.full((len(rows), 1), np.inf, np.float32)
+        thresholds = np.hstack([np.stack(rows), beyond])
         best: CodeTable | None = None
         for cells in CELL_COUNTS:
             table = cls._with_cells(thresholds, cells, is_between)
@@ -95,7 +96,7 @@ class CodeTable:
     @classmethod
     def _with_cells(cls, thresholds: np.ndarray, cells: int, is_between: bool) -> CodeTable:
         first = float(thresholds.min())
-        last = float(thresholds.max())
+        last = float(thresholds[:, :-1].max())
         width = (last - first) / cells
         edges = first + width * np.arange(cells + 1)
         starts = []
@@ -104,7 +105,7 @@ class CodeTable:
             begin = np.searchsorted(row, edges[:-1] - CELL_MARGIN * width, side="right")
             end = np.searchsorted(row, edges[1:] + CELL_MARGIN * width, side="right")
             # All that is brighter, or darker, is looked up in the outer cells.
-            end[-1] = len(row)
+            end[-1] = len(row) - 1
             begin[0] = 0
             starts.append(begin)
             steps = max(steps, int(np.max(end - begin)))
@@ -124,7 +125,7 @@ class CodeTable:
         codes = []
         for row, column in zip(self.thresholds, light.T, strict=True):
             if self.is_between:
-                codes.append(np.interp(column, row, np.linspace(0.0, 1.0, len(row))))
+                codes.append(np.interp(column, row[:-1], np.linspace(0.0, 1.0, len(row) - 1)))
             else:
                 codes.append(np.searchsorted(row, column, side="right"))
         return np.stack(codes, axis=-1)
