@@ -16,8 +16,8 @@
 // Required defines: CODE, the type of codes: uchar, ushort or float; CHANNELS of the light, 1 or 3;
 // STACKED. Of frames_decode also COLOURS of a code, 1 or CHANNELS, and TABLE, 1 if a table tells
 // the light of each code, 0 if codes are light. Of the others MIXED. Of frames_encode STEPS: 0 if
-// codes are light; else codes are places in an ascending list of light, `thresholds`, STEPS of which
-// lie within a cell at most; BETWEEN, 1 for places between two of them, as floats from 0 to 1.
+// codes are light; else codes are places in an ascending list of light, `thresholds`, of which less
+// than 2^STEPS lie within a cell; BETWEEN, 1 for places between two, as floats from 0 to 1.
 
 #include "common/real.h"
 
@@ -137,8 +137,8 @@ kernel void frames_encode(
             const int cell = (int)clamp(at, (real)0, (real)(cells - 1));
             global const real *list = thresholds + c * count;
             int place = starts[c * cells + cell];
-            for (int step = 0; step < STEPS; ++step)
-                place += light >= list[place];
+            for (int more = 1 << (STEPS - 1); more > 0; more >>= 1)
+                place += light >= list[min(place + more, count) - 1] ? more : 0;
 #if BETWEEN
             const int i = clamp(place - 1, 0, count - 3);
             const real width = list[i + 1] - list[i];

@@ -25,9 +25,8 @@ CURVES = (SRGB, LINEAR)
 # Codes, from 0 to 1, between which a curve is taken as straight where codes are floats: off by less
 # than 1e-8.
 FLOAT_CODES = 4097
-# Numbers of cells that are tried, until one has this many places at most.
+# Numbers of cells that are tried, until one bisection is enough.
 CELL_COUNTS = (1024, 4096, 16384, 65536)
-ENOUGH_STEPS = 2
 # Of the width of a cell: rounding may put light this far into the next one.
 CELL_MARGIN = 1e-2
 
@@ -47,7 +46,7 @@ class CodeTable:
     first_light, cells_per_light : float
         Where the first cell begins, and how many there are in a unit of light.
     steps : int
-        Places in a cell at most; 0 where codes are light.
+        Bisections that find a place in a cell, of less than 2^steps; 0 where codes are light.
     is_between : bool
         True if codes are floats between the places.
     """
@@ -88,7 +87,7 @@ class CodeTable:
             table = cls._with_cells(thresholds, cells, is_between)
             if best is None or table.steps < best.steps:
                 best = table
-            if best.steps <= ENOUGH_STEPS:
+            if best.steps == 1:
                 break
         assert best is not None  # noqa: S101 - some number of cells was tried
         return best
@@ -100,7 +99,7 @@ class CodeTable:
         width = (last - first) / cells
         edges = first + width * np.arange(cells + 1)
         starts = []
-        steps = 1
+        largest = 1
         for row in thresholds:
             begin = np.searchsorted(row, edges[:-1] - CELL_MARGIN * width, side="right")
             end = np.searchsorted(row, edges[1:] + CELL_MARGIN * width, side="right")
@@ -108,27 +107,15 @@ class CodeTable:
             end[-1] = len(row) - 1
             begin[0] = 0
             starts.append(begin)
-            steps = max(steps, int(np.max(end - begin)))
+            largest = max(largest, int(np.max(end - begin)))
         return cls(
             thresholds=thresholds,
             starts=np.stack(starts).astype(np.int32),
             first_light=first,
             cells_per_light=1.0 / width,
-            steps=steps,
+            steps=largest.bit_length(),
             is_between=is_between,
         )
-
-    def places(self, light: np.ndarray) -> np.ndarray:
-        """The codes of light (n, channels) as the device finds them, for tests and small things."""
-        if not self.steps:
-            return light
-        codes = []
-        for row, column in zip(self.thresholds, light.T, strict=True):
-            if self.is_between:
-                codes.append(np.interp(column, row[:-1], np.linspace(0.0, 1.0, len(row) - 1)))
-            else:
-                codes.append(np.searchsorted(row, column, side="right"))
-        return np.stack(codes, axis=-1)
 
 
 def srgb_light(codes: np.ndarray) -> np.ndarray:
