@@ -86,7 +86,7 @@ def test_products_of_blocks(shaped, kind):
     """Those of the operators, one below the other, with all terms of an epilogue, both ways."""
     blocks = three(shaped, kind)
     joined = block_diagonal(blocks)
-    matrix = scipy.linalg.block_diag(*[block.to_dense() for block in blocks])
+    matrix = np.asarray(scipy.linalg.block_diag(*[block.to_dense() for block in blocks]))
     assert joined.shape == matrix.shape
     helpers.meets_twin(joined, matrix)
     helpers.meets_twin(joined, matrix, transpose=True)

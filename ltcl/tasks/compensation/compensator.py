@@ -337,7 +337,7 @@ class Compensator:
                 self._first_gain(prepared, slot, frame)
             prepared.keep_within_bounds(slot.begun_at + self._seconds)
             prepared.end(slot)
-            future = self._collector.submit(self._collect, prepared, slot)
+            future: Future[Any] = self._collector.submit(self._collect, prepared, slot)
             self._on_the_way.append(future)
             return future
 

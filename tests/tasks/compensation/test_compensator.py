@@ -202,7 +202,7 @@ def test_white_of_codes():
     half = light(T, bounds=(0.0, 0.5), encode="linear", dtype="uint8")(frame)
     assert np.all(half == 128)
     assert np.allclose(light(T, bounds=(0.0, 0.5))(frame), 0.25)
-    response = Response([0.0, 1.0])
+    response = Response(np.array([0.0, 1.0]))
     known = light(T, bounds=(0.0, 0.5), encode=response, dtype="uint8")(frame)
     assert np.all(known == 64)
 
