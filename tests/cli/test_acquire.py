@@ -330,21 +330,24 @@ def test_what_fails_is_a_further_list(program, finished):
 
 
 @pytest.mark.parametrize(
-    ("options", "display", "advance"),
+    ("options", "display", "advance", "resize"),
     [
-        ([], 1, "key"),
-        (["--display", "0", "--every", "2"], 0, 2.0),
-        (["--arrival"], 1, "arrival"),
+        ([], 1, "key", None),
+        (["--display", "0", "--every", "2"], 0, 2.0, None),
+        (["--arrival"], 1, "arrival", None),
+        (["--resize", "crop"], 1, "key", "crop"),
     ],
 )
-def test_options_of_show(program, monkeypatch, tmp_path, options, display, advance):
+def test_options_of_show(program, monkeypatch, tmp_path, options, display, advance, resize):
     calls = []
 
     def show(folder: Path, **settings: Any) -> int:
-        calls.append((folder, settings["display"], settings["advance"]))
+        del settings["progress"]
+        calls.append((folder, settings))
         return 3
 
     monkeypatch.setattr(rigs, "show", show)
     report = program("show", tmp_path, *options, "--json").json
     assert report == {"folder": str(tmp_path), "shown": 3}
-    assert calls == [(tmp_path, display, advance)]
+    settings = {"display": display, "advance": advance, "resize": resize}
+    assert calls == [(tmp_path, settings)]
