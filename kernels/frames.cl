@@ -24,7 +24,7 @@
 #ifndef CODE
 #error "frames.cl needs -DCODE=<type of codes: uchar, ushort or float>"
 #endif
-#if CHANNELS != 1 && CHANNELS != 3
+#ifndef CHANNELS
 #error "frames.cl needs -DCHANNELS=<of the light: 1 or 3>"
 #endif
 #ifndef COLOURS

@@ -156,9 +156,9 @@ class Compensator:
     >>> compensator = ltcl.Compensator(T, decode="linear", encode="linear", dtype="float32")
     >>> compensator(numpy.array([[0.3, 0.3]])).round(2).tolist()
     [[0.5, 0.5]]
-    >>> future = compensator.submit(numpy.array([[0.1, 0.2]]))
+    >>> future = compensator.submit(numpy.array([[0.15, 0.15]]))
     >>> future.result().round(2).tolist(), compensator.statistics.frames
-    ([[0.12, 0.38]], 2)
+    ([[0.25, 0.25]], 2)
     """
 
     def __init__(
