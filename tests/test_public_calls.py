@@ -62,7 +62,7 @@ def bounded_error(device: Device) -> float:
 @call("prepared frames", 0.02)
 def prepared_error(device: Device) -> float:
     T = SCENE.transport(device=device)
-    compensator = ltcl.Compensator(T, decode="linear", encode="linear", dtype="float32")
+    compensator = ltcl.Compensator(T, encode="linear", dtype="float32")
     return relative_error(T @ compensator(DESIRED), DESIRED)
 
 

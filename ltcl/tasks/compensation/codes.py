@@ -22,6 +22,9 @@ CODE_NAMES = ", ".join(map(repr, CODE_TYPES))
 SRGB = "srgb"
 LINEAR = "linear"
 CURVES = (SRGB, LINEAR)
+# Whole numbers are sRGB, floats linear.
+AUTO = "auto"
+DECODES = (AUTO, *CURVES)
 # Codes, from 0 to 1, between which a curve is taken as straight where codes are floats: off by less
 # than 1e-8.
 FLOAT_CODES = 4097
@@ -131,7 +134,7 @@ def light_of_codes(decode: str, dtype: np.dtype) -> np.ndarray:
     if dtype.kind == "f":
         return np.zeros(1, np.float32)
     codes = np.linspace(0.0, 1.0, np.iinfo(dtype).max + 1)
-    if decode == SRGB:
+    if decode != LINEAR:
         codes = srgb_light(codes)
     return codes.astype(np.float32)
 

@@ -23,9 +23,10 @@ from ltcl.device import Array
 from ltcl.errors import InputError, InputTypeError
 from ltcl.solvers import Inverse
 from ltcl.tasks.compensation.codes import (
+    AUTO,
     CODE_NAMES,
     CODE_TYPES,
-    CURVES,
+    DECODES,
     SRGB,
     code_table,
     light_of_codes,
@@ -111,8 +112,9 @@ class Compensator:
         they go on until the error is the least there is up to `rtol`. The steps begin with the
         pattern of the frame before, where that is nearer than the clamped one: the result is never
         worse than the clamped pattern.
-    decode : "srgb" or "linear"
-        What the codes of frames mean. Whole numbers have white at the largest code, floats at 1.
+    decode : "auto", "srgb" or "linear"
+        What the codes of frames mean; "auto" takes whole numbers as sRGB and floats as linear
+        light. Whole numbers have white at the largest code, floats at 1.
     encode : "srgb", "linear" or a response
         Codes of the projector: with white at the upper bound, or those of a measured response, such
         as ``setup.calibration.projector`` of a scan, for light relative to its white.
@@ -153,7 +155,7 @@ class Compensator:
     --------
     >>> import ltcl, numpy
     >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
-    >>> compensator = ltcl.Compensator(T, decode="linear", encode="linear", dtype="float32")
+    >>> compensator = ltcl.Compensator(T, encode="linear", dtype="float32")
     >>> compensator(numpy.array([[0.3, 0.3]])).round(2).tolist()
     [[0.5, 0.5]]
     >>> future = compensator.submit(numpy.array([[0.15, 0.15]]))
@@ -173,7 +175,7 @@ class Compensator:
         rtol: float | None = None,
         clamp: bool = False,
         deadline_ms: float | None = None,
-        decode: str = SRGB,
+        decode: str = AUTO,
         encode: Any = SRGB,
         dtype: str = "uint8",
         film: Iterable[Any] | None = None,
@@ -182,7 +184,7 @@ class Compensator:
         depth: int = 3,
         late: str = "wait",
     ) -> None:
-        self._decode = checks.one_of("decode", decode, CURVES)
+        self._decode = checks.one_of("decode", decode, DECODES)
         if dtype not in CODE_TYPES:
             raise InputError(f"dtype is {checks.shown(dtype)}; it must be one of {CODE_NAMES}")
         self._dtype = dtype
@@ -363,7 +365,7 @@ class Compensator:
             if frame.dtype.kind == "f" and self._decode == SRGB:
                 raise InputError(
                     "frame is a device array of floats, but decode is 'srgb'; give codes of whole "
-                    "numbers, or decode='linear'"
+                    "numbers, or decode='auto'"
                 )
             if frame.device is not self.T.device:
                 raise InputError(f"frame is on {frame.device}; it must be on {self.T.device}")

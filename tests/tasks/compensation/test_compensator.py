@@ -73,7 +73,7 @@ def picture(T: ltcl.Transport, brightest: float, seed: int = 1) -> np.ndarray:
 
 def light(T: ltcl.Transport, **settings: Any) -> ltcl.Compensator:
     """A compensator of linear light."""
-    curves = {"decode": "linear", "encode": "linear", "dtype": "float32"}
+    curves = {"encode": "linear", "dtype": "float32"}
     return ltcl.Compensator(T, **{**curves, **settings})
 
 
@@ -157,7 +157,7 @@ def test_frames_grey_and_coloured(kind, colours):
 
 
 @pytest.mark.parametrize("frame_dtype", ["uint8", "uint16", "float32", "float64"])
-@pytest.mark.parametrize("decode", ["srgb", "linear"])
+@pytest.mark.parametrize("decode", ["auto", "srgb", "linear"])
 def test_codes_of_frames_are_light(frame_dtype, decode):
     T = ltcl.Transport(np.diag(np.ones(N)), GRID)
     frame = rng.uniform(0.0, 1.0, GRID)
@@ -168,7 +168,8 @@ def test_codes_of_frames_are_light(frame_dtype, decode):
     else:
         codes = frame.astype(frame_dtype)
     pattern = light(T, decode=decode, rtol=1e-5)(codes)
-    expected = from_srgb(frame) if decode == "srgb" else frame
+    is_srgb = decode == "srgb" or (decode == "auto" and codes.dtype.kind == "u")
+    expected = from_srgb(frame) if is_srgb else frame
     np.testing.assert_allclose(pattern, expected, rtol=0, atol=2e-5)
 
 
@@ -486,7 +487,7 @@ def test_bad_frames():
     with pytest.raises(InputError, match="frame"):
         compensator(np.full(GRID, np.nan))
     with pytest.raises(InputError, match="whole numbers"):
-        compensator(T.device.upload(np.zeros(GRID)))
+        ltcl.Compensator(T, decode="srgb")(T.device.upload(np.zeros(GRID)))
     with pytest.raises(InputTypeError, match="T is a"):
         ltcl.Compensator(np.eye(3))  # pyright: ignore[reportArgumentType]
 
