@@ -104,7 +104,8 @@ def write_record(path: Path, compilers: dict[str, str], entries: Iterable[Entry]
 def add_programs(entries: list[Entry], file: Path) -> None:
     """Add the programs that a run of tests has written down.
 
-    Those for GPUs are added for each number of right-hand sides: whoever asks for 15 right-hand sides gets launches of 8, 4 and 3, so every K can be.
+    Those for GPUs are added for each number of right-hand sides: whoever asks for 15 of them gets
+    launches of 8, 4 and 3, so every K can be.
     """
     known = {entry.program: entry for entry in entries}
     for plain in json.loads(file.read_text(encoding="utf-8")):
