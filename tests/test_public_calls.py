@@ -64,6 +64,13 @@ def bounded_error(device: Device) -> float:
     return compensate(device, bounds=(0.3, 0.5)).error
 
 
+@call("prepared frames", 0.02)
+def prepared_error(device: Device) -> float:
+    T = SCENE.transport(device=device)
+    compensator = ltcl.Compensator(T, decode="linear", encode="linear", dtype="float32")
+    return relative_error(T @ compensator(DESIRED), DESIRED)
+
+
 @call("separate", 1e-5)
 def separation_error(device: Device) -> float:
     b = ltcl.separate(SCENE.transport(device=device), DESIRED, bounces=2)

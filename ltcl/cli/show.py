@@ -6,11 +6,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from ltcl.cli import compensation, loading, options
 from ltcl.cli.command import Answer, Context, command
-from ltcl.cli.options import argument, option
+from ltcl.cli.options import argument, option, picture_option
 from ltcl.cli.reports.program import PlayReport, ShowReport
 from ltcl.cli.streams import print_line
 from ltcl.cli.view import address, address_options
@@ -26,10 +26,18 @@ def play(
     ],
     transport: options.TransportFile,
     gain: compensation.Gain = None,
+    resize: Annotated[
+        Literal["crop", "letterbox", "stretch"],
+        picture_option(
+            "Frames of another size are scaled to the camera's grid. With other proportions, cut "
+            "off what is too much, add black bars, or distort them."
+        ),
+    ] = "letterbox",
 ) -> Answer:
     """Play FILM in a projector window of the browser, compensated for TRANSPORT.
 
-    A film of other proportions lies between black bars. Ctrl-C ends it. Frames that would be late
+    A film of other proportions lies between black bars, unless --resize says otherwise. Ctrl-C ends
+    it. Frames that would be late
     are dropped. An --inverse, or a compressed TRANSPORT, makes it fast.
     """
     from ltcl.images.frames import open_frames
@@ -54,6 +62,7 @@ def play(
                 window,
                 compensation.resolve_gain(gain, setup),
                 context.progress,
+                resize,
                 **settings,
             )
             report = PlayReport(film=film, **dataclasses.asdict(pace))
@@ -96,6 +105,15 @@ def show(
             "--browser",
         ),
     ] = False,
+    resize: Annotated[
+        Literal["crop", "letterbox", "stretch"] | None,
+        picture_option(
+            "Scale pictures to the pixels of the display, with --browser to those of the first "
+            "picture. With other proportions, cut off what is too much, add black bars, or distort "
+            "them. Default: square blocks of pixels, with black around. Patterns of an acquisition "
+            "stay as they are."
+        ),
+    ] = None,
 ) -> Answer:
     """Show patterns full screen, next by key, timer or photograph; Escape ends it.
 
@@ -113,9 +131,9 @@ def show(
         advance = every
     counter = _ShotCounter(context)
     if not browser:
-        shown = rigs.show(folder, display=display, advance=advance, progress=counter)
+        shown = rigs.show(folder, display=display, advance=advance, progress=counter, resize=resize)
     else:
-        shown = _show_in_browser(folder, advance, counter)
+        shown = _show_in_browser(folder, advance, counter, resize)
     report = ShowReport(folder=folder, shown=shown)
     return Answer(report, [f"{shown} pattern(s) were shown"])
 
@@ -133,7 +151,7 @@ class _ShotCounter:
         self.count = done + 1
 
 
-def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter) -> int:
+def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter, resize: str | None) -> int:
     """Show patterns in a window until they or Ctrl-C end it; return how many were shown."""
     from ltcl.acquisition import rigs
     from ltcl.show.window import Window
@@ -141,5 +159,7 @@ def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter) -> int:
     with Window(str(folder)) as window:
         print_line(f"{window.url} shows {folder}; Ctrl-C ends it")
         with contextlib.suppress(KeyboardInterrupt):
-            return rigs.show(folder, display=window, advance=advance, progress=counter)
+            return rigs.show(
+                folder, display=window, advance=advance, progress=counter, resize=resize
+            )
     return counter.count

@@ -53,15 +53,17 @@ def play(
     window: Window,
     gain: float | str,
     progress: Callable[..., None],
+    resize: str = "letterbox",
     **settings: Any,
 ) -> Pace:
     """Show a film compensated for the T of `scene` at the film's own pace.
 
-    `settings` are those of `ltcl.compensate`; a `gain` "auto" is the largest for frames from all
+    Frames of another size are scaled by `resize`, as `ltcl.images.resize` does. `settings` are
+    those of `ltcl.compensate`; a `gain` "auto" is the largest for frames from all
     parts of the film. In the result `frames_per_second` counts shown frames, and `latency` is the
     median of the seconds between the due time of a frame and the end of its drawing.
     """
-    compensator = _FrameCompensator(scene, gain, settings)
+    compensator = _FrameCompensator(scene, gain, resize, settings)
     compensator.prepare(film)
     timing = _Timing(period=1.0 / (film.fps or DEFAULT_FPS))
     title = window.title
@@ -84,8 +86,11 @@ def play(
 class _FrameCompensator:
     """The pattern for each frame of a film, with one gain."""
 
-    def __init__(self, scene: ViewerScene, gain: float | str, settings: dict[str, Any]) -> None:
+    def __init__(
+        self, scene: ViewerScene, gain: float | str, resize: str, settings: dict[str, Any]
+    ) -> None:
         self._T = scene.T
+        self._resize = resize
         # For a camera of other pixels light is found only within the bounds.
         self._settings = {**settings, "clamp": scene.T.is_square}
         self._inverse = settings.get("inverse")
@@ -130,7 +135,7 @@ class _FrameCompensator:
         grid = self._T.camera_grid
         if light.shape[:2] == grid:
             return light
-        return images.resize(light, grid, "letterbox")
+        return images.resize(light, grid, self._resize)
 
 
 @dataclass(kw_only=True)
