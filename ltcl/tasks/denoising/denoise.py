@@ -49,10 +49,10 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     -------
     Transport
         T itself, with a warning, if its noise is unknown, if nothing shows that its pictures become
-        better, or if what would be removed is not like noise. Else float32, on the same grid, with the same first bounce, mixing and
-        masked pixels, without negative entries off the diagonal. Its `noise` is that of T, scaled
-        to the estimated error of a picture under white; the first bounce itself has that of T, and
-        errors of neighbours are alike.
+        better, or if what would be removed is not like noise. Else float32, on the same grid, with
+        the same first bounce, mixing and masked pixels, without negative entries off the diagonal.
+        Its `noise` is that of T, scaled to the estimated error of a picture under white; the first
+        bounce itself has that of T, and errors of neighbours are alike.
 
     Raises
     ------
