@@ -39,6 +39,8 @@ class MovedCornerRig(SimulatedRig):
         Rows and columns, in projector pixels, by which its picture has moved.
     lamp : float
         Light of the projector.
+    turned : int
+        Side of a square of the picture, in pixels, which a mirror turns upside down.
     **sensor
         Settings of `ltcl.acquisition.rigs.simulated.Sensor`.
     """
@@ -50,12 +52,15 @@ class MovedCornerRig(SimulatedRig):
         *,
         shift: tuple[float, float] = (0.0, 0.0),
         lamp: float = 1.0,
+        turned: int = 0,
         ambient: float = AMBIENT,
         **sensor: Any,
     ) -> None:
         super().__init__((side, side), 1, sensor)
         self.shift = shift
         self.lamp = lamp
+        start = side // 8
+        self._turned = slice(start, start + turned)
         self.albedo = albedo
         self.ambient = ambient
         self.count = 0
@@ -89,6 +94,9 @@ class MovedCornerRig(SimulatedRig):
     def light(self, pattern: np.ndarray) -> np.ndarray:
         """Light at the camera's pixels, (H, W), under linear light (h, w)."""
         power = self.lamp * self.albedo
+        pattern = np.array(pattern)
+        part = pattern[self._turned, self._turned]
+        pattern[self._turned, self._turned] = part[::-1].copy()
         down, across = self._patches_of_projector
         bounce = (power * (down @ pattern @ across.T)).reshape(-1, 1)
         least = LAST_BOUNCE * max(bounce.max(), 1e-12)

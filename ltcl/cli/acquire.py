@@ -271,6 +271,14 @@ def update(
             metavar="STORE",
         ),
     ] = None,
+    photographs: Annotated[
+        int | None,
+        option(
+            "Photographs at most. Default: 60; 12 measure nothing again, each round takes 16 more.",
+            metavar="N",
+            min=12,
+        ),
+    ] = None,
     take: Card = None,
     device: options.DeviceName = None,
 ) -> Answer:
@@ -278,10 +286,12 @@ def update(
 
     For a projector that was bumped by up to an eighth of its picture, or a lamp that has aged,
     while the camera and the scene stay. Three photographs judge the new transport; if it does not
-    hold, a new scan is needed, and where. DIR/transport.zarr stays as it is.
+    hold, what fails is measured again, by 16 photographs more in each round. If it does not hold
+    after that, a new scan is needed, and where. DIR/transport.zarr stays as it is.
 
-    With a folder rig a person takes the photographs: patterns come to STORE.photographs, all in one
-    round, and the command ends with exit code 3 as long as photographs are missing.
+    With a folder rig a person takes the photographs: patterns come to STORE.photographs, first 12,
+    then those of each round, and the command ends with exit code 3 as long as photographs are
+    missing.
     """
     from ltcl import acquisition
 
@@ -289,20 +299,28 @@ def update(
     target = folder / "updated.zarr" if to is None else to
     opened = open_device(device)
     _check_card(project, take)
-    photographs = target.with_name(f"{target.name}.photographs")
-    with project.rig(photographs=photographs) as rig:
+    settings = {} if photographs is None else {"photographs": photographs}
+    by_hand = target.with_name(f"{target.name}.photographs")
+    with project.rig(photographs=by_hand) as rig:
         if take is not None:
             rig.take([file for file in take.glob("[!.]*") if file.is_file()])
         try:
             with project.naming("acquire"):
                 result = acquisition.update(
-                    rig, project.store, store=target, progress=context.progress, device=opened
+                    rig,
+                    project.store,
+                    store=target,
+                    progress=context.progress,
+                    device=opened,
+                    **settings,
                 )
         except MissingError as error:
             again = f"ltcl acquire update {shlex.quote(str(folder))}"
             if to is not None:
                 again += f" --store {shlex.quote(str(to))}"
-            return _ask_for_photograph(photographs, error, rig.missing(), again)
+            if photographs is not None:
+                again += f" --photographs {photographs}"
+            return _ask_for_photograph(by_hand, error, rig.missing(), again)
     report = UpdateReport(
         folder=folder,
         store=target,
@@ -314,6 +332,7 @@ def update(
         largest=result.movement.largest,
         gain=result.gain.tolist(),
         masked=result.masked,
+        measured_again=result.measured_again,
         error=result.error,
         bound=result.bound,
         previous_error=result.previous_error,

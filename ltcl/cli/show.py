@@ -6,31 +6,38 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from ltcl.cli import compensation, loading, options
 from ltcl.cli.command import Answer, Context, command
-from ltcl.cli.options import argument, option
+from ltcl.cli.options import argument, option, picture_option
 from ltcl.cli.reports.program import PlayReport, ShowReport
 from ltcl.cli.streams import print_line
 from ltcl.cli.view import address, address_options
 from ltcl.errors import InputError
-from ltcl.tasks.compensation import RTOL
 
 
-@command(*options.READ_OPTIONS, options.solve_options, address_options)
+@command(*options.READ_OPTIONS, options.frame_options, address_options)
 def play(
     context: Context,
     film: Annotated[
         Path, argument("FILM", "A video, whose sound is left out, or a folder of pictures.")
     ],
     transport: options.TransportFile,
-    gain: compensation.Gain = None,
+    gain: compensation.FilmGain = None,
+    resize: Annotated[
+        Literal["crop", "letterbox", "stretch"],
+        picture_option(
+            "Frames of another size are scaled to the camera's grid. With other proportions, cut "
+            "off what is too much, add black bars, or distort them."
+        ),
+    ] = "letterbox",
 ) -> Answer:
     """Play FILM in a projector window of the browser, compensated for TRANSPORT.
 
-    A film of other proportions lies between black bars. Ctrl-C ends it. Frames that would be late
-    are dropped. An --inverse, or a compressed TRANSPORT, makes it fast.
+    A film of other proportions lies between black bars, unless --resize says otherwise. Ctrl-C ends
+    it. Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT, makes it
+    fast.
     """
     from ltcl.images.frames import open_frames
     from ltcl.show.player import play as run_film
@@ -40,9 +47,11 @@ def play(
     source = open_frames(film)
     T = loading.load(context, transport)
     setup = loading.load_setup(transport)
-    settings = loading.solver_settings(context, T, RTOL)
-    del settings["callback"]
-    settings["background"] = None if setup is None else setup.ambient
+    settings: dict[str, Any] = {
+        "rtol": context.options["rtol"],
+        "inverse": loading.load_inverse(context, T),
+        "background": None if setup is None else setup.ambient,
+    }
     scene = ViewerScene(T, transport.name, {}, setup)
     report = PlayReport(film=film)
     with Window(film.name, **address(context)) as window:
@@ -54,6 +63,7 @@ def play(
                 window,
                 compensation.resolve_gain(gain, setup),
                 context.progress,
+                resize,
                 **settings,
             )
             report = PlayReport(film=film, **dataclasses.asdict(pace))
@@ -61,7 +71,8 @@ def play(
         return Answer(report, [])
     line = (
         f"{report.shown} frames shown, {report.frames_per_second:.1f} a second, "
-        f"{report.latency:.3f} s late; {report.dropped} dropped"
+        f"{report.latency:.3f} s late; {report.dropped} dropped; "
+        f"99 % computed within {1e3 * (report.computing_p99 or 0.0):.1f} ms"
     )
     return Answer(report, [line])
 
@@ -96,6 +107,15 @@ def show(
             "--browser",
         ),
     ] = False,
+    resize: Annotated[
+        Literal["crop", "letterbox", "stretch"] | None,
+        picture_option(
+            "Scale pictures to the pixels of the display, with --browser to those of the first "
+            "picture. With other proportions, cut off what is too much, add black bars, or distort "
+            "them. Default: square blocks of pixels, with black around. Patterns of an acquisition "
+            "stay as they are."
+        ),
+    ] = None,
 ) -> Answer:
     """Show patterns full screen, next by key, timer or photograph; Escape ends it.
 
@@ -113,9 +133,9 @@ def show(
         advance = every
     counter = _ShotCounter(context)
     if not browser:
-        shown = rigs.show(folder, display=display, advance=advance, progress=counter)
+        shown = rigs.show(folder, display=display, advance=advance, progress=counter, resize=resize)
     else:
-        shown = _show_in_browser(folder, advance, counter)
+        shown = _show_in_browser(folder, advance, counter, resize)
     report = ShowReport(folder=folder, shown=shown)
     return Answer(report, [f"{shown} pattern(s) were shown"])
 
@@ -133,7 +153,7 @@ class _ShotCounter:
         self.count = done + 1
 
 
-def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter) -> int:
+def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter, resize: str | None) -> int:
     """Show patterns in a window until they or Ctrl-C end it; return how many were shown."""
     from ltcl.acquisition import rigs
     from ltcl.show.window import Window
@@ -141,5 +161,7 @@ def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter) -> int:
     with Window(str(folder)) as window:
         print_line(f"{window.url} shows {folder}; Ctrl-C ends it")
         with contextlib.suppress(KeyboardInterrupt):
-            return rigs.show(folder, display=window, advance=advance, progress=counter)
+            return rigs.show(
+                folder, display=window, advance=advance, progress=counter, resize=resize
+            )
     return counter.count

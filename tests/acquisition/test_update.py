@@ -65,7 +65,13 @@ def test_a_nudge_and_an_older_lamp(scan: Scan, tmp_path: Path, strategy: str) ->
     truth = 0.95 * camera_transport(0.7, -1.4)
     store = tmp_path / "new.zarr"
     steps = []
-    result = ltcl.update(rig(truth), old, store=store, progress=lambda *step: steps.append(step))
+    result = ltcl.update(
+        rig(truth),
+        old,
+        store=store,
+        photographs=12,
+        progress=lambda *step: steps.append(step),
+    )
     assert result.photographs == 12
     assert ("update", 12, 12) in steps
     assert result.shift == pytest.approx((0.7, -1.4), abs=0.05)
@@ -144,20 +150,60 @@ def test_too_far_and_another_scene_are_refused(
     assert not store.exists()
 
 
-@pytest.mark.rare
-def test_a_place_that_has_changed_is_named(
-    scan: Scan, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A mirror in the upper left corner sends light of pixels there elsewhere."""
+def mirrored() -> np.ndarray:
+    """T after a mirror in the upper left corner sends light of pixels there elsewhere."""
     truth = camera_transport().copy()
     changed = truth.reshape(66, 66, 16, 16)
     # Camera pixels of the first four rows and columns of projector pixels.
     changed[8:20, 8:20, :8, :8] = changed[8:20, 8:20, :8, :8][:, :, ::-1]
-    result = ltcl.update(rig(truth), scan("sketch"), store=tmp_path / "new.zarr")
+    return truth
+
+
+@pytest.mark.rare
+def test_a_place_that_has_changed_is_named(
+    scan: Scan, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    result = ltcl.update(
+        rig(mirrored()), scan("sketch"), store=tmp_path / "new.zarr", photographs=27
+    )
+    assert result.photographs == 12
     assert not result.holds
     assert result.failing[:4, :4].mean() > 0.5
     assert result.failing[8:, 8:].mean() < 0.1
     assert "a new scan is needed" in caplog.text
+
+
+def turned(height: int) -> np.ndarray:
+    """T after a turned mirror has come into the upper left corner: rows of it swap places."""
+    T = camera_transport()
+    swapped = np.arange(256).reshape(16, 16)
+    swapped[:height, :height] = swapped[:height, height - 1 :: -1]
+    return np.ascontiguousarray(T[:, swapped.ravel()])
+
+
+@pytest.mark.rare
+def test_what_fails_is_measured_again(
+    scan: Scan, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Light of an eighth of the picture falls elsewhere: 16 photographs more are enough."""
+    truth = 0.95 * turned(6)
+    store = tmp_path / "new.zarr"
+    steps = []
+    result = ltcl.update(
+        rig(truth), scan("sketch"), store=store, progress=lambda *step: steps.append(step)
+    )
+    assert result.photographs == 28
+    assert ("update", 28, 28) in steps
+    assert "16 more measure it again, at most 60 in all" in caplog.text
+    assert result.holds
+    assert 20 <= result.measured_again <= 60
+    assert f"{result.measured_again} pixels" in str(result)
+    assert true_error(store, result.transport, truth) < 0.03
+    # With 12 photographs alone.
+    before = ltcl.update(rig(truth), scan("sketch"), store=tmp_path / "first.zarr", photographs=12)
+    assert not before.holds
+    assert before.measured_again == 0
+    assert true_error(tmp_path / "first.zarr", before.transport, truth) > 0.1
 
 
 @pytest.mark.rare
@@ -211,6 +257,8 @@ def test_what_cannot_be_updated_is_refused_before_the_first_photograph(
         ltcl.update(camera, small, store=small.parent)
     with pytest.raises(FileError, match="no such folder"):
         ltcl.update(camera, tmp_path / "nowhere.zarr", store=new)
+    with pytest.raises(InputError, match="photographs is 11"):
+        ltcl.update(camera, small, store=new, photographs=11)
     with pytest.raises(ltcl.errors.InputTypeError, match="progress is 3"):
         ltcl.update(camera, small, store=new, progress=cast("Any", 3))
 

@@ -300,22 +300,54 @@ def test_a_person_takes_the_photographs_of_an_update_in_one_round(program, finis
     assert report["gain"][0] == pytest.approx(0.95, abs=0.02)
 
 
+@pytest.mark.rare
+def test_what_fails_is_a_further_list(program, finished):
+    """Light of some pixels falls elsewhere: after 12 photographs 16 more are asked for, not 32."""
+    T = ltcl.load(finished / "truth.npz")
+    matrix = np.asarray(T.matrices[0])[:, [*range(7, -1, -1), *range(8, 32)]]
+    ltcl.save(finished / "truth.npz", ltcl.Transport(matrix, T.grid))
+    with Project.open(finished).rig() as camera:
+        scene = camera
+    path = finished / "acquisition.toml"
+    settings = path.read_text().partition("\n[acquire]\n")[2]
+    by_hand = 'kind = "folder"\nprojector_grid = [4, 8]\npattern_bits = 16\ncamera_bits = 12\n'
+    path.write_text(f"[rig]\n{by_hand}[acquire]\n{settings}")
+    folder = finished / "updated.zarr.photographs"
+    command = ("acquire", "update", finished, "--photographs", "30")
+    for first, last in ((1, 12), (13, 28)):
+        outcome = program(*command)
+        assert outcome.code == 3
+        assert f"ltcl acquire update {finished} --photographs 30 --take CARD" in outcome.out
+        report = program(*command, "--json").document
+        assert report["missing"] == list(range(first, last + 1))
+        for row in (folder / "shots.csv").read_text().splitlines()[first:]:
+            _, pattern, seconds, name = row.split(",")
+            picture = scene.photograph(images.read_codes(folder / pattern) / 65535, float(seconds))
+            cv2.imwrite(str(folder / f"{name}.png"), picture)
+    report = program(*command, "--json").json
+    assert report["photographs"] == 28
+    assert report["measured_again"] > 0
+
+
 @pytest.mark.parametrize(
-    ("options", "display", "advance"),
+    ("options", "display", "advance", "resize"),
     [
-        ([], 1, "key"),
-        (["--display", "0", "--every", "2"], 0, 2.0),
-        (["--arrival"], 1, "arrival"),
+        ([], 1, "key", None),
+        (["--display", "0", "--every", "2"], 0, 2.0, None),
+        (["--arrival"], 1, "arrival", None),
+        (["--resize", "crop"], 1, "key", "crop"),
     ],
 )
-def test_options_of_show(program, monkeypatch, tmp_path, options, display, advance):
+def test_options_of_show(program, monkeypatch, tmp_path, options, display, advance, resize):
     calls = []
 
     def show(folder: Path, **settings: Any) -> int:
-        calls.append((folder, settings["display"], settings["advance"]))
+        del settings["progress"]
+        calls.append((folder, settings))
         return 3
 
     monkeypatch.setattr(rigs, "show", show)
     report = program("show", tmp_path, *options, "--json").json
     assert report == {"folder": str(tmp_path), "shown": 3}
-    assert calls == [(tmp_path, display, advance)]
+    settings = {"display": display, "advance": advance, "resize": resize}
+    assert calls == [(tmp_path, settings)]

@@ -298,6 +298,22 @@ def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) 
     np.testing.assert_allclose(shown[0].astype(int), exact.astype(int), atol=1)
 
 
+@pytest.mark.parametrize("how", ["crop", "letterbox", "stretch"])
+def test_a_film_of_other_proportions(device, tmp_path: Path, how: str) -> None:
+    T = ltcl.scenes.dihedral(4, albedo=0.6).transport()
+    images.write(tmp_path / "0.png", 0.3 + 0.2 * random.random((9, 7)))
+    source = open_frames(tmp_path)
+    scene = ViewerScene(T, "T", {}, None)
+    with Window("film", open_browser=False) as window, looking(window.url) as shown:
+        assert play(scene, source, window, 0.5, lambda *_, **__: None, how).shown
+        window.close()
+    (frame,) = source
+    desired = images.resize(frame.picture(), T.camera_grid, how)
+    light = ltcl.compensate(T, desired, gain=0.5, clamp=True).pattern
+    exact = np.atleast_3d(scene.codes(light, 1.0))
+    np.testing.assert_allclose(shown[0].astype(int), exact.astype(int), atol=1)
+
+
 @pytest.mark.rare
 @pytest.mark.parametrize("is_grey", [False, True])
 def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey: bool) -> None:

@@ -26,6 +26,7 @@ from ltcl.acquisition.rigs.shooting_list import Shot
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.files import as_path
 from ltcl.images.frames import open_frames
+from ltcl.images.pictures import RESIZES
 
 # Seconds between two looks for a key or a photograph.
 POLL_SECONDS = 0.05
@@ -44,8 +45,8 @@ class Display(Closing):
 
     Parameters
     ----------
-    grid : (int, int)
-        Height and width of the codes, at most the pixels of the display.
+    grid : (int, int), optional
+        Height and width of the codes, at most the pixels of the display; None: these pixels.
     index : int, optional
         Number of the display, from 0; None for the second display, or the only one.
 
@@ -63,15 +64,16 @@ class Display(Closing):
     ...     display.show(np.eye(3, 4))
     """
 
-    def __init__(self, grid: tuple[int, int], *, index: int | None = None) -> None:
-        self.grid = checks.grid("grid", grid)
+    def __init__(self, grid: tuple[int, int] | None, *, index: int | None = None) -> None:
+        if grid is not None:
+            grid = checks.grid("grid", grid)
         with contextlib.redirect_stdout(None):  # pygame prints a greeting
             self._pygame = load_extra("pygame", "projector", "a display")
         if self._pygame.display.get_surface() is not None:
             raise InputError("pygame shows a window in this process already; close it first")
         with self._closed_on_error():
             try:
-                self._open(index)
+                self._open(grid, index)
             except self._pygame.error as error:
                 raise AcquisitionError(f"no display can be opened: {error}") from error
 
@@ -120,7 +122,7 @@ class Display(Closing):
         self._screen = None
         self._pygame.display.quit()
 
-    def _open(self, index: int | None) -> None:
+    def _open(self, grid: tuple[int, int] | None, index: int | None) -> None:
         display = self._pygame.display
         display.init()
         _check_visible(display.get_driver())
@@ -128,6 +130,7 @@ class Display(Closing):
         self.index = _choose_display(index, sizes)
         w, h = sizes[self.index]
         self.size = (h, w)
+        self.grid = self.size if grid is None else grid
         # Refuses a grid that does not fit.
         enlarge(np.zeros(self.grid), self.size)
         rate = display.get_desktop_refresh_rates()[self.index]
@@ -174,6 +177,7 @@ def show(
     display: Any = 1,
     advance: str | float = "key",
     progress: Callable[[Shot, int, int], None] | None = None,
+    resize: str | None = None,
 ) -> int:
     """Show the patterns of a folder, or one picture, in full screen, one after the other.
 
@@ -191,6 +195,10 @@ def show(
         so many seconds.
     progress : callable, optional
         Called with each `Shot`, the number of shots before it, and the number of all.
+    resize : "crop", "letterbox" or "stretch", optional
+        Scale pictures, as `ltcl.images.resize` does, to the pixels of the display, or, on an object
+        without a `size`, to those of the first picture. None: pixels become square blocks, with
+        black around. Patterns of a shooting list must stay as they are.
 
     Returns
     -------
@@ -200,7 +208,7 @@ def show(
     Raises
     ------
     InputError, FileError
-        `advance` cannot be used, or there is nothing to show; as in `Display`.
+        `advance` or `resize` cannot be used, or there is nothing to show; as in `Display`.
     AcquisitionError
         As in `Display`.
 
@@ -215,6 +223,8 @@ def show(
         checks.number("advance", advance, above=0.0)
     elif advance not in ("key", "arrival"):
         raise InputError(f"advance is {advance!r}; it must be 'key', 'arrival' or seconds")
+    if resize is not None:
+        checks.one_of("resize", resize, RESIZES)
     shots = None
     if folder.is_file() and advance != "arrival":
         shots = [Shot(1, folder.name, 0.0, "")]
@@ -222,16 +232,25 @@ def show(
     rig = FolderRig(folder, (1, 1))  # any grid has the same list
     if shots is None:
         shots = _shots_to_show(rig, advance)
+        if resize is not None and rig.shots:
+            raise InputError(
+                f"resize is {resize!r}, but {folder} has the patterns of an acquisition; their "
+                "pixels must stay as they are"
+            )
     if not shots:
         return 0
 
-    h, w = images.read(folder / shots[0].pattern).shape[:2]
+    grid = images.read(folder / shots[0].pattern).shape[:2]
     opened: Any = contextlib.nullcontext(display)
     if not hasattr(display, "show"):
-        opened = Display((h, w), index=display)
+        opened = Display(grid if resize is None else None, index=display)
     with opened as screen:
         for done, shot in enumerate(shots):
-            screen.show(images.read(folder / shot.pattern, encoding="linear"))
+            picture = images.read(folder / shot.pattern, encoding="linear")
+            if resize is not None:
+                scaled = images.resize(picture, getattr(screen, "size", grid), resize)
+                picture = np.clip(scaled, 0.0, 1.0)
+            screen.show(picture)
             if progress is not None:
                 progress(shot, done, len(shots))
             _wait_for_next(screen, rig, shot, advance)

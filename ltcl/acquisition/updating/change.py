@@ -10,7 +10,7 @@ other pixels, and light from beyond the old picture are corrected as far as few 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,12 +39,16 @@ def with_change(
     variance: np.ndarray,
     white: np.ndarray,
     progress: Callable[[int], None],
+    centres: np.ndarray | None = None,
 ) -> ChangedTransport:
     """T and the change that pictures (k, N, channels) of patterns (k, N) show.
 
-    `white` is the light under white, (N, channels); `progress` is called with rows that are done.
+    `white` is the light under white, (N, channels); `progress` is called with rows that are done;
+    `centres` (N,) are the pixels around which rows change, by default their own.
     """
     windows = Windows.of(T.grid)
+    if centres is not None:
+        windows = replace(windows, nodes=windows.nodes[centres])
     sums = sums_under_hats(T.W, list(patterns))
     left = pictures - T.products(patterns)
     is_own = windows.nodes == np.arange(len(windows.nodes))[:, None]

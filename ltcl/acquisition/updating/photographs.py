@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The twelve photographs of an update: what is shown, and the light that they show.
+"""The photographs of an update, twelve and rounds of 16: what is shown, and the light they show.
 
 black, white     ambient light, and the lamp
 fitted           a picture like nature, and squares of 2, 4 and 8 pixels at random, two of each:
                  where the light falls now, and what has changed
 judges           three of the pictures that judge a sketch, which are never fitted
+rounds           patterns of a sketch's rounds, if a place fails by these
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.radiance import StoredRadiance
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scanning.sketch import judges, like_nature
+from ltcl.acquisition.scanning.sketch import judges, like_nature, more_patterns
 from ltcl.acquisition.scratch import ImageFile
 from ltcl.acquisition.session import Photograph, ProgressFunction, merge_photographs
 
@@ -89,19 +90,41 @@ def photograph(
     """Take the photographs; errors are those of `Shots.expose` and `merge_photographs`."""
     black = np.zeros(shots.grid, np.float32)
     shown = [black, black + 1.0, *fitted_patterns(shots.grid), *judging_patterns(shots.grid)]
-    shots.prepare([(codes, seconds) for codes in shown])
-    file = ImageFile()
-    light = []
-    for number, codes in enumerate(shown):
-        progress("update", number, len(shown))
-        shots.expose(codes, seconds)
-        taken = Photograph.of(shots, seconds, ImageFile())
-        light.append(merge_photographs([taken], camera, None, file))
-    progress("update", len(shown), len(shown))
-    black_light, white_light, *others = light
+    black_light, white_light, *others = _take(shots, shown, seconds, camera, progress, 0)
     return UpdateLight(
         black=black_light,
         white=white_light,
         fitted=others[:-JUDGES],
         judging=others[-JUDGES:],
     )
+
+
+def photograph_round(
+    shots: Shots, number: int, seconds: float, camera: CameraModel, progress: ProgressFunction
+) -> list[StoredRadiance]:
+    """Take the photographs of a round, from 0 on, of patterns that a sketch's round has."""
+    shown = more_patterns(shots.grid, number)
+    done = PHOTOGRAPHS + number * len(shown)
+    return _take(shots, shown, seconds, camera, progress, done)
+
+
+def _take(
+    shots: Shots,
+    shown: Sequence[np.ndarray],
+    seconds: float,
+    camera: CameraModel,
+    progress: ProgressFunction,
+    done: int,
+) -> list[StoredRadiance]:
+    """Photograph patterns, all of which come on the list of a person at once."""
+    shots.prepare([(codes, seconds) for codes in shown])
+    file = ImageFile()
+    light = []
+    total = done + len(shown)
+    for number, codes in enumerate(shown):
+        progress("update", done + number, total)
+        shots.expose(codes, seconds)
+        taken = Photograph.of(shots, seconds, ImageFile())
+        light.append(merge_photographs([taken], camera, None, file))
+    progress("update", total, total)
+    return light

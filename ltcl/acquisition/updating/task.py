@@ -5,6 +5,7 @@
 2. where the light falls now, and the gain of the lamp, by the old transport (`movement`)
 3. the old transport at the new places (`warp`), and what it leaves of the pictures (`change`)
 4. pictures that were not fitted judge it, beside what they said of the scan
+5. where they fail, rounds of more photographs, from which these rows are measured again (`match`)
 
 Known limit: the camera and the scene must be where they were.
 """
@@ -31,10 +32,12 @@ from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, difference, planes
 from ltcl.acquisition.rig import Rig, RigError, Shots
 from ltcl.acquisition.scanning import sketch
+from ltcl.acquisition.scanning.picture_log import BATCH_SIZE
 from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture, ScanGrid
 from ltcl.acquisition.scratch import ImageFile
 from ltcl.acquisition.session import ProgressFunction, check_same, ignore_progress
 from ltcl.acquisition.updating.change import ChangedTransport, with_change
+from ltcl.acquisition.updating.match import Matches, match_rows
 from ltcl.acquisition.updating.movement import (
     Movement,
     MovementFit,
@@ -51,6 +54,7 @@ from ltcl.acquisition.updating.photographs import (
     judge_places,
     judging_patterns,
     photograph,
+    photograph_round,
 )
 from ltcl.acquisition.updating.warp import HostTransport, known_pixels, row_interpolation
 from ltcl.device import open_device
@@ -70,6 +74,8 @@ STRATEGIES = ("sketch", "adaptive", "pixel", "hadamard")
 # Pixels up to which an adaptive scan can be: its cells do not move by parts of a pixel, so that all
 # entries of T are made of them.
 MAX_ADAPTIVE_PIXELS = 1 << 12
+# Photographs at most: the first ones, and three rounds in which what fails is measured again.
+MAX_PHOTOGRAPHS = PHOTOGRAPHS + 3 * BATCH_SIZE
 # Largest movement of any pixel, relative to the shorter side of the picture, and how much further a
 # shift is searched for, so that one that is too large is found.
 MAX_MOVEMENT_SHARE = 1 / 8
@@ -111,6 +117,8 @@ class Update:
         Light of the lamp, relative to that in the scan.
     masked : int
         Pixels that see places beyond the old picture, of which nothing is known.
+    measured_again : int
+        Pixels whose rows of T failed after the first photographs, and were measured again.
     errors, previous_errors : (judges,)
         Relative error of T p for each of these pictures, and what that was in the scan; NaN of a
         scan that no picture has judged.
@@ -121,7 +129,7 @@ class Update:
     holds : bool
         Whether `error` is at most 1.5 times that of the scan, or 2 % if that is not known.
     failing : (h, w) bool
-        Pixels in cells whose error is twice that or more; they need a new scan.
+        Pixels in cells whose error is twice that or more, also after they were measured again.
 
     Examples
     --------
@@ -143,6 +151,7 @@ class Update:
     movement: Movement
     gain: np.ndarray
     masked: int
+    measured_again: int
     errors: np.ndarray
     previous_errors: np.ndarray
     error: float
@@ -182,6 +191,11 @@ class Update:
                 f"{self.masked} pixels ({self.masked / (h * w):.1%}) are masked: they light places "
                 "beyond the old picture"
             )
+        if self.measured_again:
+            lines.append(
+                f"{self.measured_again} pixels ({self.measured_again / (h * w):.1%}) failed after "
+                f"{PHOTOGRAPHS} photographs, and were measured again"
+            )
         lines.append(self.judgement)
         return "\n".join(lines)
 
@@ -196,14 +210,7 @@ class Update:
     @property
     def judgement(self) -> str:
         """Whether the update holds, and what must be measured again, in one line."""
-        place = ""
-        if self.failing.any():
-            rows = np.flatnonzero(self.failing.any(axis=1))
-            columns = np.flatnonzero(self.failing.any(axis=0))
-            place = (
-                f"{self.failing.mean():.0%} of the picture fails, in rows {rows[0]} to {rows[-1]} "
-                f"and columns {columns[0]} to {columns[-1]}"
-            )
+        place = _place(self.failing)
         if self.holds:
             return f"the update holds; but {place}" if place else "the update holds"
         if place:
@@ -211,11 +218,24 @@ class Update:
         return "the update does not hold; a new scan is needed"
 
 
+def _place(failing: np.ndarray) -> str:
+    """The place (h, w) that fails, in words; nothing if there is none."""
+    if not failing.any():
+        return ""
+    rows = np.flatnonzero(failing.any(axis=1))
+    columns = np.flatnonzero(failing.any(axis=0))
+    return (
+        f"{failing.mean():.0%} of the picture fails, in rows {rows[0]} to {rows[-1]} and columns "
+        f"{columns[0]} to {columns[-1]}"
+    )
+
+
 def update(
     rig: Rig,
     scan: str | os.PathLike[str],
     *,
     store: str | os.PathLike[str],
+    photographs: int = MAX_PHOTOGRAPHS,
     progress: ProgressFunction | None = None,
     device: Any = None,
 ) -> Update:
@@ -224,7 +244,9 @@ def update(
     For a projector that was bumped, or a lamp that has aged, while the camera and the scene are as
     they were. The old transport tells what each pattern would look like from another place; that,
     and the gain of the lamp, are fitted to photographs of black, white and seven patterns. Three
-    more judge the result. The old scan stays as it is.
+    more judge the result. If it does not hold, what fails is measured again, in rounds of 16
+    photographs, from which its rows of T are found anew; all others are corrected by them, too.
+    The old scan stays as it is.
 
     Parameters
     ----------
@@ -236,6 +258,8 @@ def update(
         adaptive one of at most 4096 pixels.
     store : path
         Folder of the new transport, where nothing is yet.
+    photographs : int
+        Photographs at most, 12 or more. Below 28 nothing is measured again.
     progress : function of (str, int, int), optional
         Called with "update", photographs that are done, and all; then with "fit" and rows of T.
     device : Device or str, optional
@@ -245,7 +269,7 @@ def update(
     -------
     Update
         Its transport is like that of `ltcl.acquire`; pixels that light places beyond the old
-        picture are masked. If it does not hold, a new scan is needed.
+        picture are masked. If it does not hold after all photographs, a new scan is needed.
 
     Raises
     ------
@@ -269,6 +293,7 @@ def update(
         raise InputTypeError(
             f"progress is {progress!r}; it must be a function of (str, int, int), or None"
         )
+    photographs = checks.count("photographs", photographs, least=PHOTOGRAPHS)
     path = as_path(store, "store")
     if path.resolve() == as_path(scan, "scan").resolve():
         raise InputError(f"store is {path}, which is the scan; it must be another folder")
@@ -279,16 +304,17 @@ def update(
     shots = Shots(rig)
     previous = _open_scan(scan)
     _check_rig(previous, shots)
-    carried = _carry_over(shots, previous, progress)
+    carried = _carry_over(shots, previous, photographs, progress)
     _write(path, shots, previous, carried)
     judgement = carried.judgement
     result = Update(
         transport=load(path, on_dark="mask", device=device),
         store=path,
-        photographs=PHOTOGRAPHS,
+        photographs=carried.photographs,
         movement=carried.fit.movement,
         gain=carried.fit.gain,
         masked=carried.masked,
+        measured_again=carried.measured_again,
         errors=judgement.errors,
         previous_errors=judgement.previous_errors,
         error=judgement.error,
@@ -306,19 +332,24 @@ def update(
 class _Carried:
     """A scan that was carried over.
 
-    `masked` counts the pixels that light places beyond the old picture; `own_variance` is that of
-    the light of each pixel's own, (channels, N); `arrays` are those of the transport.
+    `photographs` were taken; `masked` counts the pixels that light places beyond the old picture,
+    `measured_again` those whose rows failed at first; `own_variance` is that of the light of each
+    pixel's own, (channels, N); `arrays` are those of the transport.
     """
 
     fit: MovementFit
     calibration: Calibration
+    photographs: int
     masked: int
+    measured_again: int
     judgement: _Judgement
     own_variance: np.ndarray
     arrays: dict[str, np.ndarray]
 
 
-def _carry_over(shots: Shots, previous: BlockStore, progress: ProgressFunction) -> _Carried:
+def _carry_over(
+    shots: Shots, previous: BlockStore, most_photographs: int, progress: ProgressFunction
+) -> _Carried:
     """Photograph, and carry the transport of a scan over to where things stand now."""
     T = HostTransport.of(previous)
     mapping = stored_map(previous)
@@ -334,35 +365,48 @@ def _carry_over(shots: Shots, previous: BlockStore, progress: ProgressFunction) 
     fit = _find_movement(T, old_grid, mapping, light, unit)
     movement = fit.movement
 
-    # 3. The transport at the new places.
-    known = known_pixels(movement)
+    # 3. and 4. The transport at the new places, and its judges.
     now = _moved_calibration(calibration, mapping, fit, light)
-    grid = ScanGrid(now)
-    patterns = _flat([np.ones(shots.grid), *fitted_patterns(shots.grid)])
-    pictures = _Pictures.of(grid, light.black, [light.white, *light.fitted], unit, known)
     moved = T if movement.is_identity else T.moved(movement)
-    rows = _RowCounter(progress, shots.channels * math.prod(shots.grid))
-    changed = with_change(
-        moved.scaled(fit.gain),
-        patterns,
-        pictures.value,
-        pictures.variance,
-        pictures.value[0],
-        rows.count,
+    correction = _Correction(
+        ScanGrid(now), moved.scaled(fit.gain), unit, known_pixels(movement), light, previous
     )
+    corrected = correction.correct(progress)
 
-    # 4. The judges.
-    judging = _Pictures.of(grid, light.black, light.judging, unit, known)
-    shown = _flat(judging_patterns(shots.grid))
-    judgement = _Judgement.of(changed.transport, shown, judging, previous)
-    noise = _CarriedNoise(previous, movement, fit.gain, judgement.ratio)
+    # 5. What fails is measured again.
+    photographs = PHOTOGRAPHS
+    while not corrected.judgement.holds and photographs + BATCH_SIZE <= most_photographs:
+        _tell_round(corrected, photographs, most_photographs)
+        number = (photographs - PHOTOGRAPHS) // BATCH_SIZE
+        more = photograph_round(shots, number, seconds, calibration.camera, progress)
+        correction.add(sketch.more_patterns(shots.grid, number), more, corrected.judgement.failing)
+        photographs += BATCH_SIZE
+        corrected = correction.correct(progress)
+
+    noise = _CarriedNoise(previous, movement, fit.gain, corrected.judgement.ratio)
     return _Carried(
         fit=fit,
         calibration=now,
-        masked=int(np.count_nonzero(~known)),
-        judgement=judgement,
+        photographs=photographs,
+        masked=int(np.count_nonzero(~correction.known)),
+        measured_again=len(correction.failed_rows),
+        judgement=corrected.judgement,
         own_variance=noise.own_variance,
-        arrays=_arrays(changed, noise, now.mixing),
+        arrays=_arrays(corrected, noise, now.mixing),
+    )
+
+
+def _tell_round(corrected: _Corrected, photographs: int, most: int) -> None:
+    """Say why more photographs follow, and how many at most."""
+    place = _place(corrected.judgement.failing)
+    if not place:
+        place = f"the error of T p is {corrected.judgement.error:.1%}"
+    logger.warning(
+        "after %d photographs %s; %d more measure it again, at most %d in all",
+        photographs,
+        place,
+        BATCH_SIZE,
+        most,
     )
 
 
@@ -384,9 +428,9 @@ def _write(path: Path, shots: Shots, previous: BlockStore, carried: _Carried) ->
     written.update(
         settings=previous.attributes["settings"],
         plan=previous.attributes["plan"],
-        why=f"updated from {previous.path} by {PHOTOGRAPHS} photographs",
+        why=f"updated from {previous.path} by {carried.photographs} photographs",
         strategy="sketch",
-        patterns=PHOTOGRAPHS,
+        patterns=carried.photographs,
         sketch={
             "error": judgement.error,
             "bound": judgement.bound,
@@ -397,6 +441,7 @@ def _write(path: Path, shots: Shots, previous: BlockStore, carried: _Carried) ->
             "coefficients": carried.fit.movement.coefficients.tolist(),
             "gain": carried.fit.gain.tolist(),
             "masked": carried.masked,
+            "measured_again": carried.measured_again,
             "holds": judgement.holds,
         },
     )
@@ -495,6 +540,13 @@ class _Pictures:
             values.append(np.where(is_known, value, 0.0))
             variances.append(np.where(is_known, variance, float(UNKNOWN)))
         return cls(value=np.stack(values), variance=np.stack(variances))
+
+    def joined(self, others: _Pictures) -> _Pictures:
+        """These pictures and others."""
+        return _Pictures(
+            value=np.concatenate([self.value, others.value]),
+            variance=np.concatenate([self.variance, others.variance]),
+        )
 
 
 def _find_movement(
@@ -630,6 +682,91 @@ class _Judgement:
         return max(self.error / self.previous_error, 1.0)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Corrected:
+    """The moved transport with its change, the rows that took the place of others, and judges."""
+
+    changed: ChangedTransport
+    matches: Matches | None
+    judgement: _Judgement
+
+
+class _Correction:
+    """The moved transport, corrected by all pictures that there are by now.
+
+    Parameters
+    ----------
+    grid : ScanGrid
+        That of now.
+    moved : HostTransport
+    unit : (channels,)
+        Light of pictures for that of the transport.
+    known : (N,) bool
+        Pixels of which the old scan knows anything.
+    light : UpdateLight
+    previous : BlockStore
+    """
+
+    def __init__(
+        self,
+        grid: ScanGrid,
+        moved: HostTransport,
+        unit: np.ndarray,
+        known: np.ndarray,
+        light: UpdateLight,
+        previous: BlockStore,
+    ) -> None:
+        self.known = known
+        self._grid = grid
+        self._moved = moved
+        self._unit = unit
+        self._black = light.black
+        self._previous = previous
+        self._patterns = _flat([np.ones(grid.grid), *fitted_patterns(grid.grid)])
+        self._pictures = self._pictures_of([light.white, *light.fitted])
+        self._judging = self._pictures_of(light.judging)
+        self._is_failed = np.zeros(len(known), bool)
+
+    @property
+    def failed_rows(self) -> np.ndarray:
+        """Numbers of the rows that failed, and are measured again."""
+        return np.flatnonzero(self._is_failed & self.known)
+
+    def add(
+        self, patterns: Sequence[np.ndarray], light: Sequence[StoredRadiance], failing: np.ndarray
+    ) -> None:
+        """Add the pictures of a round, after pixels (h, w) have failed."""
+        self._patterns = np.concatenate([self._patterns, _flat(patterns)])
+        self._pictures = self._pictures.joined(self._pictures_of(light))
+        self._is_failed |= failing.ravel()
+
+    def correct(self, progress: ProgressFunction) -> _Corrected:
+        """The transport that the pictures show, and what the judges say of it."""
+        T = self._moved
+        matches = None
+        centres = None
+        if self._is_failed.any():
+            matches = match_rows(T, self._patterns, self._pictures.value, self.failed_rows)
+            T = matches.apply(T)
+            centres = matches.centres
+        rows = _RowCounter(progress, len(T.cores) * len(self.known))
+        changed = with_change(
+            T,
+            self._patterns,
+            self._pictures.value,
+            self._pictures.variance,
+            self._pictures.value[0],
+            rows.count,
+            centres,
+        )
+        shown = _flat(judging_patterns(self._grid.grid))
+        judgement = _Judgement.of(changed.transport, shown, self._judging, self._previous)
+        return _Corrected(changed=changed, matches=matches, judgement=judgement)
+
+    def _pictures_of(self, light: Sequence[StoredRadiance]) -> _Pictures:
+        return _Pictures.of(self._grid, self._black, light, self._unit, self.known)
+
+
 def _previous_errors(previous: BlockStore, grid: tuple[int, int]) -> np.ndarray:
     """Errors of a scan, or of an update, for the same pictures; NaN if they are not known."""
     errors = np.array(previous.attributes.get("sketch", {}).get("errors", ()), np.float64)
@@ -709,10 +846,10 @@ class _CarriedNoise:
 
 
 def _arrays(
-    changed: ChangedTransport, carried: _CarriedNoise, mixing: np.ndarray | None
+    corrected: _Corrected, carried: _CarriedNoise, mixing: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """The arrays of the transport (`ltcl.transport.stored`), with its noise."""
-    T = changed.transport
+    T = corrected.changed.transport
     cores = []
     diagonals = []
     for core in T.cores:
@@ -721,7 +858,11 @@ def _arrays(
         identity = scipy.sparse.eye_array(*core.shape, format="csr")
         cores.append(scipy.sparse.csr_array(core - identity))
     direct = carried.first_bounce
-    direct = np.where(direct > 0, direct + changed.own, 0.0)
+    direct = np.where(direct > 0, direct + corrected.changed.own, 0.0)
+    if corrected.matches is not None:
+        # Rows of other places: the light of a pixel is what they have at its number.
+        own = np.stack([core.diagonal() for core in T.cores])
+        direct = np.where(corrected.matches.moved, np.maximum(own, 0.0), direct)
     first_bounce = drop_uncertain(direct, carried.own_variance, FIRST_BOUNCE_SIGMAS)
     transport = stored.arrays_of_scan(
         T.grid, cores, np.stack(diagonals), first_bounce, mixing, BASIS

@@ -162,6 +162,30 @@ def test_one_picture_is_shown_alone_with_the_blocks_of_a_scan(tmp_path: Path) ->
     np.testing.assert_array_equal(*shown[0])
 
 
+@pytest.mark.parametrize("how", ["crop", "letterbox", "stretch"])
+def test_pictures_are_scaled_as_asked(tmp_path: Path, how: str) -> None:
+    """A square picture larger than the display is refused without a way to scale it."""
+    codes = np.tile(np.linspace(0.2, 1.0, 4000), (4000, 1))
+    images.write(tmp_path / "large.png", codes, encoding="linear")
+    with pytest.raises(InputError, match="the projector has"):
+        show(tmp_path / "large.png", 0, 0.01)
+    shown = []
+    show(tmp_path / "large.png", 0, 0.01, lambda *_: shown.append(screen()), how)
+    size = shown[0].shape[:2]
+    stored = images.read(tmp_path / "large.png", encoding="linear")
+    expected = np.rint(255 * images.resize(stored, size, how))
+    np.testing.assert_array_equal(shown[0], np.broadcast_to(expected[..., None], shown[0].shape))
+
+
+def test_patterns_of_an_acquisition_are_not_scaled(scan: FolderRig) -> None:
+    with pytest.raises(
+        InputError, match=r"resize is 'crop', but .* the patterns of an acquisition"
+    ):
+        show(scan.folder, 0, 0.01, resize="crop")
+    with pytest.raises(InputError, match="resize is 'fit'"):
+        show(scan.folder, 0, 0.01, resize="fit")
+
+
 def test_of_the_results_of_a_compensation_the_patterns_are_shown(tmp_path: Path) -> None:
     for number in (2, 10):
         pattern = np.full((2, 3), number / 255)
