@@ -86,7 +86,7 @@ class FrameError:
         ``||W (appearance - target)|| / ||W target||``; where the target is black, without the
         divisor.
     clipped : float
-        Share of the values of lit pixels that are at a bound.
+        Share of the values of lit pixels that would go beyond a bound.
     """
 
     error: float
@@ -109,9 +109,11 @@ class Compensator:
         Clamp the light to the bounds, and leave it at that.
     deadline_ms : float, optional
         Milliseconds after which no further projected step is begun, from the call on; without it
-        they go on until the error is the least there is up to `rtol`. The steps begin with the
-        pattern of the frame before, where that is nearer than the clamped one: the result is never
-        worse than the clamped pattern.
+        they go on until the error is the least there is up to `rtol`. The result is never worse
+        than the clamped pattern.
+    warm : bool
+        Begin the projected steps with the pattern of the frame before, where that is nearer than
+        the clamped one. False gives each frame the same pattern whatever came before.
     decode : "auto", "srgb" or "linear"
         What the codes of frames mean; "auto" takes whole numbers as sRGB and floats as linear
         light. Whole numbers have white at the largest code, floats at 1.
@@ -175,6 +177,7 @@ class Compensator:
         rtol: float | None = None,
         clamp: bool = False,
         deadline_ms: float | None = None,
+        warm: bool = True,
         decode: str = AUTO,
         encode: Any = SRGB,
         dtype: str = "uint8",
@@ -196,6 +199,7 @@ class Compensator:
         change = checks.number("gain_change", gain_change, least=1.0)
         self._frame_change = change ** (1.0 / checks.number("fps", fps, above=0.0))
         self._clamp = checks.flag("clamp", clamp)
+        self._is_warm = checks.flag("warm", warm)
         self.T = T
         self._options = {
             "bounds": bounds,
@@ -222,7 +226,8 @@ class Compensator:
         white = float(request.problem.limits.high)
         self._table = code_table(encode, dtype, 3 if T.channels == 3 else 1, white)
         self._prepared: dict[tuple[int, str], PreparedFrames] = {}
-        self._last: tuple[PreparedFrames, np.ndarray | Array, float] | None = None
+        # Of the last frame.
+        self._last: tuple[PreparedFrames, float] | None = None
         if not self.follows_gain:
             self.gain = self._find_gain(gain, film)
 
@@ -287,6 +292,7 @@ class Compensator:
                 dtype=self._dtype,
                 table=table,
                 is_bounded=not self._clamp,
+                is_warm=self._is_warm,
                 has_peaks=self.follows_gain,
                 slots=self._depth,
             )
@@ -355,7 +361,7 @@ class Compensator:
         slot = prepared.slots[self._turn % self._depth]
         self._turn += 1
         prepared.begin(slot, codes, self.gain)
-        self._last = (prepared, codes, self.gain)
+        self._last = (prepared, self.gain)
         return prepared, slot
 
     def _codes_of(self, frame: Any) -> np.ndarray | Array:
@@ -417,7 +423,7 @@ class Compensator:
         self.gain = wanted
         codes = self._codes_of(frame)
         prepared.begin(slot, codes, self.gain)
-        self._last = (prepared, codes, self.gain)
+        self._last = (prepared, self.gain)
 
     def _follow(self, slot: Slot) -> None:
         """Bring the gain of frames to come nearer to what this one allows."""
@@ -441,7 +447,7 @@ class Compensator:
         products = 0
         if prepared.direct_steps is not None:
             products = prepared.direct_steps.products
-        last_gain = self.gain if self._last is None else self._last[2]
+        last_gain = self.gain if self._last is None else self._last[1]
         return FrameStatistics(
             frames=self._frames,
             dropped=self._dropped,
@@ -461,36 +467,8 @@ class Compensator:
                 future.result()
             if self._last is None:
                 raise InputError("no frame was given yet, which could be judged")
-            prepared, codes, gain = self._last
-            if isinstance(codes, Array):
-                codes = codes.get()
-            colours = 3 if self.T.channels == 3 or codes.ndim == 3 else 1
-            request = self._request(colours)
-            light = prepared.light()
-        h, w = self.T.grid
-        pattern = light.reshape((h, w, 3) if colours == 3 else (h, w))
-        linear = codes
-        if codes.dtype.kind != "f":
-            linear = light_of_codes(self._decode, codes.dtype)[codes]
-        target = gain * np.broadcast_to(
-            linear.reshape(*linear.shape[:2], -1), (*self.T.camera_grid, colours)
-        )
-        appearance = (self.T @ pattern).reshape(target.shape)
-        background = request.shape.pack(request.problem.background, self.T.camera_grid)
-        missing = target - appearance - background.reshape(target.shape)
-        weights = np.ones_like(missing)
-        if request.problem.weights is not None:
-            packed = request.shape.pack(request.problem.weights, self.T.camera_grid)
-            weights = packed.reshape(target.shape)
-        size = float(np.linalg.norm(weights * target)) or 1.0 / request.problem.weight_unit
-        limits = request.problem.limits
-        is_lit = ~self.T.masked
-        values = light[is_lit]
-        is_at_bound = (values <= limits.low) | (values >= limits.high)
-        return FrameError(
-            error=float(np.linalg.norm(weights * missing)) / size,
-            clipped=float(np.mean(is_at_bound)),
-        )
+            error, clipped = self._last[0].judge()
+        return FrameError(error=error, clipped=clipped)
 
     def close(self) -> None:
         """Wait for the frames on their way, and end the thread that waits for the device."""

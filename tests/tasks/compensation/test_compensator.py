@@ -98,7 +98,9 @@ def test_light_of_compensate(kind, brightest):
     appearance = (T @ pattern)[is_lit]
     error = np.linalg.norm(appearance - desired[is_lit]) / np.linalg.norm(desired[is_lit])
     assert error <= expected.error + 2.5e-3
-    assert compensator.judge().error == pytest.approx(error, abs=1e-5)
+    facts = compensator.judge()
+    assert facts.error == pytest.approx(error, abs=1e-5)
+    assert facts.clipped == pytest.approx(expected.clipped, abs=0.1)
 
 
 @pytest.mark.parametrize("kind", SQUARE)
@@ -113,9 +115,13 @@ def test_clamped_light(kind, has_inverse):
     settings |= {"rtol": 1e-3, "clamp": True}
     if has_inverse:
         settings["inverse"] = ltcl.invert(T, 1e-3)
-    pattern = light(T, **settings)(desired)
-    expected = ltcl.compensate(T, desired, **settings).pattern
-    np.testing.assert_allclose(pattern, expected, rtol=0, atol=4e-3)
+    compensator = light(T, **settings)
+    pattern = compensator(desired)
+    expected = ltcl.compensate(T, desired, **settings)
+    np.testing.assert_allclose(pattern, expected.pattern, rtol=0, atol=4e-3)
+    facts = compensator.judge()
+    assert facts.error == pytest.approx(expected.error, abs=2e-3)
+    assert facts.clipped == pytest.approx(expected.clipped, abs=0.02)
 
 
 def test_background_of_each_pixel():
@@ -261,8 +267,9 @@ def test_kernels_meet_their_twins(shaped, kind, monkeypatch):
     )
     frames._exceeded.set(np.zeros(1, np.int32))
     frames._clip()
-    assert frames._exceeded.get()[0] == 1
     scales = frames.shown.to_channels(frames._scales())
+    is_outside = ((light < 0.1) | (light > 0.8)) & (scales > 0)
+    assert frames._exceeded.get()[0] == np.count_nonzero(is_outside)
     expected = reference.frames_clip(light, 0.1, 0.8, scales)
     found = frames.shown.to_channels(frames.bounded.start.get())
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
@@ -353,6 +360,15 @@ def test_second_frame_begins_where_the_first_ended():
     best = patient.judge().error
     patient(desired)
     assert patient.judge().error <= best + 1e-6
+
+
+def test_cold_frames_do_not_depend_on_others():
+    T = transport("colour")
+    desired = picture(T, 2.0)
+    compensator = light(T, warm=False, rtol=1e-2)
+    first = compensator(desired)
+    compensator(picture(T, 1.5, seed=9))
+    np.testing.assert_array_equal(compensator(desired), first)
 
 
 def test_launches_of_a_frame():
