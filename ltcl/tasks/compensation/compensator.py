@@ -136,6 +136,8 @@ class Compensator:
     ----------
     gain : float
         That of the next frame.
+    rtol : float
+        Tolerance, as given, or what was chosen.
     statistics : FrameStatistics
 
     Raises
@@ -218,6 +220,7 @@ class Compensator:
         self.gain = 1.0
         # Checks all arguments, before anything is uploaded.
         request = self._request(3 if getattr(T, "channels", 3) == 3 else 1)
+        self.rtol = request.problem.settings.rtol
         if self.follows_gain and not T.is_square:
             raise InputError(
                 "gain is 'follow', but this T has no S, whose light it follows; give a number"
@@ -279,24 +282,31 @@ class Compensator:
         """What is prepared for frames of so many colours and one type; made at the first one."""
         key = (colours, dtype.name)
         if key not in self._prepared:
-            channels = 3 if self.T.channels == 3 else colours
-            table = self._table
-            if len(table.starts) != channels:
-                white = float(self._request(channels).problem.limits.high)
-                table = code_table(self._encode, self._dtype, channels, white)
-            self._prepared[key] = PreparedFrames(
-                self._request(channels),
-                frame_colours=colours,
-                frame_dtype=dtype,
-                decode=self._decode,
-                dtype=self._dtype,
-                table=table,
-                is_bounded=not self._clamp,
-                is_warm=self._is_warm,
-                has_peaks=self.follows_gain,
-                slots=self._depth,
-            )
+            self._prepared[key] = self._prepare(colours, dtype)
         return self._prepared[key]
+
+    def _prepare(self, colours: int, dtype: np.dtype) -> PreparedFrames:
+        channels = 3 if self.T.channels == 3 else colours
+        for known in self._prepared.values():
+            if known.colours == channels:
+                return known.for_codes(colours, dtype, self._decode)
+        table = self._table
+        request = self._request(channels)
+        if len(table.starts) != channels:
+            white = float(request.problem.limits.high)
+            table = code_table(self._encode, self._dtype, channels, white)
+        return PreparedFrames(
+            request,
+            frame_colours=colours,
+            frame_dtype=dtype,
+            decode=self._decode,
+            dtype=self._dtype,
+            table=table,
+            is_bounded=not self._clamp,
+            is_warm=self._is_warm,
+            has_peaks=self.follows_gain,
+            slots=self._depth,
+        )
 
     # Frames.
 
@@ -456,6 +466,19 @@ class Compensator:
             gain=last_gain,
             products=products,
         )
+
+    def light(self) -> np.ndarray:
+        """The projector light of the last frame, (h, w) or (h, w, 3) float32.
+
+        InputError before the first frame.
+        """
+        with self._lock:
+            if self._last is None:
+                raise InputError("no frame was given yet, whose light could be told")
+            prepared = self._last[0]
+            light = prepared.light()
+        h, w = self.T.grid
+        return light.reshape((h, w, 3) if prepared.colours == 3 else (h, w))
 
     def judge(self) -> FrameError:
         """The error and the clipped share of the last frame, by a product with T.

@@ -9,6 +9,7 @@ three colours are one vector, channel below channel, and one system.
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Sequence
@@ -20,8 +21,9 @@ import numpy as np
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import InputError
-from ltcl.operators import IdentityPlus, Operator, block_diagonal
+from ltcl.operators import Dense, IdentityPlus, Operator, block_diagonal
 from ltcl.operators.epilogue import Epilogue
+from ltcl.solvers.auto import SMALL
 from ltcl.solvers.bounded import Descent, Search
 from ltcl.solvers.chebyshev import chebyshev_steps
 from ltcl.solvers.survey import survey
@@ -38,6 +40,8 @@ STRIP_PIXELS = 256
 PROBE_SHARE = 0.5
 # Steps beyond which fixed steps are given up.
 MAX_FIXED_STEPS = 60
+# Products of the norms of S and S^-1 up to which float32 holds an inverse of a small system.
+MAX_CONDITION = 1e5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +84,22 @@ class ByInverse:
 
     def __init__(self, inverse: Operator, target: Array, direct: Array) -> None:
         self.queue = inverse.bind(target, direct)
+
+
+def _dense_inverses(systems: Sequence[Operator]) -> list[Dense] | None:
+    """S^-1 of small systems, by a factorization in float64; None if one is singular."""
+    inverses = []
+    for S in systems:
+        matrix, _ = S.matrix_float64()
+        try:
+            inverse = np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:
+            return None
+        size = float(np.linalg.norm(inverse)) * float(np.linalg.norm(matrix))
+        if not size < MAX_CONDITION:
+            return None
+        inverses.append(Dense(S.device, inverse))
+    return inverses
 
 
 class ByFixedSteps:
@@ -316,6 +336,15 @@ class PreparedFrames:
         self._make_steps(is_bounded, has_peaks)
         self.slots = [self._slot() for _ in range(slots)]
 
+    def for_codes(self, frame_colours: int, frame_dtype: Any, decode: str) -> PreparedFrames:
+        """The same for frames of other codes, which share all buffers but those of the codes."""
+        other = copy.copy(self)
+        other.frame_colours = frame_colours
+        other.frame_dtype = np.dtype(frame_dtype)
+        other._set_light_table(decode)
+        other.slots = [other._slot() for _ in self.slots]
+        return other
+
     # Preparation.
 
     def _find_unit(self) -> float:
@@ -332,8 +361,7 @@ class PreparedFrames:
         """Upload the tables of codes and the factors of light."""
         request = self._request
         device = self.device
-        self._light_table = device.upload(light_of_codes(decode, self.frame_dtype))
-        self._has_table = self.frame_dtype.kind != "f"
+        self._set_light_table(decode)
         background = self.seen.from_channels(request.problem.background)
         self._subtracts = float(request.problem.has_background)
         self._background_host = background
@@ -345,6 +373,10 @@ class PreparedFrames:
         if request.T.mixing is not None:
             mixing = np.linalg.inv(request.T.mixing)
         self._mixing = device.upload(mixing)
+
+    def _set_light_table(self, decode: str) -> None:
+        self._light_table = self.device.upload(light_of_codes(decode, self.frame_dtype))
+        self._has_table = self.frame_dtype.kind != "f"
 
     def _factors(self) -> np.ndarray:
         """Projector light per direct light, of each pixel and channel; 0 at masked ones."""
@@ -409,6 +441,10 @@ class PreparedFrames:
         if request.inverse is not None:
             inverse = block_diagonal(request.inverse.systems)
             return ByInverse(inverse, self.target, self.direct)
+        if request.T.shape[0] <= SMALL:
+            inverses = _dense_inverses(request.T.systems)
+            if inverses is not None:
+                return ByInverse(block_diagonal(inverses), self.target, self.direct)
         S = block_diagonal(request.T.systems)
         assert isinstance(S, IdentityPlus)  # noqa: S101 - as all systems are
         rtol = request.problem.settings.rtol

@@ -515,14 +515,28 @@ def test_gain_follows_only_undone_light():
 
 def test_clamp_needs_light_that_is_undone():
     """A T whose light no fixed number of steps undoes is solved within the bounds only."""
-    T = np.eye(N) * 0.5
+    grid = (24, 26)
+    n = 24 * 26
+    T = 0.5 * np.eye(n)
     T[0, 1] = T[1, 0] = 50.0
-    strong = ltcl.Transport(T, GRID)
+    strong = ltcl.Transport(T, grid)
     with pytest.raises(InputError, match="clamp is True"):
         light(strong, clamp=True)
-    desired = T @ np.full(N, 0.5)
+    desired = strong @ np.full(grid, 0.5)
     compensator = light(strong, rtol=1e-3)
-    compensator(desired.reshape(GRID))
+    compensator(desired)
+    assert compensator.judge().error < 2e-3
+
+
+def test_singular_light_is_found_within_the_bounds():
+    """A small T with two equal columns, whose light has no inverse."""
+    T = dense(0)
+    T[:, 1] = T[:, 0]
+    T[1] = T[0]
+    singular = ltcl.Transport(T, GRID)
+    desired = singular @ np.full(GRID, 0.5)
+    compensator = light(singular, rtol=1e-3)
+    compensator(desired)
     assert compensator.judge().error < 2e-3
 
 
