@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ImageFile`: pictures in a temporary file instead of memory, read back whole or by rows.
+"""Arrays in temporary files instead of memory: `ImageFile`, `scratch_array`, `ScratchFrames`.
 
 A calibration takes about 150 photographs, of which 45 megapixels in colour are 20 gigabytes.
 """
@@ -84,6 +84,39 @@ def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         return np.zeros(shape, dtype)
     with tempfile.TemporaryFile(prefix="ltcl-") as file:
         return np.memmap(file, dtype, "w+", shape=shape)
+
+
+class ScratchFrames:
+    """Frames of one shape, to which more are added, in a temporary file once they are large.
+
+    Examples
+    --------
+    >>> frames = ScratchFrames((2,), "float32")
+    >>> frames.extend(1)[0] = 1, 2
+    >>> frames.extend(2).tolist()
+    [[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]]
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: Any) -> None:
+        self.array = np.zeros((0, *shape), dtype)
+        self._file: Any = None
+
+    def extend(self, count: int) -> np.ndarray:
+        """All frames with `count` more of zeros; arrays from before must not be written to."""
+        before = self.array
+        shape = (len(before) + count, *before.shape[1:])
+        if self._file is None and math.prod(shape) * before.itemsize <= MAX_ARRAY_BYTES:
+            self.array = np.concatenate([before, np.zeros((count, *shape[1:]), before.dtype)])
+            return self.array
+        is_new = self._file is None
+        if is_new:
+            self._file = tempfile.TemporaryFile(prefix="ltcl-")  # noqa: SIM115
+            weakref.finalize(self, self._file.close)
+        # Makes the file longer, and keeps what it holds.
+        self.array = np.memmap(self._file, before.dtype, "r+", shape=shape)
+        if is_new:
+            self.array[: len(before)] = before
+        return self.array
 
 
 @dataclass(frozen=True, kw_only=True)
