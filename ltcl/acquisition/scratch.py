@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 # Bytes of a scratch array that are kept in memory.
-MAX_ARRAY_BYTES = 1 << 26
+MAX_ARRAY_BYTES = 1 << 24
 # Values of a strip of rows.
 STRIP_VALUES = 1 << 20
 

@@ -543,9 +543,11 @@ def _advise_another_scan(grid: ScanGrid, error: float) -> None:
     candidates = plan.plans(
         grid.grid, known.exposures, known.noise, plan.measured(known), channels=grid.channels
     )
+    adaptive_scan = candidates["adaptive"]
     logger.warning(
         "pictures T p by this sketch are off by %.1f %%: light changes abruptly in this scene; "
-        "strategy 'adaptive' finds where, with up to %d photographs",
+        "strategy 'adaptive' finds where, with up to %d photographs, %.2g minutes of exposures",
         100 * error,
-        candidates["adaptive"].photographs,
+        adaptive_scan.photographs,
+        adaptive_scan.seconds / 60.0,
     )
