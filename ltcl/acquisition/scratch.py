@@ -108,14 +108,16 @@ class ScratchFrames:
         if self._file is None and math.prod(shape) * before.itemsize <= MAX_ARRAY_BYTES:
             self.array = np.concatenate([before, np.zeros((count, *shape[1:]), before.dtype)])
             return self.array
-        is_new = self._file is None
-        if is_new:
-            self._file = tempfile.TemporaryFile(prefix="ltcl-")  # noqa: SIM115
-            weakref.finalize(self, self._file.close)
-        # Makes the file longer, and keeps what it holds.
-        self.array = np.memmap(self._file, before.dtype, "r+", shape=shape)
-        if is_new:
+        if self._file is None:
+            file = tempfile.TemporaryFile(prefix="ltcl-")  # noqa: SIM115
+            weakref.finalize(self, file.close)
+            self._file = file
+            self.array = np.memmap(file, before.dtype, "w+", shape=shape)
             self.array[: len(before)] = before
+            return self.array
+        # Makes the file longer, and keeps what it holds.
+        file: Any = self._file
+        self.array = np.memmap(file, before.dtype, "r+", shape=shape)
         return self.array
 
 

@@ -135,6 +135,16 @@ def test_a_person_takes_at_most_80_photographs() -> None:
     assert relative_error(dense(T), corner(), (8, 16)) < 0.025
 
 
+def test_bounces_of_a_clean_sketch_carry_no_warning(
+    scanned: tuple[Unplugged, ltcl.Transport, Report], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Single entries are noisy, which their noise says; the scene is reciprocal."""
+    _, T, _ = scanned
+    separation = ltcl.separate(T, T @ np.ones(T.grid), bounces=2)
+    assert separation.warning.startswith("bounces hold as far as")
+    assert not caplog.records
+
+
 @pytest.mark.slow
 def test_where_light_is_not_smooth_the_error_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
