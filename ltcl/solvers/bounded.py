@@ -26,11 +26,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ltcl.device import vectors
+from ltcl.device import Array, vectors
 from ltcl.device.arrays import round_inwards
 from ltcl.device.kernels import Launch
 from ltcl.operators import Operator
@@ -119,17 +119,17 @@ def minimise(
     largest = float(np.max(np.abs(b)))
     if largest == 0.0:
         largest = float(np.max(np.abs([lower, upper])))
-    unit = _power_of_two(largest)
+    unit = power_of_two(largest)
     weight_unit = 1.0
     if weights is not None:
-        weight_unit = _power_of_two(float(np.max(weights)))
+        weight_unit = power_of_two(float(np.max(weights)))
         weights = weights / weight_unit
 
     scaled_lower = np.clip(np.asarray(lower, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
     scaled_upper = np.clip(np.asarray(upper, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
     box = round_inwards(scaled_lower, scaled_upper)
     first = _clip((x0 / unit).astype(np.float32), box)
-    descent = _Descent(A, b / unit, weights, box, first)
+    descent = Descent(A, b / unit, weights, box, first)
     search = _Search(descent, rtol, atol / (unit * weight_unit), maxiter, callback)
     status = search.run()
 
@@ -160,7 +160,7 @@ class _Search:
 
     def __init__(
         self,
-        descent: _Descent,
+        descent: Descent,
         rtol: float,
         atol: float,
         maxiter: int,
@@ -245,7 +245,15 @@ class _Search:
         self.excess = np.where(self.is_worse, self._excess_above_least(self.initial), self.excess)
 
 
-class _Descent:
+class Target(NamedTuple):
+    """A target b (M, k) on the device, with u = w^2 b and q = A^T u."""
+
+    b: Array
+    u: Array
+    q: Array
+
+
+class Descent:
     """The iterate and, on the device, r = b - A x, u = w^2 r, g = -A^T u, d, and h = A^T w^2 A d.
 
     `norms` (k,) are those of w b; `has_true_residual` tells whether r was computed from x itself.
@@ -389,6 +397,28 @@ class _Descent:
         self.products += 2
         self.has_true_residual = True
 
+    def shift(self, change: float, direction: Target) -> None:
+        """Add `change` times another target to b, without a product; `read` needs a step first."""
+        vectors.axpy(change, direction.b, self.b)
+        vectors.axpy(change, direction.b, self.r)
+        if self._is_weighted:
+            vectors.axpy(change, direction.u, self._u)
+        vectors.axpy(change, direction.q, self._q)
+        self._look_anew()
+
+    def scale(self, factor: float) -> None:
+        """Multiply b and x by `factor`, without a product; `read` needs a step first."""
+        scaled = [self.b, self.x, self.r, self._q]
+        if self._is_weighted:
+            scaled.append(self._u)
+        for values in scaled:
+            vectors.axpby(factor, values, 0.0, values, values)
+        self._look_anew()
+
+    def product_with(self, target: Array) -> np.ndarray:
+        """<w r, w b> of every column for another target b, which waits."""
+        return vectors.dot(self._u, target)
+
     def step(self, unsolved: np.ndarray) -> None:
         """Lower the error in the columns `unsolved`: six launches."""
         if np.any(self._is_resting == unsolved):
@@ -432,7 +462,7 @@ def _clip(x: np.ndarray, box: Box) -> np.ndarray:
     return np.clip(x, lower, upper)
 
 
-def _power_of_two(largest: float) -> float:
+def power_of_two(largest: float) -> float:
     """Return a power of two near `largest`: in such units squares stay within float32."""
     if not largest > 0.0:
         return 1.0
