@@ -46,8 +46,11 @@ MIN_CHANGE = 1e-3
 # The gain changes by this factor at most in a step, or in a jump.
 MAX_STEP = 1.3
 MAX_JUMP = 1.5
-# The largest factor by which a step of the gain is lengthened while it keeps its sign.
+# A change of the gain is lengthened, at first and at most, as light that follows asks for more.
+FIRST_LENGTHENING = 3.0
 MAX_LENGTHENING = 16.0
+# Steps of the light after a change of the gain.
+RESTING_STEPS = 2
 # The error at a gain is known well enough for a jump to another one.
 KNOWN_ERROR = 1.005
 # Values of light from which the first gains are guessed.
@@ -286,8 +289,8 @@ class GainDescent:
                 return self._accept_closest(direction, allowed)
             here = max(a + b / self.gain for a, b in self.tangents)
             error = np.sqrt(residual.square) / (self.gain * self.desired_norm)
-            if error <= KNOWN_ERROR * here:
-                self._jump(t)
+            if self.is_homogeneous and error <= KNOWN_ERROR * here and t * self.gain > 1.0:
+                self._dim(1.0 / t)
                 change = _GainChange()
             else:
                 self._shift(change.next(self.gain, direction.size / direction.cosine))
@@ -371,16 +374,11 @@ class GainDescent:
         for system in self.systems:
             system.shift(gain)
 
-    def _jump(self, t: float) -> None:
-        """Go towards the t = 1 / gain where the tangents are lowest."""
-        here = 1.0 / self.gain
-        gain = 1.0 / float(np.clip(t, here / MAX_JUMP, here * MAX_JUMP))
-        if not self.is_homogeneous or gain > self.gain:
-            self._shift(gain)
-            return
-        self.gain = gain
+    def _dim(self, gain: float) -> None:
+        """Go towards a smaller gain, with less of the same light: then bounds above do not hold."""
+        self.gain = max(gain, self.gain / MAX_JUMP)
         for system in self.systems:
-            system.rescale(gain)
+            system.rescale(self.gain)
 
     def _direction(self, residual: _Residual) -> PictureDirection:
         """W c in parts along W d and across it, from W c = gain W d - r."""
@@ -428,19 +426,28 @@ class GainDescent:
 
 
 class _GainChange:
-    """Steps of the gain, which grow while their sign stays."""
+    """The next gain for the closest picture: where the light asks for no other gain, by secants.
+
+    Light needs a few steps to follow, so that the gain rests in between.
+    """
 
     def __init__(self) -> None:
-        self._last = 0.0
-        self._lengthening = 1.0
+        self._gain = 0.0
+        self._change = 0.0
+        self._rest = 0
 
     def next(self, gain: float, suitable: float) -> float:
         """The next gain, from this one and the one that suits the light here best."""
+        if self._rest > 0:
+            self._rest -= 1
+            return gain
+        self._rest = RESTING_STEPS
         change = suitable - gain
-        if change * self._last > 0.0:
-            self._lengthening = min(2.0 * self._lengthening, MAX_LENGTHENING)
-        else:
-            self._lengthening = 1.0
-        self._last = change
-        lengthened = gain + self._lengthening * change
-        return float(np.clip(lengthened, gain / MAX_STEP, gain * MAX_STEP))
+        lengthening = FIRST_LENGTHENING
+        if self._change != 0.0 and gain != self._gain:
+            fall = (self._change - change) / (gain - self._gain)
+            # The change has this slope over the gain, between -1 and 0 where light has settled.
+            lengthening = 1.0 / max(fall, 1.0 / MAX_LENGTHENING)
+        self._gain = gain
+        self._change = change
+        return float(np.clip(gain + lengthening * change, gain / MAX_STEP, gain * MAX_STEP))
