@@ -65,13 +65,13 @@ GUESS_TOLERANCE = 1.02
 Tangents = list[tuple[float, float]]
 
 
-def lowest_of_tangents(tangents: Tangents, end: float) -> tuple[float, float]:
-    """Find where in [0, end] the largest of the tangents is lowest, and how low."""
+def lowest_of_tangents(tangents: Tangents, *ends: float) -> tuple[float, float]:
+    """Find where up to the last end the largest of the tangents is lowest, and how low."""
     a, b = np.array(tangents).T
     with np.errstate(divide="ignore", invalid="ignore"):
         crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
-    is_inside = (crossings > 0.0) & (crossings < end)
-    candidates = np.concatenate([[0.0, end], crossings[is_inside]])
+    is_inside = (crossings > 0.0) & (crossings < ends[-1])
+    candidates = np.concatenate([ends, crossings[is_inside]])
     heights = np.max(a + b * candidates[:, None], axis=1)
     lowest = np.argmin(heights)
     return float(candidates[lowest]), float(heights[lowest])
@@ -283,7 +283,7 @@ class GainDescent:
             if not direction.cosine > 0.0 or not np.isfinite(direction.sine):
                 return None
             self._add_tangent(residual)
-            t, bound = lowest_of_tangents(self.tangents, 2.0 * self.farthest)
+            t, bound = lowest_of_tangents(self.tangents, 0.0, 2.0 * self.farthest)
             allowed = max(enough, (1.0 + self.tolerance) * bound)
             if direction.sine <= allowed:
                 return self._accept_closest(direction, allowed)
@@ -307,12 +307,15 @@ class GainDescent:
             reached = self._direction(residual).largest_gain(loss)
             low = max(low, reached)
             high = min(high, self._upper_bound(residual, loss))
+            if high <= 0.0:
+                # No gain is within the loss.
+                return None
             if high <= (1.0 + self.tolerance) * reached:
                 return self._accept_largest(loss, high)
             expected = SAFE_GAIN * self._expected_gain(residual, loss)
             expected = float(np.clip(expected, self.gain / MAX_STEP, self.gain * MAX_STEP))
             gain = max(min(expected, high), low)
-            if not np.isfinite(gain):
+            if not 0.0 < gain < np.inf:
                 return None
             if abs(gain - self.gain) > MIN_CHANGE * self.gain:
                 self._shift(gain)
