@@ -7,7 +7,7 @@
 // A level halves both sides at once: from the values that the filters reach, two by two are made,
 // or two by 2 PAIRS. Work-items stride through pieces of K right-hand sides (dimension 0), pairs of
 // columns (1) and of rows (2). A launch of several levels takes one group a piece, which waits for
-// itself between levels.
+// itself between levels. Where K is 1, dimension 0 counts pictures, which stand one below the other.
 //
 // Required defines: K, see common/lanes.h; TAPS, length of the filters; PAIRS, of columns: 1, or 8
 // where K is 1, on CPUs.
@@ -215,9 +215,20 @@ INLINE void store(
         real add_scale, constant int *starts, constant real *taps, global const real *x, \
         global real *approximations, global const real *add, global real *out
 
+// Where K is 1: the arrays of picture number get_global_id(0).
+#if K == 1
+#define CHOOSE_PICTURE \
+    const int picture = get_global_id(0), first_pixel = picture * height * width; \
+    x += first_pixel, add += first_pixel, out += first_pixel; \
+    approximations += picture * starts[levels]; \
+    const piece p = {0, 0}
+#else
+#define CHOOSE_PICTURE const piece p = piece_of(get_global_id(0), k)
+#endif
+
 kernel void wavelet_split(TRANSFORM_ARGUMENTS)
 {
-    const piece p = piece_of(get_global_id(0), k);
+    CHOOSE_PICTURE;
     for (int level = first_level; level < end_level; ++level) {
         const side a = side_at(height, level), b = side_at(width, level);
         const bool deepest = level + 1 == levels;
@@ -250,7 +261,7 @@ kernel void wavelet_split(TRANSFORM_ARGUMENTS)
 // Levels end_level - 1 .. first_level; `out` gets the picture where first_level is 0.
 kernel void wavelet_join(TRANSFORM_ARGUMENTS)
 {
-    const piece p = piece_of(get_global_id(0), k);
+    CHOOSE_PICTURE;
     x += p.at;
     add += p.at;
     for (int level = end_level - 1; level >= first_level; --level) {

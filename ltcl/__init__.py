@@ -32,7 +32,7 @@ from ltcl.solvers import Inverse, Solution, Status, solve
 from ltcl.store import load, load_inverse, save, save_inverse
 from ltcl.tasks import compensation, compression
 from ltcl.tasks.analysis import Analysis, analyze
-from ltcl.tasks.compensation import Compensation, compensate
+from ltcl.tasks.compensation import Compensation, Compensator, compensate
 from ltcl.tasks.compression import Compression, compress, invert
 from ltcl.tasks.denoising import denoise
 from ltcl.tasks.relighting import relight
@@ -49,6 +49,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Analysis",
     "Compensation",
+    "Compensator",
     "Compression",
     "Device",
     "Inverse",

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.device import Array, Device
+from ltcl.device.kernels import Queued
 from ltcl.operators import CSR, Compressed, Dense, Epilogue
 from ltcl.operators.bases import Basis
 
@@ -21,10 +22,10 @@ class MatrixBasis(Basis):
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
         self.isometric = bool(np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5))
 
-    def _transform(
+    def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
-        self._on_device._queue_product(x, out, Epilogue(a, b, y), transpose)
+    ) -> Queued:
+        return self._on_device._bind_product(x, out, Epilogue(a, b, y), transpose)
 
 
 def rotation(n: int, seed: int = 0) -> np.ndarray:

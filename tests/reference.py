@@ -498,6 +498,41 @@ def ordered_gather(order: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.asarray(x, np.float64)[order]
 
 
+def ordered_scatter(order: np.ndarray, x: np.ndarray, rows: int) -> np.ndarray:
+    """Rows of x at their places among `rows` of zeros."""
+    out = np.zeros((rows, *x.shape[1:]))
+    out[order] = x
+    return out
+
+
+def frames_decode(
+    codes: np.ndarray, table: np.ndarray, gain: float, background: np.ndarray
+) -> np.ndarray:
+    """Light to add, (pixels, channels), of whole-number codes (pixels, colours)."""
+    return gain * np.asarray(table, np.float64)[codes] - background
+
+
+def frames_light(factors: np.ndarray, direct: np.ndarray, mixing: np.ndarray) -> np.ndarray:
+    """Projector light without bounds, (pixels, channels); 0 at masked pixels."""
+    return np.where(factors == 0.0, 0.0, (factors * direct) @ mixing.T)
+
+
+def frames_clip(light: np.ndarray, low: float, high: float, scales: np.ndarray) -> np.ndarray:
+    """Unknowns of light within the bounds; scales are 0 at masked pixels."""
+    return scales * np.clip(light, low, high)
+
+
+def frames_encode(light: np.ndarray, low: float, high: float, thresholds: np.ndarray) -> np.ndarray:
+    """Codes of light that is lit everywhere: places in an ascending list, one for all channels."""
+    return np.searchsorted(thresholds, np.clip(light, low, high), side="right")
+
+
+def frames_peaks(light: np.ndarray, high: float, shift: np.ndarray, span: int) -> np.ndarray:
+    """The largest share of the way to `high` in each `span` of pixels, and 0 at least."""
+    shares = np.maximum((light + shift) / (high + shift), 0.0).max(axis=1)
+    return np.maximum.reduceat(shares, range(0, len(shares), span))
+
+
 def pyramid_gather(x: np.ndarray) -> np.ndarray:
     """Sums of pictures (h, w, k) over cells of all levels, (cells, k), each from its pixels."""
     h, w, k = x.shape

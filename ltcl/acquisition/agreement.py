@@ -8,7 +8,9 @@ photograph is compared with the radiance L of the others, at pixels where neithe
 
 v is the sum of noise, (2 % of x)^2 for inexact exposures and response curves, and for the level
 of black (0.1 % of full scale)^2 and (3 electrons)^2: cameras without an offset clip the noise
-there, which bends their curves.
+there, which bends their curves. Where black lies within four deviations of the noise above the
+first code, as with a pure power of 2.2, dim pixels have one deviation in common, which is not
+averaged.
 
 A photograph deviates if the mean of min(z^2, 100) is above 2.5, two pixels left out that may be
 defects; for fewer than 8 pixels, if it is above 27.5. It also deviates if the sum of
@@ -39,6 +41,8 @@ BLACK_ELECTRONS = 3.0
 MIN_ELECTRONS = 300.0
 # Pixels below this multiple of the error of black have that error in common.
 DIM_FACTOR = 3.0
+# Noise is clipped where black is less than so many of its standard deviations above the first code.
+CLIPPED_SIGMAS = 4.0
 # Common error of all pixels, relative to the noise without light.
 COMMON_ERROR = 0.2
 # Largest z^2 that counts, number of defects that may have it, largest mean z^2 of the others.
@@ -83,6 +87,12 @@ class CameraModel:
     response: Response
     noise: NoiseModel = ROUGH_NOISE
     offset: Any = 0.0
+
+    def clipped_noise(self) -> np.ndarray:
+        """Deviation of noise without light where the first code clips it, else 0, (1 or 3,)."""
+        deviation = np.sqrt(self.noise.variance(0.0))
+        depth = np.asarray(self.offset) - self.response.values[:, 0]
+        return np.where(depth < CLIPPED_SIGMAS * deviation, deviation, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,11 +248,12 @@ def _are_inverse(a: np.ndarray, b: np.ndarray) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _MeanLight:
-    """Radiance (n, c) by several photographs, its variance, common error, and where it is known."""
+    """Radiance (n, c) by photographs, its variance, common errors, and where it is known."""
 
     value: np.ndarray
     variance: np.ndarray
     bias: np.ndarray
+    clipping: np.ndarray
     known: np.ndarray
 
 
@@ -259,6 +270,8 @@ class LinearLight:
         Value from which on a pixel is saturated.
     bias, dim_bias : (k, 1, c)
         Common error of all pixels, and what dim pixels have of it in addition.
+    clipping : (k, n, c)
+        Common error of dim pixels whose noise is clipped.
     """
 
     seconds: np.ndarray
@@ -267,6 +280,7 @@ class LinearLight:
     limit: np.ndarray
     bias: np.ndarray
     dim_bias: np.ndarray
+    clipping: np.ndarray
 
     @classmethod
     def from_samples(
@@ -295,6 +309,8 @@ class LinearLight:
         variance = noise.variance(t * radiance, slope)
         variance = variance + (SCALE_ERROR * t * radiance) ** 2 + BLACK_ERROR**2 + dim_bias**2
         bias = COMMON_ERROR * np.sqrt(noise.variance(0.0))
+        clipped_noise = camera.clipped_noise()
+        is_dim = t * radiance < DIM_FACTOR * clipped_noise
         return cls(
             seconds=t,
             value=np.where(value < limit, value, np.inf),
@@ -302,6 +318,7 @@ class LinearLight:
             limit=limit,
             bias=np.full(limit.shape, bias),
             dim_bias=np.full(limit.shape, dim_bias),
+            clipping=is_dim * clipped_noise,
         )
 
     def with_known(self, radiance: np.ndarray, variance: np.ndarray) -> LinearLight:
@@ -316,6 +333,7 @@ class LinearLight:
             limit=np.full(shape, np.inf),
             bias=np.zeros(shape),
             dim_bias=np.zeros(shape),
+            clipping=np.zeros(value.shape),
         )
         return LinearLight(
             seconds=np.concatenate([self.seconds, known.seconds]),
@@ -324,6 +342,7 @@ class LinearLight:
             limit=np.concatenate([self.limit, known.limit]),
             bias=np.concatenate([self.bias, known.bias]),
             dim_bias=np.concatenate([self.dim_bias, known.dim_bias]),
+            clipping=np.concatenate([self.clipping, known.clipping]),
         )
 
     def select(self, numbers: Sequence[int]) -> LinearLight:
@@ -336,6 +355,7 @@ class LinearLight:
             limit=self.limit[chosen],
             bias=self.bias[chosen],
             dim_bias=self.dim_bias[chosen],
+            clipping=self.clipping[chosen],
         )
 
     def without(self, k: int) -> LinearLight:
@@ -351,6 +371,7 @@ class LinearLight:
             limit=self.limit + addend.limit,
             bias=self.bias + addend.bias,
             dim_bias=self.dim_bias + addend.dim_bias,
+            clipping=self.clipping + addend.clipping,
         )
 
     def mean(self) -> _MeanLight:
@@ -365,6 +386,7 @@ class LinearLight:
             value=np.sum(weight * light, axis=0) / precision,
             variance=1.0 / precision,
             bias=np.sum(weight * self.bias, axis=0) / precision,
+            clipping=np.sum(weight * self.clipping, axis=0) / precision,
             known=known,
         )
 
@@ -379,7 +401,8 @@ class LinearLight:
         t = self.seconds[k]
         value = self.value[k]
         expected = t * others.value
-        variance = self.variance[k] + t**2 * others.variance
+        clipping = self.clipping[k] + t * others.clipping
+        variance = self.variance[k] + t**2 * others.variance + clipping**2
         z2 = np.minimum((value - expected) ** 2 / variance, MAX_Z2)
 
         # 1. Each pixel by itself, where the photograph must not be saturated.

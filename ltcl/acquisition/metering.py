@@ -56,6 +56,8 @@ MIN_RISE_POWER = 0.05
 # Ratio of exposures that tells, and least code that is not noise.
 MIN_EXPOSURE_RATIO = 1.5
 MIN_BRIGHT_CODE = 0.05
+# Deviation of the brightest codes of photographs in which a camera is full.
+MAX_FULL_SPREAD = 0.1
 # Relative width of the codes of saturated pixels.
 SATURATION_WIDTH = 0.02
 # Largest number of exposures that are tried for white.
@@ -249,6 +251,8 @@ def check_full_scale(shots: Shots, seconds: Sequence[float], images: Sequence[np
             ratio = seconds[b] / seconds[a]
             is_below_full = levels[a] > MIN_BRIGHT_CODE and levels[b] < SATURATED_CODE
             is_flat = levels[b] < levels[a] * ratio**MIN_RISE_POWER
+            # Noise alone is flat, too, at short exposures; but a full camera gets no brighter.
+            is_flat &= levels[b] >= (1.0 - MAX_FULL_SPREAD) * max(levels)
             if ratio >= MIN_EXPOSURE_RATIO and is_below_full and is_flat:
                 raise AcquisitionError(_full_scale_error(shots, planes[b], levels[b]))
 

@@ -44,6 +44,23 @@ Gain = Annotated[
 ]
 
 
+def parse_film_gain(text: str) -> float | str:
+    """Return a factor, "auto" or "follow"."""
+    return text if text == "follow" else parse_gain(text)
+
+
+FilmGain = Annotated[
+    str | None,
+    projector_option(
+        "Factor between the film and what the scene will show; auto: the largest within reach of "
+        "frames from all parts; follow: one that goes after the content, no faster than twofold in "
+        "a second. Default: 1; auto if T was measured.",
+        parser=parse_film_gain,
+        metavar="FACTOR",
+    ),
+]
+
+
 def target_options(
     gain: Gain = None,
     loss: Annotated[

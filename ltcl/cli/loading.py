@@ -15,6 +15,7 @@ from ltcl.cli.reports.parts import Device, TransportFacts, Versions
 from ltcl.device import open_device
 from ltcl.errors import InputError
 from ltcl.operators import rank_device
+from ltcl.solvers import Inverse
 from ltcl.solvers.solve import SAMPLED
 from ltcl.tasks import report
 from ltcl.tasks.requirements import check_exact, default_rtol
@@ -105,9 +106,7 @@ def solver_settings(
     """
     options = context.options
     method = options["method"]
-    inverse = None
-    if options["inverse"] is not None:
-        inverse = store.load_inverse(options["inverse"], device=T.device)
+    inverse = load_inverse(context, T)
     exact = None
     if options["exact"] is not None:
         exact = _load_original(context, T)
@@ -125,6 +124,14 @@ def solver_settings(
         "callback": context.progress.solve(rtol, solves),
         **_given_options(context, "samples", "seed"),
     }
+
+
+def load_inverse(context: Context, T: Transport) -> Inverse | None:
+    """Load the inverse that --inverse names, on the device of T."""
+    path = context.options["inverse"]
+    if path is None:
+        return None
+    return store.load_inverse(path, device=T.device)
 
 
 def _load_original(context: Context, T: Transport) -> Transport:

@@ -248,6 +248,25 @@ def solve_options(
     """Options of the solver."""
 
 
+def frame_options(
+    rtol: Annotated[
+        float | None,
+        solver_option(
+            "Relative residual that frames are computed to. Default: 0.01, or the error of T if "
+            "that is larger."
+        ),
+    ] = None,
+    inverse: Annotated[
+        Path | None,
+        file_option(
+            "Inverse made by 'ltcl invert': one product for each frame, and no solve.",
+            panel=SOLVER_PANEL,
+        ),
+    ] = None,
+) -> None:
+    """Options of frames that are prepared once."""
+
+
 def picture_options(
     resize: Annotated[
         Literal["crop", "letterbox", "stretch"] | None,

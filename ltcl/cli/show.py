@@ -15,17 +15,16 @@ from ltcl.cli.reports.program import PlayReport, ShowReport
 from ltcl.cli.streams import print_line
 from ltcl.cli.view import address, address_options
 from ltcl.errors import InputError
-from ltcl.tasks.compensation import RTOL
 
 
-@command(*options.READ_OPTIONS, options.solve_options, address_options)
+@command(*options.READ_OPTIONS, options.frame_options, address_options)
 def play(
     context: Context,
     film: Annotated[
         Path, argument("FILM", "A video, whose sound is left out, or a folder of pictures.")
     ],
     transport: options.TransportFile,
-    gain: compensation.Gain = None,
+    gain: compensation.FilmGain = None,
     resize: Annotated[
         Literal["crop", "letterbox", "stretch"],
         picture_option(
@@ -37,8 +36,8 @@ def play(
     """Play FILM in a projector window of the browser, compensated for TRANSPORT.
 
     A film of other proportions lies between black bars, unless --resize says otherwise. Ctrl-C ends
-    it. Frames that would be late
-    are dropped. An --inverse, or a compressed TRANSPORT, makes it fast.
+    it. Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT, makes it
+    fast.
     """
     from ltcl.images.frames import open_frames
     from ltcl.show.player import play as run_film
@@ -48,9 +47,11 @@ def play(
     source = open_frames(film)
     T = loading.load(context, transport)
     setup = loading.load_setup(transport)
-    settings = loading.solver_settings(context, T, RTOL)
-    del settings["callback"]
-    settings["background"] = None if setup is None else setup.ambient
+    settings: dict[str, Any] = {
+        "rtol": context.options["rtol"],
+        "inverse": loading.load_inverse(context, T),
+        "background": None if setup is None else setup.ambient,
+    }
     scene = ViewerScene(T, transport.name, {}, setup)
     report = PlayReport(film=film)
     with Window(film.name, **address(context)) as window:
@@ -70,7 +71,8 @@ def play(
         return Answer(report, [])
     line = (
         f"{report.shown} frames shown, {report.frames_per_second:.1f} a second, "
-        f"{report.latency:.3f} s late; {report.dropped} dropped"
+        f"{report.latency:.3f} s late; {report.dropped} dropped; "
+        f"99 % computed within {1e3 * (report.computing_p99 or 0.0):.1f} ms"
     )
     return Answer(report, [line])
 

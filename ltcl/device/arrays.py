@@ -72,7 +72,10 @@ class Array:
         """Copy `count` rows from row `first` on into a new array."""
         if not 0 <= first <= first + count <= self.shape[0]:
             raise InputError(f"rows {first} to {first + count} are not among {self.shape[0]}")
-        block = self.device.empty((count, *self.shape[1:]), self.dtype)
+        return self.copy_rows(first, self.device.empty((count, *self.shape[1:]), self.dtype))
+
+    def copy_rows(self, first: int, block: Array) -> Array:
+        """Copy rows from row `first` on into `block`, as many as it has; returns `block`."""
         if block.size:
             offset = first * self.columns * self.dtype.itemsize
             self.device.copy(block.buffer, self.buffer, byte_count=block.nbytes, src_offset=offset)

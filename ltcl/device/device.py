@@ -198,6 +198,14 @@ class Device:
         with driver_errors.translated(f"copying on {self.name}"):
             self.cl.enqueue_copy(self.queue, destination, source, **sizes)
 
+    def queue_copy(self, destination: Any, source: Any) -> Any:
+        """Queue a copy between a host array and a buffer; the host array must stay until it ends.
+
+        Returns an object whose `wait` returns when it has ended.
+        """
+        with driver_errors.translated(f"copying on {self.name}"):
+            return self.cl.enqueue_copy(self.queue, destination, source, is_blocking=False)
+
     def agreed(self, value: Any) -> Any:
         """A measured `value`; where processes solve in lock-step, that of the first."""
         return value

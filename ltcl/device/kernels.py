@@ -11,7 +11,7 @@ import contextlib
 import ctypes
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ltcl.device.driver_errors import explain, translated
@@ -32,6 +32,8 @@ PACKERS: dict[str, Callable[[Any], Any]] = {
     "ulong": struct.Struct("Q").pack,
 }
 Size = int | tuple[int, ...]
+# What queues something at each call: a `Launch`, or several in order.
+Queued = Callable[[], object]
 
 
 # An argument of a kernel, as the compiler reports it: its position, and how a Python number becomes
@@ -123,6 +125,19 @@ class Kernel:
     def _unknown_name(self, name: str) -> InputTypeError:
         known = ", ".join(self.parameters)
         return InputTypeError(f"kernel {self.name} has no argument {name}; it has {known}")
+
+
+def in_order(launches: Sequence[Queued]) -> Queued:
+    """One function that queues all of these, one after the other."""
+    if len(launches) == 1:
+        return launches[0]
+    kept = tuple(launches)
+
+    def queue_all() -> None:
+        for launch in kept:
+            launch()
+
+    return queue_all
 
 
 def _parameters(info: Any, handle: Any) -> dict[str, Parameter]:

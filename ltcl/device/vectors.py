@@ -16,7 +16,7 @@ from ltcl.errors import InputError
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
-    from ltcl.device.kernels import Kernel
+    from ltcl.device.kernels import Kernel, Launch
 
 # Work-items that share a column of a reduction. On a CPU each is a stream: a few of neighbouring
 # columns, or of many columns.
@@ -32,13 +32,25 @@ MIN_GROUP_LIMIT = 64
 
 def fill(x: Array, value: float) -> Array:
     """Set x = value everywhere."""
-    return _elementwise(x, "vector_fill", value=value)
+    bind_fill(x, value)()
+    return x
+
+
+def bind_fill(x: Array, value: float) -> Launch:
+    """The launch of `fill`, to be queued again and again."""
+    return _bind_elementwise(x, "vector_fill", value=value)
 
 
 def axpby(a: float, x: Array, b: float, y: Array, out: Array) -> Array:
     """Set out = a x + b y; `out` may be `x` or `y`."""
+    bind_axpby(a, x, b, y, out)()
+    return out
+
+
+def bind_axpby(a: float, x: Array, b: float, y: Array, out: Array) -> Launch:
+    """The launch of `axpby`, to be queued again and again."""
     _same_shape(x, y, out)
-    return _elementwise(out, "vector_axpby", a=a, x=x, b=b, y=y)
+    return _bind_elementwise(out, "vector_axpby", a=a, x=x, b=b, y=y)
 
 
 def axpy(a: float, x: Array, y: Array) -> Array:
@@ -48,10 +60,16 @@ def axpy(a: float, x: Array, y: Array) -> Array:
 
 def scale_rows(d: Array, x: Array, out: Array) -> Array:
     """Set out = diag(d) x with d (N,) and x (N,) or (N, k); `out` may be `x`."""
+    bind_scale_rows(d, x, out)()
+    return out
+
+
+def bind_scale_rows(d: Array, x: Array, out: Array) -> Launch:
+    """The launch of `scale_rows`, to be queued again and again."""
     _same_shape(x, out)
     if d.shape != x.shape[:1]:
         raise InputError(f"the diagonal has shape {d.shape}; it must be {x.shape[:1]}")
-    return _elementwise(out, "vector_scale_rows", k=x.columns, d=d, x=x)
+    return _bind_elementwise(out, "vector_scale_rows", k=x.columns, d=d, x=x)
 
 
 def dot(x: Array, y: Array) -> np.ndarray:
@@ -216,11 +234,10 @@ def _reduce(name: str, like: Array, /, *, across: int = 1, **arguments: float | 
     kernel(items, (group, 1, 1), rows=rows, k=k, scratch=scratch, **arguments)
 
 
-def _elementwise(out: Array, name: str, /, **arguments: float | Array) -> Array:
-    """Queue a kernel with one work-item a value of `out`."""
+def _bind_elementwise(out: Array, name: str, /, **arguments: float | Array) -> Launch:
+    """The launch of a kernel with one work-item a value of `out`."""
     kernel = kernel_of(out.device, name)
-    kernel(out.size, 256, count=out.size, out=out, **arguments)
-    return out
+    return kernel.bind(out.size, 256, count=out.size, out=out, **arguments)
 
 
 def _same_shape(*arrays: Array) -> None:

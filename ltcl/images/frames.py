@@ -26,7 +26,7 @@ from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
-from ltcl.images.pictures import BITS, as_picture, read
+from ltcl.images.pictures import BITS, as_picture, read, read_srgb
 from ltcl.images.video import Video
 
 # Videos that store the number of their frames.
@@ -93,11 +93,25 @@ class Frame:
         """Linear light, float32, (h, w) or (h, w, 3); FileError if it cannot be read."""
         if isinstance(self.stored, Path):
             return read(self.stored, encoding=self.encoding)
-        b, g, r = cv2.split(self.stored)
-        is_grey = np.array_equal(b, g) and np.array_equal(g, r)
-        if is_grey:  # one channel costs a third
-            return to_linear(b, self.encoding)
-        return to_linear(cv2.cvtColor(self.stored, cv2.COLOR_BGR2RGB), self.encoding)
+        return to_linear(_grey_or_rgb(self.stored), self.encoding)
+
+    def srgb(self) -> np.ndarray:
+        """Codes of sRGB, uint8 or uint16, where it has such, else linear light, float32.
+
+        (h, w) or (h, w, 3) RGB; FileError if it cannot be read.
+        """
+        if isinstance(self.stored, Path):
+            return read_srgb(self.stored, encoding=self.encoding)
+        if self.encoding == "linear":
+            return self.picture()
+        return _grey_or_rgb(self.stored)
+
+
+def _grey_or_rgb(codes: np.ndarray) -> np.ndarray:
+    """BGR codes as (h, w) where all are grey, which costs a third, or as RGB."""
+    b, g, r = cv2.split(codes)
+    is_grey = np.array_equal(b, g) and np.array_equal(g, r)
+    return b if is_grey else cv2.cvtColor(codes, cv2.COLOR_BGR2RGB)
 
 
 class Source:

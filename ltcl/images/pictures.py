@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -87,18 +88,60 @@ def read(
     array([[0.5, 0.5, 0.5]], dtype=float32)
     """
     checks.one_of("encoding", encoding, ENCODINGS)
-    path = as_path(path)
+    stored = _read_stored(as_path(path), encoding, upright=upright, memory=memory)
+    return stored.light(encoding)
+
+
+def read_srgb(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> np.ndarray:
+    """Read the sRGB codes of a picture, or its light where it has no such codes.
+
+    Parameters
+    ----------
+    path, encoding
+        Those of `read`.
+
+    Returns
+    -------
+    ndarray
+        (h, w) or (h, w, 3) RGB, upright: uint8 or uint16 codes of sRGB, or float32 linear light.
+
+    Raises
+    ------
+    FileError, MemoryLimitError
+        Those of `read`.
+    """
+    checks.one_of("encoding", encoding, ENCODINGS)
+    stored = _read_stored(as_path(path), encoding, upright=True, memory=NO_LIMIT)
+    is_integer = stored.codes.dtype.kind == "u"
+    if is_integer and encoding != "linear" and stored.power is None:
+        return stored.codes
+    return stored.light(encoding)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Stored:
+    """Codes of a file, and the power by which a PNG says that they become light, if it does."""
+
+    codes: np.ndarray
+    power: float | None
+
+    def light(self, encoding: Encoding) -> np.ndarray:
+        """Linear light, float32."""
+        if self.power is not None:
+            return to_linear(self.codes, "linear") ** np.float32(self.power)
+        return to_linear(self.codes, encoding)
+
+
+def _read_stored(path: Path, encoding: Encoding, *, upright: bool, memory: int) -> _Stored:
     picture = _decode(path, memory)
     codes = picture.codes
     if upright:
         codes = turn_upright(codes, picture.orientation)
-    codes = np.ascontiguousarray(codes)
+    power = None
     if encoding == "auto" and picture.png_header is not None:
         with decoding(path):
             power = png.power(picture.png_header)
-        if power is not None:
-            return to_linear(codes, "linear") ** np.float32(power)
-    return to_linear(codes, encoding)
+    return _Stored(codes=np.ascontiguousarray(codes), power=power)
 
 
 def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
@@ -120,6 +163,35 @@ def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
         The file is missing, damaged or transparent, or holds NaN.
     """
     return np.ascontiguousarray(_decode(as_path(path), NO_LIMIT).codes)
+
+
+def write_codes(path: str | os.PathLike[str], codes: np.ndarray) -> None:
+    """Write codes as they are, without curve or scale; `read_codes` reads them.
+
+    Parameters
+    ----------
+    path : path
+        The extension names the format, as in `read`; it must hold as many bits as the codes have.
+    codes : (h, w) or (h, w, 3) RGB, uint8 or uint16
+
+    Raises
+    ------
+    InputError
+        Codes of another shape or type, or of bits that the format has not.
+    FileError
+        The extension is unknown, or the file cannot be written.
+    """
+    path = as_path(path)
+    is_picture = codes.ndim == 2 or codes.shape[2:] == (3,)
+    if not is_picture or codes.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"codes are {codes.shape} of {codes.dtype}; they must be (h, w) or (h, w, 3), uint8 or "
+            "uint16"
+        )
+    bits = 8 * codes.dtype.itemsize
+    if bits not in _possible_bits(path):
+        raise InputError(f"codes have {bits} bits, which {path.suffix} does not hold")
+    _write(path, codes)
 
 
 def write(
@@ -161,6 +233,12 @@ def write(
         raise InputError(f"bits is {bits!r}; for {path.suffix} it must be {allowed}")
     is_float = suffix == ".exr" or bits == 32
     codes = from_linear(as_picture("image", image), encoding, bits, is_float=is_float)
+    _write(path, codes)
+
+
+def _write(path: Path, codes: np.ndarray) -> None:
+    """Replace a file by one of these codes, (h, w) or (h, w, 3) RGB."""
+    suffix = path.suffix.lower()
     with replace_file(path) as temporary:
         try:
             if suffix == ".exr":

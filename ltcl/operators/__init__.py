@@ -16,6 +16,7 @@ from ltcl.operators.conversion import as_operator
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
+from ltcl.operators.diagonal_blocks import BlockDiagonal, Planes, block_diagonal
 from ltcl.operators.distributed import Distributed, rank_device
 from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.identity_plus import IdentityPlus
@@ -33,6 +34,7 @@ from ltcl.operators.wavelets import Wavelet, basis
 __all__ = [
     "CSR",
     "Basis",
+    "BlockDiagonal",
     "Compressed",
     "Coupled",
     "Dense",
@@ -45,6 +47,7 @@ __all__ = [
     "Norms",
     "Operator",
     "Parts",
+    "Planes",
     "Pyramid",
     "RowBlocks",
     "ScaledBasis",
@@ -55,6 +58,7 @@ __all__ = [
     "Wavelet",
     "as_operator",
     "basis",
+    "block_diagonal",
     "interreflections",
     "multiresolution_order",
     "rank_device",

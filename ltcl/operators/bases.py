@@ -16,7 +16,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
-from ltcl.device.kernels import Kernel
+from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import PLAIN, Epilogue, widest_launch
@@ -34,7 +34,7 @@ MAX_SUPPORT_SHARE = 0.5
 class Basis(Operator):
     """W, (M, N): `apply` is analysis, from N pixels to M coefficients, `apply_transpose` synthesis.
 
-    Subclasses write `_transform`.
+    Subclasses write `_bind_transform`.
 
     Attributes
     ----------
@@ -63,22 +63,27 @@ class Basis(Operator):
         super().__init__(device, (coefficients, h * w), *parts)
 
     @abc.abstractmethod
-    def _transform(
+    def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
-        """Queue out = a (W x) + b y, or with W^T; y is not read if b is 0."""
+    ) -> Queued:
+        """The launches of out = a (W x) + b y, or with W^T; y is not read if b is 0."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Arrays that a file can hold, from which `ltcl.operators.stored` makes the basis again."""
         return {"name": np.array(self.name), "grid": np.array(self.grid)}
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self._bind_product(x, out, epilogue, transpose)()
+
+    def _bind_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         epilogue = epilogue.without_shift(x)
+        launches: list[Queued] = []
         if out.size:
             y = epilogue.operand(x)
-            self._transform(x, out, epilogue.a, epilogue.b, y, transpose)
+            launches.append(self._bind_transform(x, out, epilogue.a, epilogue.b, y, transpose))
         if epilogue.c:
-            vectors.axpy(epilogue.c, x, out)
+            launches.append(vectors.bind_axpby(epilogue.c, x, 1.0, out, out))
+        return in_order(launches)
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
         """A kernel for k right-hand sides, and the number of pieces in which it takes them."""
@@ -87,8 +92,8 @@ class Basis(Operator):
         return kernel, -(-k // lanes)
 
 
-def launch_grid(kernel: Kernel, pieces: int, grid: tuple[int, int], **arguments: Any) -> None:
-    """Queue a kernel that strides through rows and columns.
+def bind_grid(kernel: Kernel, pieces: int, grid: tuple[int, int], **arguments: Any) -> Launch:
+    """The launch of a kernel that strides through rows and columns.
 
     A CPU has an item for each row of `grid`, a GPU one for each place.
     """
@@ -100,13 +105,16 @@ def launch_grid(kernel: Kernel, pieces: int, grid: tuple[int, int], **arguments:
         across = min(columns, MAX_STRIDING_ITEMS)
         group = GROUP_ITEMS
     items = (pieces, across, min(rows, MAX_STRIDING_ITEMS))
-    kernel(items, (1, group, 1), **arguments)
+    return kernel.bind(items, (1, group, 1), **arguments)
 
 
-def launch_group(kernel: Kernel, pieces: int, **arguments: Any) -> None:
-    """Queue a kernel of which one group does all: one item on a CPU, up to 16 x 16 on a GPU."""
+def bind_group(kernel: Kernel, pieces: int, **arguments: Any) -> Launch:
+    """The launch of a kernel of which one group does all.
+
+    The group is one item on a CPU, and up to 16 x 16 on a GPU.
+    """
     group = (1, 1, 1) if kernel.device.is_cpu else kernel.group((1, 16, 16))
-    kernel((pieces, *group[1:]), group, **arguments)
+    return kernel.bind((pieces, *group[1:]), group, **arguments)
 
 
 class SubsetBasis(Basis):
@@ -164,26 +172,37 @@ class SubsetBasis(Basis):
             return {**self.of.to_arrays(), "places": self.places}
         return {**super().to_arrays(), "places": self.places}
 
-    def _transform(
+    def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
+    ) -> Queued:
         if self.of is None:
-            self._gather(x, out, a, b, y, transpose)
-            return
+            return self._bind_gather(x, out, a, b, y, transpose)
         coefficients = self.device.empty((self.of.shape[0], *x.shape[1:]))
         if transpose:
-            self._gather(x, coefficients, 1.0, 0.0, x, transpose)
-            self.of._queue_product(coefficients, out, Epilogue(a, b, y), True)
-        else:
-            self.of._queue_product(x, coefficients, PLAIN, False)
-            self._gather(coefficients, out, a, b, y, transpose)
+            # The places of a subset never change: the others stay 0.
+            vectors.fill(coefficients, 0.0)
+            scatter = self._bind_scatter(x, coefficients)
+            synthesis = self.of._bind_product(coefficients, out, Epilogue(a, b, y), True)
+            return in_order([scatter, synthesis])
+        analysis = self.of._bind_product(x, coefficients, PLAIN, False)
+        return in_order([analysis, self._bind_gather(coefficients, out, a, b, y, transpose)])
 
-    def _gather(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
-        """Queue out = a (P x) + b y, or with P^T."""
+    def _bind_scatter(self, x: Array, out: Array) -> Launch:
+        """The launch that writes x to its places in `out`, and nothing else."""
+        kernel, pieces = self._kernel("ordered", "scatter", x.columns)
+        count = self._order.size
+        items = (pieces, min(count, MAX_STRIDING_ITEMS))
+        group = (1, GROUP_ITEMS)
+        return kernel.bind(items, group, rows=count, k=x.columns, order=self._order, x=x, out=out)
+
+    def _bind_gather(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> Launch:
+        """The launch of out = a (P x) + b y, or with P^T."""
         order = self._inverse_order if transpose else self._order
         kernel, pieces = self._kernel("ordered", "gather", x.columns)
         items = (pieces, min(order.size, MAX_STRIDING_ITEMS))
-        kernel(
+        return kernel.bind(
             items,
             (1, GROUP_ITEMS),
             rows=order.size,
@@ -231,17 +250,21 @@ class ScaledBasis(Basis):
         """The arrays of W, and the scale."""
         return {**self.of.to_arrays(), "scale": self.scale}
 
-    def _transform(
+    def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
+    ) -> Queued:
         if transpose:
             product = self.device.empty(out.shape)
-            self.of._queue_product(x, product, PLAIN, True)
-            vectors.scale_rows(self._scale, product, product)
-            vectors.axpby(a, product, b, y if b else product, out)
-        else:
-            scaled = vectors.scale_rows(self._scale, x, x.like())
-            self.of._queue_product(scaled, out, Epilogue(a, b, y), False)
+            return in_order(
+                [
+                    self.of._bind_product(x, product, PLAIN, True),
+                    vectors.bind_scale_rows(self._scale, product, product),
+                    vectors.bind_axpby(a, product, b, y if b else product, out),
+                ]
+            )
+        scaled = x.like()
+        scale = vectors.bind_scale_rows(self._scale, x, scaled)
+        return in_order([scale, self.of._bind_product(scaled, out, Epilogue(a, b, y), False)])
 
 
 def _count_coefficients(grid: tuple[int, int], of: Basis | None) -> int:

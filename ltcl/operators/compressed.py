@@ -7,6 +7,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
+from ltcl.device.kernels import Queued, in_order
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis
@@ -110,10 +111,12 @@ class Compressed(Operator):
         return self.core if self.two_sided else super().on_coefficients()
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self._bind_product(x, out, epilogue, transpose)()
+
+    def _bind_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         first, last = (self.out, self.into) if transpose else (self.into, self.out)
         if first is None and last is None:
-            self.core._queue_product(x, out, epilogue, transpose)
-            return
+            return self.core._bind_product(x, out, epilogue, transpose)
         a, b, y, c = epilogue.without_shift(x)
         # Factors from right to left, with whether each is transposed.
         factors: list[tuple[Operator, bool]] = [(self.core, transpose)]
@@ -123,14 +126,17 @@ class Compressed(Operator):
             factors.append((last, True))
         *inner_factors, (last_factor, last_transposed) = factors
         operand = x
+        launches = []
         for factor, is_transposed in inner_factors:
             rows = factor.shape[1] if is_transposed else factor.shape[0]
             product = self.device.empty((rows, *x.shape[1:]))
-            factor._queue_product(operand, product, PLAIN, is_transposed)
+            launches.append(factor._bind_product(operand, product, PLAIN, is_transposed))
             operand = product
-        last_factor._queue_product(operand, out, Epilogue(a, b, y), last_transposed)
+        added = Epilogue(a, b, y)
+        launches.append(last_factor._bind_product(operand, out, added, last_transposed))
         if c:
-            vectors.axpy(c, x, out)
+            launches.append(vectors.bind_axpby(c, x, 1.0, out, out))
+        return in_order(launches)
 
 
 def _pixels(name: str, basis: Basis | None, core: Operator, coefficients: int) -> int:

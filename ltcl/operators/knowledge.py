@@ -118,6 +118,8 @@ class Knowledge:
     factorization : ltcl.solvers.direct.Factorization
     coefficient_system : Operator
         The same system between the coefficients of its basis.
+    joined : tuple
+        Identities of the systems of all colours, of which it is the first, and all as one.
     relaxations : dict
         Block inverses and windows of `ltcl.operators.relaxation`.
     walk_tables : dict
@@ -132,5 +134,6 @@ class Knowledge:
     was_tried: bool = False
     factorization: Any = None
     coefficient_system: Operator | None = None
+    joined: tuple[tuple[int, ...], Operator] | None = None
     relaxations: dict[tuple[Any, ...], Any] = field(default_factory=dict)
     walk_tables: dict[str, Any] = field(default_factory=dict)

@@ -11,7 +11,8 @@ from typing import ClassVar
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators.bases import Basis, launch_grid, launch_group
+from ltcl.device.kernels import Launch, Queued, in_order
+from ltcl.operators.bases import Basis, bind_grid, bind_group
 
 PYRAMID = "pyramid"
 HATS = "hats"
@@ -41,19 +42,18 @@ class MultiscaleSums(Basis):
         self._sizes = [rows * columns for rows, columns in levels]
         super().__init__(device, grid, self.file, sum(self._sizes))
 
-    def _transform(
+    def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
+    ) -> Queued:
         if transpose:
-            self._spread(x, out, a, b, y)
-        else:
-            self._gather(x, out, a, b, y)
+            return self._bind_spread(x, out, a, b, y)
+        return self._bind_gather(x, out, a, b, y)
 
-    def _spread(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
-        """Queue the transpose: at each pixel, the functions of all levels added up."""
+    def _bind_spread(self, x: Array, out: Array, a: float, b: float, y: Array) -> Launch:
+        """The launch of the transpose: at each pixel, the functions of all levels added up."""
         kernel, pieces = self._kernel(self.file, "spread", x.columns)
         height, width = self.grid
-        launch_grid(
+        return bind_grid(
             kernel,
             pieces,
             self.grid,
@@ -68,8 +68,8 @@ class MultiscaleSums(Basis):
             out=out,
         )
 
-    def _gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> None:
-        """Queue the sums: large levels one by one, then the others in one launch."""
+    def _bind_gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> Queued:
+        """The launches of the sums: large levels one by one, then the others in one."""
         kernel, pieces = self._kernel(self.file, "gather", x.columns)
         height, width = self.grid
         count = len(self.levels)
@@ -86,10 +86,12 @@ class MultiscaleSums(Basis):
             "out": out,
         }
         large = sum(size > SMALL_LEVEL_PIXELS for size in self._sizes)
+        launches: list[Queued] = []
         for level in range(large):
-            size = self.levels[level]
-            launch_grid(kernel, pieces, size, first_level=level, end_level=level + 1, **arguments)
-        launch_group(kernel, pieces, first_level=large, end_level=count, **arguments)
+            levels = {"first_level": level, "end_level": level + 1}
+            launches.append(bind_grid(kernel, pieces, self.levels[level], **levels, **arguments))
+        rest = bind_group(kernel, pieces, first_level=large, end_level=count, **arguments)
+        return in_order([*launches, rest])
 
 
 class Pyramid(MultiscaleSums):

@@ -20,7 +20,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.device import Array, Device, tuning, vectors
 from ltcl.device.device import SPARE_BYTES
-from ltcl.device.kernels import Kernel, Launch
+from ltcl.device.kernels import Kernel, Launch, in_order
 from ltcl.errors import MemoryLimitError
 from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import PLAIN, Epilogue, widths
@@ -314,9 +314,7 @@ class RowOperator(ReadableRows):
             for slab in self.slabs:
                 launch = self._bind_slab(slab, (offset, width), x, out, epilogue, variant)
                 launches.append(launch)
-        if len(launches) == 1:
-            return launches[0]
-        return lambda: [launch() for launch in launches]
+        return in_order(launches)
 
     def stepper(
         self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0

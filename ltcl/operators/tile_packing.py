@@ -13,6 +13,7 @@ fraction: float16 holds such a number exactly.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +32,8 @@ PRECISION_WITHOUT_SCALES = {"float32": "float32", "float16": "float16", "int8": 
 # The smallest float16 that is not subnormal.
 MIN_NORMAL_FLOAT16 = 2.0**-14
 MAX_INT8_CODE = 127
+# Bits of the smallest scale, 2^-14.
+SMALLEST_SCALE_BITS = 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,6 +130,83 @@ def smallest(matrix: Any, tolerance: float) -> Packed:
                 best = packed
     assert best is not None  # noqa: S101 - float32 is always allowed
     return best
+
+
+def joined_diagonally(blocks: Sequence[Packed]) -> Packed:
+    """diag(A_1, ...) of matrices in tiles.
+
+    Numbers stay as they are, but for those that float32 does not tell from 0 beside the largest.
+
+    >>> eye = pack(scipy.sparse.eye_array(2, format="csr"), 1)
+    >>> joined = joined_diagonally([eye, eye])
+    >>> joined.matrix().toarray().tolist() == np.eye(4).tolist()
+    True
+    """
+    first = blocks[0]
+    unit = max(packed.unit for packed in blocks)
+    frobenius = float(np.linalg.norm([packed.difference[0] for packed in blocks]))
+    difference = (frobenius, max(packed.difference[1] for packed in blocks))
+    formats = {(packed.width, packed.precision) for packed in blocks}
+    scaled = [_in_unit(packed, unit) for packed in blocks]
+    if len(formats) > 1 or any(codes is None for codes in scaled):
+        return _packed_anew(blocks, unit, difference)
+    height = 0
+    width = 0
+    codes = []
+    scales = []
+    columns = []
+    pointers = [np.zeros(1, np.int64)]
+    tile_count = 0
+    for packed, in_unit in zip(blocks, scaled, strict=True):
+        assert in_unit is not None  # noqa: S101 - as was seen above
+        codes.append(in_unit[0])
+        scales.append(in_unit[1])
+        columns.append(packed.columns.astype(np.int64) + width)
+        pointers.append(packed.pointers[1:] + tile_count)
+        tile_count += len(packed.columns)
+        height += packed.shape[0]
+        width += packed.shape[1]
+    return Packed(
+        shape=(height, width),
+        pointers=np.concatenate(pointers),
+        columns=np.concatenate(columns).astype(_column_type(width)),
+        precision=first.precision,
+        codes=np.concatenate(codes),
+        scales=np.concatenate(scales),
+        unit=unit,
+        difference=difference,
+    )
+
+
+def _packed_anew(blocks: Sequence[Packed], unit: float, difference: tuple[float, float]) -> Packed:
+    """The same in the narrowest tiles of the blocks, and without scales."""
+    precisions = {PRECISION_WITHOUT_SCALES[packed.precision] for packed in blocks}
+    precision = "float32" if "float32" in precisions else "float16"
+    matrices: list[Any] = [packed.matrix() for packed in blocks]
+    matrix = scipy.sparse.csr_array(scipy.sparse.block_diag(matrices, format="csr"))
+    width = min(packed.width for packed in blocks)
+    packed = _pack(_nonzeros(matrix), width, precision, unit if precision == "float16" else None)
+    return dataclasses.replace(packed, difference=difference)
+
+
+def _in_unit(packed: Packed, unit: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Codes and scales of the same numbers in a larger unit; None where that is out of range.
+
+    Units are powers of two.
+    """
+    ratio = packed.unit / unit
+    if ratio == 1.0:
+        return packed.codes, packed.scales
+    if packed.precision == "int8":
+        # Three bits of a scale are its fraction.
+        scales = packed.scales.astype(int) + 8 * round(np.log2(ratio))
+        if np.min(scales, initial=SMALLEST_SCALE_BITS) < SMALLEST_SCALE_BITS:
+            return None
+        return packed.codes, scales.astype(np.uint8)
+    codes = packed.codes * packed.codes.dtype.type(ratio)
+    # Subnormal numbers are below what float32 tells from 0 beside the largest.
+    is_subnormal = np.abs(codes) < np.finfo(codes.dtype).tiny
+    return np.where(is_subnormal, codes.dtype.type(0), codes), packed.scales
 
 
 def _pack(matrix: Any, width: int, precision: str, unit: float | None = None) -> Packed:
@@ -234,8 +314,8 @@ def _scale_bits(numbers: np.ndarray) -> np.ndarray:
     fraction, exponent = np.frexp(largest / MAX_INT8_CODE)
     # Fractions are in 1/2 .. 1.
     bits = (exponent + 14) * 8 + np.ceil(16 * fraction - 8).astype(np.int64)
-    smallest_bits = 8
-    return np.where(fraction > 0, np.maximum(bits, smallest_bits), smallest_bits).astype(np.uint8)
+    bits = np.maximum(bits, SMALLEST_SCALE_BITS)
+    return np.where(fraction > 0, bits, SMALLEST_SCALE_BITS).astype(np.uint8)
 
 
 def _scale_of_bits(bits: np.ndarray) -> np.ndarray:

@@ -16,8 +16,9 @@ import pywt
 
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
+from ltcl.device.kernels import Queued, in_order
 from ltcl.errors import InputError
-from ltcl.operators.bases import PIXELS, Basis, launch_grid, launch_group
+from ltcl.operators.bases import PIXELS, Basis, bind_grid, bind_group
 from ltcl.operators.pyramid import HATS, PYRAMID, Hats, Pyramid
 
 # Wavelets that are compared where no basis is named, the best one first.
@@ -92,12 +93,28 @@ class Wavelet(Basis):
         size = 2**level
         return -(-h // size), -(-w // size)
 
-    def _transform(
+    def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> None:
+    ) -> Queued:
+        return self.bind_planes(x, out, a, b, y, transpose, planes=1)
+
+    def bind_planes(
+        self,
+        x: Array,
+        out: Array,
+        a: float,
+        b: float,
+        y: Array,
+        transpose: bool,
+        planes: int,
+    ) -> Queued:
+        """The launches of out = a (W x) + b y, or with W^T.
+
+        With several `planes`, x and out (planes N,) are pictures one below the other, each of which
+        is transformed.
+        """
         if self.levels == 0:
-            vectors.axpby(a, x, b, y, out)
-            return
+            return vectors.bind_axpby(a, x, b, y, out)
         name = "join" if transpose else "split"
         k = x.columns
         pairs = CPU_PAIRS if k == 1 and self.device.is_cpu else 1
@@ -114,21 +131,24 @@ class Wavelet(Basis):
             "starts": self._starts,
             "taps": self._taps,
             "x": x,
-            "approximations": self.device.empty(self._scratch_size * k),
+            "approximations": self.device.empty(self._scratch_size * k * planes),
             "add": y,
             "out": out,
         }
-        launches = self._launches()
+        level_ranges = self._level_ranges()
         if transpose:
-            launches.reverse()
-        for first, end in launches:
+            level_ranges.reverse()
+        launches = []
+        for first, end in level_ranges:
             levels = {"first_level": first, "end_level": end}
             if end <= self._large_levels:
-                launch_grid(kernel, pieces, self._sides(end), **levels, **arguments)
+                launch = bind_grid(kernel, pieces * planes, self._sides(end), **levels, **arguments)
             else:
-                launch_group(kernel, pieces, **levels, **arguments)
+                launch = bind_group(kernel, pieces * planes, **levels, **arguments)
+            launches.append(launch)
+        return in_order(launches)
 
-    def _launches(self) -> list[tuple[int, int]]:
+    def _level_ranges(self) -> list[tuple[int, int]]:
         """The levels first .. end - 1 of each launch: large ones one by one, then the others."""
         launches = [(level, level + 1) for level in range(self._large_levels)]
         if self._large_levels < self.levels:

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from ltcl import images
+from ltcl.errors import InputError
 from ltcl.images.frames import Frame, Source
 from ltcl.show.window import Window
-from ltcl.tasks.compensation import compensate
+from ltcl.tasks.compensation import Compensator, FrameStatistics
 from ltcl.viewer.answers import ViewerScene
 
 # Seconds without a window after which a film waits, instead of dropping frames.
@@ -30,21 +31,39 @@ TIMED_FRAMES = 5
 # Frames that decide on the gain.
 SAMPLE_FRAMES = 8
 DEFAULT_FPS = 25.0
+# Of the time from frame to frame: what projected steps may take, where light cannot be undone.
+STEPS_SHARE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pace:
-    """Pace of a film, as it was shown."""
+    """Pace of a film, as it was shown.
+
+    Attributes
+    ----------
+    shown, dropped : int
+    gain : float
+    frames_per_second : float
+        Of shown frames.
+    latency : float
+        The median of the seconds between the due time of a frame and the end of its drawing.
+    computing_p50, computing_p99 : float
+        Seconds from the codes of a frame to those of its pattern: the median, and what 99 % are
+        below.
+    """
 
     shown: int
     dropped: int
     gain: float
     frames_per_second: float
     latency: float
+    computing_p50: float
+    computing_p99: float
 
     def __str__(self) -> str:
         pace = f"{self.frames_per_second:.1f} frames/s"
-        return f"{pace}, {self.dropped} dropped, latency {self.latency:.3f} s"
+        computing = f"p99 {1e3 * self.computing_p99:.1f} ms"
+        return f"{pace}, {self.dropped} dropped, latency {self.latency:.3f} s, {computing}"
 
 
 def play(
@@ -59,83 +78,85 @@ def play(
     """Show a film compensated for the T of `scene` at the film's own pace.
 
     Frames of another size are scaled by `resize`, as `ltcl.images.resize` does. `settings` are
-    those of `ltcl.compensate`; a `gain` "auto" is the largest for frames from all
-    parts of the film. In the result `frames_per_second` counts shown frames, and `latency` is the
-    median of the seconds between the due time of a frame and the end of its drawing.
+    those of `ltcl.Compensator`; a `gain` "auto" is the largest for frames from all parts of the
+    film, "follow" one that goes after it.
     """
-    compensator = _FrameCompensator(scene, gain, resize, settings)
+    period = 1.0 / (film.fps or DEFAULT_FPS)
+    compensator = _FrameCompensator(scene, gain, resize, period, settings)
     compensator.prepare(film)
-    timing = _Timing(period=1.0 / (film.fps or DEFAULT_FPS))
+    timing = _Timing(period=period)
     title = window.title
     for frame in film:
         begun_at = time.monotonic()
         if timing.is_too_late(frame.number, begun_at):
             continue
-        codes = scene.codes(compensator.pattern(frame), 1.0)
+        codes = compensator.codes(frame)
         timing.wait_until_due(frame.number, begun_at)
         asked_at = time.monotonic()
         drawn_at = window.show(codes)
         timing.record(frame.number, asked_at, drawn_at)
-        pace = timing.pace(compensator.gain)
+        pace = timing.pace(compensator.statistics)
         window.title = f"{title}: {pace}"
         progress("playing", frame.number, film.count, detail=f": {pace}")
     window.wait(PAUSE_SECONDS)
-    return timing.pace(compensator.gain)
+    return timing.pace(compensator.statistics)
 
 
 class _FrameCompensator:
-    """The pattern for each frame of a film, with one gain."""
+    """The codes of the projector for each frame of a film."""
 
     def __init__(
-        self, scene: ViewerScene, gain: float | str, resize: str, settings: dict[str, Any]
+        self,
+        scene: ViewerScene,
+        gain: float | str,
+        resize: str,
+        period: float,
+        settings: dict[str, Any],
     ) -> None:
         self._T = scene.T
+        self._setup = scene.setup
         self._resize = resize
-        # For a camera of other pixels light is found only within the bounds.
-        self._settings = {**settings, "clamp": scene.T.is_square}
-        self._inverse = settings.get("inverse")
-        self._background = settings.get("background")
+        self._period = period
         self._gain = gain
+        self._settings = settings
 
     @property
-    def gain(self) -> float:
-        """The gain of all frames, once it is known."""
-        return float(self._gain)
+    def statistics(self) -> FrameStatistics:
+        """Numbers of the frames so far."""
+        return self._compensator.statistics
 
     def prepare(self, film: Source) -> None:
-        """Find the gain, and let `compensate` check the settings with an inverse once."""
-        is_auto = isinstance(self._gain, str)
-        if not is_auto and self._inverse is None:
-            return
-        count = SAMPLE_FRAMES if is_auto else 1
-        step = max((film.count or SAMPLE_FRAMES) // SAMPLE_FRAMES, 1)
-        sample = []
-        for frame in islice(film, 0, count * step, step):
-            picture = np.atleast_3d(self._picture(frame))
-            sample.append(np.broadcast_to(picture, (*picture.shape[:2], 3)))
-        result = compensate(self._T, np.stack(sample), gain=self._gain, **self._settings)
-        self._gain = result.gain
+        """Make the compensator, with the gain of frames from all parts of the film."""
+        settings = {**self._settings, "gain": self._gain}
+        if self._setup is not None:
+            settings["encode"] = self._setup.calibration.projector
+        if self._gain == "auto":
+            step = max((film.count or SAMPLE_FRAMES) // SAMPLE_FRAMES, 1)
+            frames = islice(film, 0, SAMPLE_FRAMES * step, step)
+            settings["film"] = [self._picture(frame) for frame in frames]
+        fps = 1.0 / self._period
+        try:
+            # For a camera of other pixels light is found only within the bounds.
+            self._compensator = Compensator(self._T, clamp=self._T.is_square, fps=fps, **settings)
+        except InputError:
+            # Bad settings are refused once more; light that fixed steps do not undo is no reason.
+            deadline = 1e3 * STEPS_SHARE * self._period
+            self._compensator = Compensator(self._T, deadline_ms=deadline, fps=fps, **settings)
 
-    def pattern(self, frame: Frame) -> np.ndarray:
-        """Return the light of the projector for a frame."""
-        desired = self._picture(frame)
-        if self._inverse is None:
-            return compensate(self._T, desired, gain=self._gain, **self._settings).pattern
-        # Without the error of the result, which costs as much as the pattern.
-        target = self.gain * np.atleast_3d(desired)
-        if self._background is not None:
-            target = target - np.atleast_3d(self._background)
-        if target.shape[2] != 3:
-            target = target[..., 0]
-        return self._inverse.pattern(target)
+    def codes(self, frame: Frame) -> np.ndarray:
+        """Return uint8 codes on the pixels of the projector for a frame."""
+        codes = self._compensator(self._picture(frame))
+        if self._setup is not None:
+            return self._setup.blocks.enlarged(codes)
+        return codes
 
     def _picture(self, frame: Frame) -> np.ndarray:
-        """Return the light of a frame on the camera's grid."""
-        light = frame.picture()
+        """Return sRGB codes or the light of a frame, on the camera's grid."""
         grid = self._T.camera_grid
-        if light.shape[:2] == grid:
-            return light
-        return images.resize(light, grid, self._resize)
+        codes = frame.srgb()
+        if codes.shape[:2] == grid:
+            return codes
+        return images.resize(frame.picture(), grid, self._resize)
 
 
 @dataclass(kw_only=True)
@@ -186,7 +207,7 @@ class _Timing:
         self.number = number
         self.shown += 1
 
-    def pace(self, gain: float) -> Pace:
+    def pace(self, computed: FrameStatistics) -> Pace:
         """Return the pace so far."""
         rate = 0.0
         latency = 0.0
@@ -197,7 +218,9 @@ class _Timing:
         return Pace(
             shown=self.shown,
             dropped=self.number - self.shown,
-            gain=gain,
+            gain=computed.gain,
             frames_per_second=rate,
             latency=latency,
+            computing_p50=computed.latency_p50,
+            computing_p99=computed.latency_p99,
         )

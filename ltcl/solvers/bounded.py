@@ -23,6 +23,7 @@ far below 1, that is at least the rounding of x itself.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -129,11 +130,16 @@ def minimise(
     scaled_upper = np.clip(np.asarray(upper, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
     box = round_inwards(scaled_lower, scaled_upper)
     first = _clip((x0 / unit).astype(np.float32), box)
-    descent = Descent(A, b / unit, weights, box, first)
-    search = _Search(descent, rtol, atol / (unit * weight_unit), maxiter, callback)
+    columns = b.shape[1]
+    descent = Descent(A, columns, weights, box)
+    descent.b.set(b / unit)
+    descent.x.set(first)
+    descent.begin()
+    search = Search(descent, rtol, atol / (unit * weight_unit), maxiter, callback)
     status = search.run()
+    search.fall_back()
 
-    x = np.where(search.is_worse, first, search.x) * unit
+    x = np.where(search.worse_columns, first, search.x) * unit
     x = _clip(x.astype(np.float32), round_inwards(lower, upper))
     error_unit = unit * weight_unit
     return Bounded(
@@ -151,8 +157,10 @@ def minimise(
     )
 
 
-class _Search:
+class Search:
     """The search for the least error, and its certificate.
+
+    With a `deadline`, a time of `time.perf_counter`, it ends where another step would be late.
 
     Attributes, of the last iterate and by columns: `errors`, the bound `least` on the least error,
     `hidden`, what rounding hides of the errors, and `excess`, the error above the least one.
@@ -162,11 +170,13 @@ class _Search:
         self,
         descent: Descent,
         rtol: float,
-        atol: float,
-        maxiter: int,
-        callback: Callable[[int, float], object] | None,
+        atol: float = 0.0,
+        maxiter: int = 1000,
+        callback: Callable[[int, float], object] | None = None,
+        deadline: float = math.inf,
     ) -> None:
         self.descent = descent
+        self.deadline = deadline
         self.maxiter = maxiter
         self.callback = callback
         self.initial, _ = descent.read()
@@ -180,6 +190,8 @@ class _Search:
         self.residuals: list[float] = []
         self._lowest = np.inf
         self._lowest_at = 0
+        self._last_time = time.perf_counter()
+        self._step_seconds = 0.0
 
     def run(self) -> Status:
         """Take steps until the search ends; its end is said of a residual computed from x alone."""
@@ -188,16 +200,20 @@ class _Search:
             self._measure()
             unsolved = self.excess > self.tolerance
             status = self._judge(unsolved)
-            if status is not None and not descent.has_true_residual:
+            is_certain = descent.has_true_residual or self._is_late()
+            if status is not None and not is_certain:
                 descent.refresh()
                 self.hidden = descent.rounding()
                 continue
             self._record()
             if status is not None:
-                break
+                return status
             descent.step(unsolved)
-        self._fall_back()
-        return status
+
+    def _is_late(self) -> bool:
+        """True if there is no time for as long a step as the last one."""
+        now = time.perf_counter()
+        return now + self._step_seconds > self.deadline
 
     def _measure(self) -> None:
         """Read the errors, and raise the bound on the least one."""
@@ -218,14 +234,17 @@ class _Search:
         steps = len(self.residuals)
         if not unsolved.any():
             return Status.CONVERGED
-        if steps >= self.maxiter:
+        if steps >= self.maxiter or self._is_late():
             return Status.MAXITER
         if steps - self._lowest_at > PATIENCE:
             return Status.STAGNATED
         return None
 
     def _record(self) -> None:
-        """Keep the history of the errors, and call the callback."""
+        """Keep the history of the errors and the time of a step, and call the callback."""
+        now = time.perf_counter()
+        self._step_seconds = now - self._last_time
+        self._last_time = now
         steps = len(self.residuals)
         relative_excess = float(np.max(self.excess / self.scale))
         if relative_excess < self._lowest:
@@ -235,14 +254,21 @@ class _Search:
             self.callback(steps, relative_excess)
         self.residuals.append(float(np.max(self.errors / self.scale)))
 
-    def _fall_back(self) -> None:
-        """Return to the start in columns that are worse; rounding alone can do that."""
+    @property
+    def is_worse(self) -> np.ndarray:
+        """Columns (k,) that are worse than at the start, which rounding alone can make them."""
+        return ~(self.errors <= self.initial)
+
+    def fall_back(self) -> None:
+        """Read x, and take back the facts of the start in columns that are worse."""
         self.x = self.descent.x.get()
-        self.is_worse = ~(self.errors <= self.initial)
+        is_worse = self.is_worse
         saturated = self.descent.saturated(self.x)
-        self.saturated = np.where(self.is_worse, False, saturated)
-        self.errors = np.where(self.is_worse, self.initial, self.errors)
-        self.excess = np.where(self.is_worse, self._excess_above_least(self.initial), self.excess)
+        self.saturated = np.where(is_worse, False, saturated)
+        initial_excess = self._excess_above_least(self.initial)
+        self.excess = np.where(is_worse, initial_excess, self.excess)
+        self.worse_columns = is_worse
+        self.errors = np.where(is_worse, self.initial, self.errors)
 
 
 class Target(NamedTuple):
@@ -256,38 +282,44 @@ class Target(NamedTuple):
 class Descent:
     """The iterate and, on the device, r = b - A x, u = w^2 r, g = -A^T u, d, and h = A^T w^2 A d.
 
-    `norms` (k,) are those of w b; `has_true_residual` tells whether r was computed from x itself.
+    The caller writes b (M, k) and x (N, k), within the bounds, on the device, and begins; this may
+    be done again and again.
+
+    Attributes
+    ----------
+    b, x : Array
+    norms : (k,)
+        Those of w b.
+    has_true_residual : bool
+        Whether r was computed from x itself.
     """
 
-    def __init__(
-        self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray
-    ) -> None:
+    def __init__(self, A: Operator, columns: int, w: np.ndarray | None, box: Box) -> None:
         device = A.device
+        rows, width = A.shape
         self.A = A
         self.products = 0
         self.has_true_residual = False
         self._box = box
-        self.b = device.upload(b)
-        self.x = device.upload(x)
+        self.b = device.empty((rows, columns))
+        self.x = device.empty((width, columns))
         self.r = self.b.like()
+        self.norms = np.zeros(columns)
         if w is None:
-            self.norms = np.linalg.norm(b, axis=0)
             self._largest_weight = 1.0
             self._u = self.r
             # The kernels do not read them.
             self._weights = self.r
         else:
-            self.norms = np.linalg.norm(w * b, axis=0)
             self._largest_weight = float(np.max(w))
             self._u = self.r.like()
             self._weights = device.upload(np.square(w))
-        self.g = vectors.fill(self.x.like(), 0.0)
+        self.g = self.x.like()
         # A^T u
-        self._q = vectors.fill(self.x.like(), 0.0)
+        self._q = self.x.like()
         self._is_weighted = w is not None
         self._allocate()
         self._bind()
-        self.refresh()
 
     def _allocate(self) -> None:
         """Allocate the vectors and numbers that stay on the device."""
@@ -297,19 +329,22 @@ class Descent:
         self._slices = self._columns.slices
         self._is_resting = np.zeros(k, bool)
         self._resting = device.upload(self._is_resting, np.int32)
-        numbers = np.zeros((NUMBER_ROWS + 3 * self._slices, k))
+        self._first_numbers = np.zeros((NUMBER_ROWS + 3 * self._slices, k), np.float32)
         # The first alpha.
-        numbers[0] = 1.0
-        self._numbers = device.upload(numbers)
+        self._first_numbers[0] = 1.0
+        self._numbers = device.upload(self._first_numbers)
         self._sums = self._columns.sums(3)
         self._curvatures = self._columns.sums(1)
         self._limits: dict[str, Any] = {
             "lower": device.upload(self._box[0]),
             "upper": device.upload(self._box[1]),
         }
-        self._d = vectors.fill(self.x.like(), 0.0)
-        self._h = vectors.fill(self.x.like(), 0.0)
+        self._d = self.x.like()
+        self._h = self.x.like()
         self._Ad = self.b.like()
+        self._zeros = [
+            vectors.bind_fill(array, 0.0) for array in (self.g, self._q, self._d, self._h)
+        ]
 
     def _bind(self) -> None:
         """Bind the launches of a step, and those that start anew."""
@@ -319,7 +354,7 @@ class Descent:
         self._launches = (
             self._bind_direction(),
             self.A.bind(self._d, self._Ad),
-            self._bind_curvature(),
+            self._bind_squares(self._Ad),
             self._bind_move(slices=self._slices),
             self.A.bind(self._u, self._q, transpose=True),
             self._bind_look(restart=0),
@@ -340,8 +375,8 @@ class Descent:
             **self._limits,
         )
 
-    def _bind_curvature(self) -> Launch:
-        """Bind the sums of w^2 (A d)^2."""
+    def _bind_squares(self, picture: Array) -> Launch:
+        """Bind the sums of w^2 picture^2, for a picture (M, k)."""
         return self._columns.bind(
             _DOTS,
             rows=self.b.shape[0],
@@ -349,9 +384,9 @@ class Descent:
             pairs=0,
             weighted=int(self._is_weighted),
             weights=self._weights,
-            a=self._Ad,
-            b=self._Ad,
-            c=self._Ad,
+            a=picture,
+            b=picture,
+            c=picture,
             partials=self._curvatures,
         )
 
@@ -387,6 +422,26 @@ class Descent:
             numbers=self._numbers,
             **self._limits,
         )
+
+    def begin(self) -> None:
+        """Start anew from b and x as they are on the device; waits."""
+        for launch in self._zeros:
+            launch()
+        self._numbers.set(self._first_numbers)
+        self.norms = self.norm_of(self.b)
+        self.refresh()
+
+    def norm_of(self, picture: Array) -> np.ndarray:
+        """||w picture|| of a picture (M, k) on the device, (k,); waits."""
+        self._bind_squares(picture)()
+        squares = self._curvatures.get().astype(np.float64)
+        return np.sqrt(squares.sum(axis=0)).ravel()
+
+    def measure(self) -> np.ndarray:
+        """||w (b - A x)|| of x as it is on the device, (k,), by one product; waits."""
+        self.A.apply(self.x, self.r, scale=-1.0, add=self.b)
+        self.products += 1
+        return self.norm_of(self.r)
 
     def refresh(self) -> None:
         """Compute r and g from x itself, instead of by recursion."""

@@ -21,6 +21,7 @@ from ltcl.solvers import chebyshev, krylov, relaxation, stationary
 from ltcl.solvers.auto import solve_automatically
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.hybrid import Hybrid
+from ltcl.solvers.joined import may_join, solve_joined
 from ltcl.solvers.method import Method
 from ltcl.solvers.monte_carlo import MonteCarlo
 from ltcl.solvers.problem import LinearProblem, SolveSettings, check_square, naming_channel
@@ -211,6 +212,12 @@ def solve_each(
     has_exact = any(operator is not None for operator in exacts)
     if isinstance(chosen, Sampler) and len(systems) == 3 and not has_exact:
         return _solve_together(systems, np.stack(sides), chosen, settings, x0=x0)
+    if chosen is None and not has_exact and may_join(systems, sides, settings, x0):
+        start = time.perf_counter()
+        joined = solve_joined(systems, sides, settings)
+        if joined is not None:
+            seconds = time.perf_counter() - start
+            return tuple(dataclasses.replace(s, seconds=seconds) for s in joined)
     solutions = []
     for S, b, channel_exact in zip(systems, sides, exacts, strict=True):
         solutions.append(_solve_one(S, b, chosen, settings, x0=x0, exact=channel_exact))

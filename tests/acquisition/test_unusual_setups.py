@@ -12,6 +12,7 @@ import pytest
 import ltcl
 from ltcl.acquisition import Shots, VirtualRig, acquire, camera_map
 from ltcl.acquisition.calibrate import measure
+from ltcl.acquisition.metering import check_full_scale
 from ltcl.errors import AcquisitionError, InputError
 from ltcl.images import from_srgb, to_srgb
 
@@ -118,6 +119,16 @@ def test_a_white_level_beyond_the_codes_is_refused() -> None:
 STOPS = tuple(0.25 * 2.0**k for k in range(5))
 HALF_STOPS = tuple(0.25 * 2.0 ** (k / 2) for k in range(9))
 THIRDS = tuple(0.25 * 2.0 ** (k / 3) for k in range(13))
+
+
+def test_noise_is_no_full_scale() -> None:
+    """Its codes rise slowly through a power curve, and short exposures show nothing else."""
+    shots = Shots(VirtualRig(np.eye(4), (2, 2)))
+    noise = 0.16 * np.random.default_rng(0).random((32, 32))
+    images = [noise, noise + 0.001, np.maximum(noise, 0.5)]
+    check_full_scale(shots, [0.01, 0.03, 1.0], images)
+    with pytest.raises(AcquisitionError, match="is full at"):
+        check_full_scale(shots, [0.01, 0.03, 1.0], [images[0], images[2], images[2]])
 
 
 @pytest.mark.slow

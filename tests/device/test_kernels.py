@@ -63,6 +63,7 @@ DEFINES = {
     "WALKS": 2,
     "CHANNELS": 2,
     "LINKED": 1,
+    "CODE": "uchar",
     **krylov_state.DEFINES,
 }
 

@@ -13,6 +13,7 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.tasks.denoising.risk import has_structure
 from ltcl.transport.noise import Noise
 from tests.transport.noise.measured import SCENES, measure, noise_of, truth
 
@@ -337,7 +338,30 @@ def test_of_many_random_scenes_none_gets_worse_and_most_get_better() -> None:
         light, T = random_measurement(seed)
         ratios.append(picture_error_ratio(light, T, ltcl.denoise(T)))
     assert max(ratios) < 1.0001
-    assert np.median(ratios) < 0.55
+    assert np.median(ratios) < 0.65
+
+
+# Unlike columns beside a noise that is estimated far too large, 98 and 72 pixels, and few lit rows.
+STRUCTURED = [485, 366, 338]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", STRUCTURED)
+def test_light_with_structure_is_no_noise(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+    """By the estimated risk alone, pictures or bounces became worse."""
+    _, T = random_measurement(seed)
+    assert ltcl.denoise(T) is T
+    assert "not changed" in caplog.text
+
+
+def test_structure_is_told_from_noise() -> None:
+    grids = ((6, 8), (5, 9))
+    noise = random.standard_normal((48, 45))
+    assert not has_structure(noise, grids)
+    assert not has_structure(np.zeros((48, 45)), grids)
+    assert has_structure(noise + 1.0, grids)
+    assert has_structure(noise + random.choice([-1.0, 1.0], 45), grids)
+    assert has_structure(noise + random.choice([-1.0, 1.0], (48, 1)), grids)
 
 
 @pytest.mark.slow

@@ -178,7 +178,8 @@ def _sample_pixels(codes: np.ndarray) -> np.ndarray:
     # bin.
     bin_sizes = np.bincount(bins)[bins]
     keys = np.random.default_rng(0).exponential(size=len(bins)) * bin_sizes
-    chosen = np.argsort(keys)[: SETTINGS.samples]
+    count = min(SETTINGS.samples, len(keys))
+    chosen = np.argpartition(keys, count - 1)[:count]
     return codes[:, chosen].astype(np.float64)
 
 
@@ -198,7 +199,7 @@ class CurveFit:
         self.levels = levels
         self.saturation = saturation
         self.grid = np.linspace(0.0, 1.0, SETTINGS.grid_size)
-        self.grid_basis = _basis(self.grid)
+        self.rows_of_grid = _basis(self.grid).toarray()
         lowest = 0.5 / (levels - 1) if levels else 0.0
         self.is_usable = (codes <= saturation) & (codes > lowest)
         self._check_pixels()
@@ -238,13 +239,14 @@ class CurveFit:
             )
 
     def _nearest(self, codes: np.ndarray) -> np.ndarray:
-        """Numbers of the codes of the grid that are nearest."""
-        return np.rint(codes * (len(self.grid) - 1)).astype(np.intp)
+        """Numbers of the codes of the grid that are nearest; noise of floats may be below 0."""
+        last = len(self.grid) - 1
+        return np.clip(np.rint(codes * last), 0, last).astype(np.intp)
 
     def _linearise(self) -> None:
         """Predict codes from curve and light; set weights and linearisation of the next round."""
         grid = self.grid
-        table = self.grid_basis @ self.theta
+        table = self.rows_of_grid @ self.theta
         light = table[self.near] + self.offset
         squares = np.maximum((self.weight * self.t**2).sum(axis=0), TINY)
         L = (self.weight * self.t * light).sum(axis=0) / squares
@@ -296,21 +298,19 @@ class CurveFit:
     def _quadratic_form(self) -> tuple[np.ndarray, np.ndarray]:
         """M and v of the residuals, with all L_p eliminated."""
         w = self.weight
-        B = self.grid_basis[self.near.ravel()]
-        C = (self._sum_over_exposures(w * self.t) @ B).toarray()
+        B = self.rows_of_grid[self.near]
+        C = np.einsum("kp,kpj->pj", w * self.t, B)
         inverse = 1.0 / np.maximum((w * self.t**2).sum(axis=0), TINY)
-        weighted = B * w.reshape(-1, 1)
-        M = (B.T @ weighted).toarray() - C.T @ (inverse[:, None] * C)
+        # Codes near the same code of the grid have the same row of the basis.
+        size = len(self.grid)
+        near = self.near.ravel()
+        weight_of_code = np.bincount(near, w.ravel(), size)
+        offset_of_code = np.bincount(near, (w * self.offset).ravel(), size)
+        M = self.rows_of_grid.T @ (weight_of_code[:, None] * self.rows_of_grid)
+        M -= C.T @ (inverse[:, None] * C)
         light_offset = inverse * (w * self.t * self.offset).sum(axis=0)
-        v = B.T @ (w * self.offset).ravel() - C.T @ light_offset
+        v = self.rows_of_grid.T @ offset_of_code - C.T @ light_offset
         return M, v
-
-    def _sum_over_exposures(self, factors: np.ndarray) -> scipy.sparse.csr_array:
-        """The matrix that sums values (K pixels), times `factors` (K, pixels), for each pixel."""
-        exposures, pixels = factors.shape
-        columns = np.arange(pixels)[:, None] + pixels * np.arange(exposures)
-        ends = exposures * np.arange(pixels + 1)
-        return scipy.sparse.csr_array((factors.T.ravel(), columns.ravel(), ends))
 
     def _slope_changes(self) -> np.ndarray:
         """D with the changes of slope D @ theta, relative to the slopes of the round before."""

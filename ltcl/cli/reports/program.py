@@ -150,6 +150,10 @@ class PlayReport(Report):
     latency: Annotated[float | None, "Median seconds from a frame's due time to its drawing."] = (
         None
     )
+    computing_p50: Annotated[float | None, "Median seconds of computing a frame."] = None
+    computing_p99: Annotated[
+        float | None, "Seconds of computing that 99 % of frames stay below."
+    ] = None
 
 
 @dataclass(kw_only=True)

@@ -4,7 +4,15 @@
 from __future__ import annotations
 
 from ltcl.tasks.compensation.compensate import compensate
+from ltcl.tasks.compensation.compensator import Compensator, FrameError, FrameStatistics
 from ltcl.tasks.compensation.inputs import RTOL
 from ltcl.tasks.compensation.result import Compensation
 
-__all__ = ["RTOL", "Compensation", "compensate"]
+__all__ = [
+    "RTOL",
+    "Compensation",
+    "Compensator",
+    "FrameError",
+    "FrameStatistics",
+    "compensate",
+]

@@ -175,25 +175,28 @@ class _SystemDescent:
         self.box = round_inwards(free_scale * limits.low / unit, free_scale * limits.high / unit)
         self.desired = problem.desired[index] / desired_unit
         self.background = problem.background[index] / unit
-        self.weights = None
+        weights = None
         weighted = self.desired
         if problem.weights is not None:
-            self.weights = problem.weights[index]
-            weighted = self.desired * np.square(self.weights)
+            weights = problem.weights[index]
+            weighted = self.desired * np.square(weights)
         device = self.A.device
         u = device.upload(weighted)
         self.target = Target(device.upload(self.desired), u, self.A.apply_transpose(u))
         self._count(1)
         self.gain = 0.0
-        self._all = np.ones(self.desired.shape[1], bool)
+        columns = self.desired.shape[1]
+        self.descent = Descent(self.A, columns, weights, self.box)
+        self._all = np.ones(columns, bool)
 
     def start(self, x: np.ndarray, gain: float) -> None:
         """Start anew from this x, (N, k), moved within the bounds."""
         lower, upper = self.box
         first = np.clip(x.astype(np.float32), lower[:, None], upper[:, None])
-        b = gain * self.desired - self.background
-        self.descent = Descent(self.A, b, self.weights, self.box, first)
-        self._count(self.descent.products)
+        self.descent.b.set(gain * self.desired - self.background)
+        self.descent.x.set(first)
+        self.descent.begin()
+        self._count(2)
         self.gain = gain
 
     def read(self) -> _Residual:

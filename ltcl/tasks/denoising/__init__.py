@@ -14,7 +14,8 @@
 5. Negative entries become 0; dim entries between the same two blocks of pixels lose as much light.
 6. Entries that no noise explains beside their neighbours stay as measured (`problem`).
 7. T is denoised once more with added noise, which tells how much of it stays. If that does not show
-   that pictures become better, T is denoised without reciprocity, or stays (`risk`).
+   that pictures become better, or if what is removed has structure along rows or columns, which
+   noise has not, T is denoised without reciprocity, or stays (`risk`).
 
 Known limits: at low noise or with few pixels, most coefficients stand out of the noise;
 `bench/denoise.py` prints the bound. Where d spans a factor of over 20, reciprocity is left out:

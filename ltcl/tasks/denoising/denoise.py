@@ -19,6 +19,7 @@ from ltcl.tasks.denoising.problem import DenoisingProblem
 from ltcl.tasks.denoising.risk import (
     NOISE_MARGIN,
     NoiseProbe,
+    has_structure,
     max_risk,
     noise_to_add,
     picture_risk,
@@ -47,11 +48,11 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     Returns
     -------
     Transport
-        T itself, with a warning, if its noise is unknown, or if nothing shows that its pictures
-        become better. Else float32, on the same grid, with the same first bounce, mixing and
-        masked pixels, without negative entries off the diagonal. Its `noise` is that of T, scaled
-        to the estimated error of a picture under white; the first bounce itself has that of T, and
-        errors of neighbours are alike.
+        T itself, with a warning, if its noise is unknown, if nothing shows that its pictures become
+        better, or if what would be removed is not like noise. Else float32, on the same grid, with
+        the same first bounce, mixing and masked pixels, without negative entries off the diagonal.
+        Its `noise` is that of T, scaled to the estimated error of a picture under white; the first
+        bounce itself has that of T, and errors of neighbours are alike.
 
     Raises
     ------
@@ -138,7 +139,8 @@ def _denoise_channel(T: Transport, channel: int, note: NoteShare) -> DenoisedCha
     trials = _Trials(Y, noise, channel, (T.camera_grid, T.grid), note)
     for may_be_reciprocal in (True, False):
         run = trials.run(Y, may_be_reciprocal)
-        if trials.risk(run, may_be_reciprocal) <= max_risk(len(Y)):
+        is_gain = trials.risk(run, may_be_reciprocal) <= max_risk(len(Y))
+        if is_gain and not has_structure(Y - run.entries, trials.grids):
             entries = unit * run.entries
             return DenoisedChannel(entries=entries, variance_share=run.variance_share)
         if not run.is_reciprocal:
@@ -164,6 +166,7 @@ class _Trials:
         self.Y = Y
         self.noise = noise
         self.channel = channel
+        self.grids = grids
         self.camera_grid, self.grid = grids
         self.note = note
         self.runs = 0

@@ -180,8 +180,8 @@ class DenoisingProblem:
         # Negative entries become 0; dim entries of the same blocks lose the light that adds.
         not_negative = np.maximum(Z, 0.0)
         dim = np.minimum(not_negative, DIM_DEVIATIONS * np.sqrt(self.variance))
-        camera_blocks = _block_membership(self.camera_grid)
-        projector_blocks = _block_membership(self.grid)
+        camera_blocks = block_membership(self.camera_grid)
+        projector_blocks = block_membership(self.grid)
         surplus = camera_blocks.T @ (not_negative - Z) @ projector_blocks
         available = camera_blocks.T @ dim @ projector_blocks
         share = np.minimum(surplus / np.maximum(available, TINY), 1.0)
@@ -194,8 +194,8 @@ class DenoisingProblem:
 
 def _light_of_blocks(X: np.ndarray, camera_grid: Grid, grid: Grid) -> np.ndarray:
     """Mean light between the blocks of each entry, (M, N)."""
-    camera_blocks = _block_membership(camera_grid)
-    projector_blocks = _block_membership(grid)
+    camera_blocks = block_membership(camera_grid)
+    projector_blocks = block_membership(grid)
     sizes = np.outer(camera_blocks.sum(axis=0), projector_blocks.sum(axis=0))
     means = camera_blocks.T @ X @ projector_blocks / sizes
     return camera_blocks @ means @ projector_blocks.T
@@ -209,7 +209,7 @@ def _photon_light(noise: Noise, channel: int) -> np.ndarray:
 
 def _is_glossy(Z: np.ndarray, variance: np.ndarray, grid: Grid) -> bool:
     """True if sums of Z - Z^T between blocks exceed noise, by the model and by these entries."""
-    blocks = _block_membership(grid)
+    blocks = block_membership(grid)
     pairs = np.triu_indices(blocks.shape[1], 1)
     of_model = blocks.T @ (variance + variance.T) @ blocks
     of_entries = blocks.T @ (Z - Z.T) ** 2 @ blocks
@@ -219,7 +219,7 @@ def _is_glossy(Z: np.ndarray, variance: np.ndarray, grid: Grid) -> bool:
     return len(excess) > 0 and bool(excess.mean() > MAX_RECIPROCITY_EXCESS)
 
 
-def _block_membership(grid: Grid) -> np.ndarray:
+def block_membership(grid: Grid) -> np.ndarray:
     """Matrix (pixels, blocks) of ones where a pixel is in a block."""
     height, width = grid
     rows = np.arange(height) // BLOCK_SIDE

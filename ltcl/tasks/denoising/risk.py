@@ -14,6 +14,11 @@ Blu and Unser, Monte-Carlo SURE, 2008).
 A noise that was estimated from T alone may be wrong, and the entries judge it: if Y - D were noise
 alone, its variance would be 1 - r of that of Y, with the share r of noise that stays in entries of
 D. That counts in the place of the noise model, within NOISE_MARGIN.
+
+What is removed must look like noise, whatever the model says: sums of Y - D over each row, and over
+each column, must not be larger than those of blocks of independent signs. Light that was taken for
+noise, as the gains of projector pixels or of dim walls, has one sign along its row or column, and
+bounces, which have no such estimate, would lose it.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ltcl.tasks.denoising.multiwavelets import Grid
+from ltcl.tasks.denoising.problem import block_membership
 from ltcl.transport.noise import Noise
 
 # Factor within which an estimated noise is right.
@@ -36,6 +42,8 @@ ADDED_NOISE = 0.5
 PROBED_PIXELS = 256
 # Share of the noise of entries that is removed, at least.
 MIN_REMOVED_SHARE = 0.05
+# Standard deviations by which sums of removed noise may exceed those of independent blocks.
+STRUCTURE_SIGMAS = 3.0
 # Random patterns of each kind.
 PATTERNS = 4
 # Waves across a smooth pattern, at most.
@@ -117,6 +125,28 @@ def picture_risk(
         risk = change - 1.0 + 2.0 * _share_in_pictures(probes, patterns)
         largest = max(largest, float(risk))
     return largest
+
+
+def has_structure(removed: np.ndarray, grids: tuple[Grid, Grid]) -> bool:
+    """True if entries (M, N) that were removed as noise have sums that are no noise.
+
+    `grids` are those of camera and projector. Errors of neighbouring pixels may be alike: sums over
+    blocks of pixels are taken as they are, and must have independent signs.
+    """
+    camera_grid, grid = grids
+    of_rows = _sum_excess(removed, grid)
+    of_columns = _sum_excess(removed.T, camera_grid)
+    return max(of_rows, of_columns) > STRUCTURE_SIGMAS
+
+
+def _sum_excess(removed: np.ndarray, grid: Grid) -> float:
+    """Excess of squared sums over pixels of a grid (n, pixels), in standard deviations."""
+    sums_of_blocks = removed @ block_membership(grid)
+    independent = float(np.sum(sums_of_blocks**2, dtype=np.float64))
+    if independent == 0.0:
+        return 0.0
+    sums = sums_of_blocks.sum(axis=1, dtype=np.float64)
+    return float(sums @ sums / independent - 1.0) / (2.0 / len(removed)) ** 0.5
 
 
 def _patterns(grid: Grid) -> list[np.ndarray]:

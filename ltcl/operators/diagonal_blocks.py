@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Several operators as one: diag(A_1, ..., A_c) on vectors that stand one below the other.
+
+The three colours of a frame are then one vector, one product and one solve. What the operators have
+in common is shared: an identity plus, or cores between one basis, become one of these; cores of one
+format become one core, so that a product is one launch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.device import Array
+from ltcl.device.kernels import Queued, in_order
+from ltcl.errors import InputError
+from ltcl.operators.base import Operator
+from ltcl.operators.bases import Basis, SubsetBasis
+from ltcl.operators.compressed import Compressed
+from ltcl.operators.csr import CSR
+from ltcl.operators.epilogue import Epilogue
+from ltcl.operators.identity_plus import IdentityPlus
+from ltcl.operators.knowledge import NormBound
+from ltcl.operators.rows import RowOperator
+from ltcl.operators.tile_packing import Packed, joined_diagonally
+from ltcl.operators.tiles import Tiles
+from ltcl.operators.wavelets import Wavelet
+
+# Bytes up to which matrices are joined, which takes as many once more.
+MAX_JOINED_BYTES = 1 << 26
+
+
+class Place(NamedTuple):
+    """The rows of x and of the result with which the part of a block begins."""
+
+    of_x: int
+    of_out: int
+
+
+class BlockDiagonal(Operator):
+    """diag(A_1, ..., A_c) of operators on one device.
+
+    `block_diagonal` finds a faster form where there is one.
+
+    Parameters
+    ----------
+    blocks : sequence of Operator
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import BlockDiagonal, Dense
+    >>> device = ltcl.open_device()
+    >>> A = BlockDiagonal([Dense(device, [[2.0]]), Dense(device, [[3.0]])])
+    >>> (A @ numpy.array([1.0, 10.0])).tolist()
+    [2.0, 30.0]
+    """
+
+    def __init__(self, blocks: Sequence[Operator]) -> None:
+        device = check_blocks(blocks).device
+        self.blocks = tuple(blocks)
+        # Where each block begins, and the last one ends.
+        self._rows = np.cumsum([0, *(block.shape[0] for block in blocks)]).tolist()
+        self._columns = np.cumsum([0, *(block.shape[1] for block in blocks)]).tolist()
+        super().__init__(device, (self._rows[-1], self._columns[-1]), *blocks)
+        self.error = max(block.error for block in blocks)
+        self.solution_error = max(block.solution_error for block in blocks)
+        self.error_bound = max(block.error_bound for block in blocks)
+        weights = [block.weights for block in blocks if block.weights is not None]
+        if len(weights) == len(blocks):
+            self.weights = np.concatenate(weights)
+
+    def diagonal(self) -> np.ndarray:
+        """The diagonals of the blocks, one behind the other."""
+        if self._rows != self._columns:
+            raise InputError(f"{type(self).__name__} of {self.shape} does not know its diagonal")
+        return np.concatenate([block.diagonal() for block in self.blocks])
+
+    def norm_bound(self) -> NormBound:
+        """The largest bound of the blocks."""
+        bounds = [block.norm_bound() for block in self.blocks]
+        largest = max(bound.value for bound in bounds)
+        return NormBound(largest, is_bound=all(bound.is_bound for bound in bounds))
+
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self._bind_product(x, out, epilogue, transpose)()
+
+    def _bind_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
+        to, of = (self._columns, self._rows) if transpose else (self._rows, self._columns)
+        launches = []
+        for number, block in enumerate(self.blocks):
+            rows = _rows_of_product(block, transpose)
+            if rows is not None and x.columns == 1 and to[number] == of[number]:
+                launches += _bind_rows(rows, to[number], x, out, epilogue)
+            else:
+                place = Place(of[number], to[number])
+                launches.append(_bind_copies(block, place, x, out, epilogue, transpose))
+        return in_order(launches)
+
+
+def block_diagonal(blocks: Sequence[Operator]) -> Operator:
+    """diag(A_1, ..., A_c) in the fastest form for these operators.
+
+    Parameters
+    ----------
+    blocks : sequence of Operator
+        On one device; InputError for others. One operator alone comes back.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Dense, IdentityPlus, block_diagonal
+    >>> device = ltcl.open_device()
+    >>> S = block_diagonal([IdentityPlus(Dense(device, [[0.5]])) for _ in range(3)])
+    >>> type(S).__name__, (S @ numpy.array([2.0, 4.0, 6.0])).tolist()
+    ('IdentityPlus', [3.0, 6.0, 9.0])
+    """
+    first = check_blocks(blocks)
+    if len(blocks) == 1:
+        return first
+    for join in (_join_systems, _join_compressed, _join_csr, _join_tiles):
+        joined = join(blocks)
+        if joined is not None:
+            return joined
+    return BlockDiagonal(blocks)
+
+
+def check_blocks(blocks: Sequence[Operator]) -> Operator:
+    """The first block; InputError unless all have one device."""
+    if not blocks:
+        raise InputError("blocks is empty; there must be at least one operator")
+    first = blocks[0]
+    for block in blocks:
+        if block.device is not first.device:
+            raise InputError(
+                f"blocks are on {first.device} and {block.device}; all must be on one device"
+            )
+    return first
+
+
+class Planes(Basis):
+    """The coefficients of several pictures one below the other: diag(W, ..., W).
+
+    Parameters
+    ----------
+    of : Basis
+        W of one picture.
+    count : int
+        Number of pictures.
+    """
+
+    def __init__(self, of: Basis, count: int) -> None:
+        h, w = of.grid
+        super().__init__(of.device, (count * h, w), of.name, count * of.shape[0], of)
+        self.of = of
+        self.count = count
+        self.orthonormal = of.orthonormal
+        self.isometric = of.isometric
+
+    def _bind_transform(
+        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
+    ) -> Queued:
+        if isinstance(self.of, Wavelet) and x.columns == 1:
+            return self.of.bind_planes(x, out, a, b, y, transpose, self.count)
+        epilogue = Epilogue(a, b, y)
+        launches = []
+        height, width = self.of.shape
+        if transpose:
+            height, width = width, height
+        for number in range(self.count):
+            place = Place(number * width, number * height)
+            launches.append(_bind_copies(self.of, place, x, out, epilogue, transpose))
+        return in_order(launches)
+
+
+def planes(bases: Sequence[Basis]) -> Basis | None:
+    """Bases of pictures one below the other; None where they have nothing in common.
+
+    Subsets of one basis may pick other coefficients of each picture.
+    """
+    first = bases[0]
+    count = len(bases)
+    if not isinstance(first, SubsetBasis):
+        return Planes(first, count) if all(is_same(W, first) for W in bases) else None
+    subsets = [W for W in bases if isinstance(W, SubsetBasis)]
+    if len(subsets) < count or any(W.grid != first.grid for W in bases):
+        return None
+    of = None
+    coefficients = first.shape[1]
+    if first.of is not None:
+        if any(W.of is None or not is_same(W.of, first.of) for W in subsets):
+            return None
+        of = Planes(first.of, count)
+        coefficients = first.of.shape[0]
+    elif any(W.of is not None for W in subsets):
+        return None
+    places = [W.places + number * coefficients for number, W in enumerate(subsets)]
+    grid = (count * first.grid[0], first.grid[1])
+    return SubsetBasis(first.device, grid, np.concatenate(places), of)
+
+
+def is_same(a: Basis, b: Basis) -> bool:
+    """True if two bases make the same coefficients."""
+    if a is b:
+        return True
+    if type(a) is not type(b) or a.shape != b.shape:
+        return False
+    ours = a.to_arrays()
+    theirs = b.to_arrays()
+    if ours.keys() != theirs.keys():
+        return False
+    return all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def _join_systems(blocks: Sequence[Operator]) -> Operator | None:
+    """I + diag(R_1, ...), where all are I + R, or all I - R."""
+    systems = [block for block in blocks if isinstance(block, IdentityPlus)]
+    signs = {system.sign for system in systems}
+    if len(systems) != len(blocks) or len(signs) != 1:
+        return None
+    joined = IdentityPlus(block_diagonal([system.R for system in systems]), signs.pop())
+    joined.solution_error = max(system.solution_error for system in systems)
+    joined.error_bound = max(system.error_bound for system in systems)
+    weights = [system.weights for system in systems if system.weights is not None]
+    if len(weights) == len(systems):
+        joined.weights = np.concatenate(weights)
+    return joined
+
+
+def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
+    """W_out^T diag(C_1, ...) W_in, where all have the same bases."""
+    compressed = [block for block in blocks if isinstance(block, Compressed)]
+    if len(compressed) != len(blocks):
+        return None
+    has_sides = {(R.out is not None, R.into is not None) for R in compressed}
+    if len(has_sides) > 1 or has_sides == {(False, False)}:
+        return None
+    out_bases = [R.out for R in compressed if R.out is not None]
+    into_bases = [R.into for R in compressed if R.into is not None]
+    out = planes(out_bases) if out_bases else None
+    into = out
+    if any(R.into is not R.out for R in compressed):
+        into = planes(into_bases) if into_bases else None
+    if (out_bases and out is None) or (into_bases and into is None):
+        return None
+    diagonals = [R.known_diagonal for R in compressed if R.known_diagonal is not None]
+    diagonal = np.concatenate(diagonals) if len(diagonals) == len(blocks) else None
+    error = max(R.error for R in compressed)
+    core = block_diagonal([R.core for R in compressed])
+    return Compressed(core, out, into, error, diagonal=diagonal)
+
+
+def _join_csr(blocks: Sequence[Operator]) -> Operator | None:
+    """One matrix in compressed sparse rows, where it is small."""
+    if any(type(block) is not CSR for block in blocks) or _are_large(blocks):
+        return None
+    matrices: list[Any] = []
+    for block in blocks:
+        if isinstance(block, CSR):
+            matrices.append(block.matrix())
+    joined = scipy.sparse.block_diag(matrices, format="csr")
+    return CSR(blocks[0].device, scipy.sparse.csr_array(joined))
+
+
+def _join_tiles(blocks: Sequence[Operator]) -> Operator | None:
+    """One matrix of tiles, where it is small."""
+    packed: list[Packed] = [block.packed for block in blocks if isinstance(block, Tiles)]
+    if len(packed) != len(blocks) or _are_large(blocks):
+        return None
+    return Tiles(blocks[0].device, joined_diagonally(packed))
+
+
+def _are_large(blocks: Sequence[Operator]) -> bool:
+    """True if a launch less is not worth a second copy."""
+    return sum(block.nbytes for block in blocks) > MAX_JOINED_BYTES
+
+
+def _rows_of_product(block: Operator, transpose: bool) -> RowOperator | None:
+    """The square rows by which a block is multiplied, if it has some."""
+    if not isinstance(block, RowOperator) or block.shape[0] != block.shape[1]:
+        return None
+    if not transpose:
+        return block
+    copy = getattr(block, "transposed_copy", None)
+    return None if copy is None else copy()
+
+
+def _bind_rows(
+    rows: RowOperator, first: int, x: Array, out: Array, epilogue: Epilogue
+) -> list[Queued]:
+    """The launches of a block whose rows begin at value `first` of x and out."""
+    variant = rows.fastest(x, 1)
+    launches: list[Queued] = []
+    for slab in rows.slabs:
+        # A vector of one column that begins later is a column behind others.
+        launches.append(rows._bind_slab(slab, (first, 1), x, out, epilogue, variant))
+    return launches
+
+
+def _bind_copies(
+    block: Operator, place: Place, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+) -> Queued:
+    """The product of a block with copies of its part of x and out."""
+    height, width = block.shape
+    if transpose:
+        height, width = width, height
+    part = block.device.empty((width, *x.shape[1:]))
+    product = block.device.empty((height, *x.shape[1:]))
+    a, b, y, c = epilogue
+    bound = block._bind_product(part, product, Epilogue(a, b, product, c), transpose)
+
+    def multiply() -> None:
+        x.copy_rows(place.of_x, part)
+        if b and y is not None:
+            y.copy_rows(place.of_out, product)
+        bound()
+        out.set_rows(place.of_out, product)
+
+    return multiply

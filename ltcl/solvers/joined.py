@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Three colours solved as one system, where launches take longer than products do.
+
+    diag(S_1, S_2, S_3) x = b,    b = (b_1 / ||b_1||, ...)
+
+Between coefficients a product is a few numbers, and most of the time of a solve are its launches,
+of which one system needs a third. Each channel keeps its own tolerance: with c channels that have
+light, a residual of rtol / sqrt(c) of the whole is below rtol in each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ltcl.operators import Operator, block_diagonal
+from ltcl.solvers.auto import SMALL, solve_automatically
+from ltcl.solvers.problem import LinearProblem, SolveSettings
+from ltcl.solvers.result import Solution
+
+# Bytes of all systems up to which they are joined.
+MAX_JOINED_BYTES = 1 << 24
+# Below, a solve may be refined in float64, channel by channel.
+MIN_JOINED_RTOL = 1e-4
+
+
+def may_join(
+    systems: Sequence[Any], sides: Sequence[Any], settings: SolveSettings, x0: Any
+) -> bool:
+    """True if one solve of all channels is quicker, and no less than three."""
+    if len(systems) < 2 or x0 is not None or settings.callback is not None or settings.atol:
+        return False
+    if settings.rtol < MIN_JOINED_RTOL:
+        return False
+    if any(np.ndim(side) > 1 and np.shape(side)[1] != 1 for side in sides):
+        return False
+    for S in systems:
+        is_small = not isinstance(S, Operator) or S.shape[0] <= SMALL
+        if is_small or S.coefficient_basis is None or S.device is not systems[0].device:
+            return False
+    return sum(S.nbytes for S in systems) <= MAX_JOINED_BYTES
+
+
+def solve_joined(
+    systems: Sequence[Operator], sides: Sequence[np.ndarray], settings: SolveSettings
+) -> tuple[Solution, ...] | None:
+    """The solution of each channel; None if the joined solve did not converge."""
+    S = _joined_system(systems)
+    sizes = [float(np.linalg.norm(side)) for side in sides]
+    lit_count = sum(size > 0.0 for size in sizes)
+    if not lit_count or not np.all(np.isfinite(sizes)):
+        return None
+    columns = []
+    for side, size in zip(sides, sizes, strict=True):
+        columns.append(np.ravel(side) / (size or 1.0))
+    b = np.concatenate(columns).astype(np.float32)
+    shared = dataclasses.replace(
+        settings, rtol=settings.rtol / np.sqrt(lit_count), with_residual=True, throw=False
+    )
+    solution = solve_automatically(LinearProblem.from_arrays(S, b, shared))
+    if not solution.converged or solution.rest is None:
+        return None
+    parts = zip(np.split(solution.x, len(sides)), np.split(solution.rest, len(sides)), strict=True)
+    solutions = []
+    for (x, rest), side, size in zip(parts, sides, sizes, strict=True):
+        # Relative to ||b|| of this channel, which is 1 in the joined system.
+        residual = float(np.linalg.norm(rest))
+        residuals = (*solution.residuals[:-1], residual)
+        solutions.append(
+            dataclasses.replace(
+                solution,
+                x=np.reshape(size * x, np.shape(side)).astype(x.dtype, copy=False),
+                rest=np.reshape(size * rest, np.shape(side)) if settings.with_residual else None,
+                residuals=residuals,
+                lowest=None,
+            )
+        )
+    return tuple(solutions)
+
+
+def _joined_system(systems: Sequence[Operator]) -> Operator:
+    """The system of all channels, made once in the life of the first."""
+    known = systems[0].known
+    if known.joined is None or known.joined[0] != tuple(map(id, systems)):
+        known.joined = (tuple(map(id, systems)), block_diagonal(systems))
+    return known.joined[1]

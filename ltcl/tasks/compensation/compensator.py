@@ -1,0 +1,514 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`Compensator`: a compensation that is prepared once, for the frames of a film or a show.
+
+All that does not change from frame to frame is done when it is made. A frame is then one upload, a
+fixed list of launches, and one download; codes become light, and light codes, on the device.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.device import Array
+from ltcl.errors import InputError, InputTypeError
+from ltcl.solvers import Inverse
+from ltcl.tasks.compensation.codes import (
+    AUTO,
+    CODE_NAMES,
+    CODE_TYPES,
+    DECODES,
+    SRGB,
+    code_table,
+    light_of_codes,
+    srgb_light,
+)
+from ltcl.tasks.compensation.compensate import compensate
+from ltcl.tasks.compensation.inputs import check_inputs
+from ltcl.tasks.compensation.prepared import PreparedFrames, Slot
+from ltcl.transport.transport import Transport
+
+# A gain that follows the frames changes by this factor in a second at most.
+GAIN_CHANGE = 2.0
+# Share of the strips of pixels that may be brighter than the bound at the gain that is aimed at.
+BRIGHT_SHARE = 0.005
+# Latencies that are kept.
+MAX_LATENCIES = 10_000
+LATE = ("wait", "drop")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameStatistics:
+    """Numbers of a `Compensator` so far.
+
+    Attributes
+    ----------
+    frames, dropped : int
+        Frames whose codes were given, and those that came too early to be taken.
+    latency_p50, latency_p99 : float
+        Seconds from a frame to its codes: the median, and what 99 % are below; NaN before the
+        first frame.
+    gain : float
+        That of the last frame.
+    products : int
+        Products with R that each frame takes at least.
+    """
+
+    frames: int
+    dropped: int
+    latency_p50: float
+    latency_p99: float
+    gain: float
+    products: int
+
+    def __str__(self) -> str:
+        p50 = 1e3 * self.latency_p50
+        p99 = 1e3 * self.latency_p99
+        return f"{self.frames} frames, {self.dropped} dropped, p50 {p50:.1f} ms, p99 {p99:.1f} ms"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameError:
+    """How near the last frame comes to its target, as in `Compensation`.
+
+    Attributes
+    ----------
+    error : float
+        ``||W (appearance - target)|| / ||W target||``; where the target is black, without the
+        divisor.
+    clipped : float
+        Share of the values of lit pixels that would go beyond a bound.
+    """
+
+    error: float
+    clipped: float
+
+
+class Compensator:
+    """Prepared compensation: codes of the projector for the codes of a picture, frame by frame.
+
+    Parameters
+    ----------
+    T : Transport
+    gain : float, "auto" or "follow"
+        Scale of the target. "auto" is the largest for all frames of `film`, as in
+        `ltcl.compensate`. "follow" goes after the content: the gain at which the brightest light
+        is at the upper bound, but for the brightest half percent of strips of 256 pixels.
+    bounds, background, weights, inverse, rtol
+        Those of `ltcl.compensate`; background and weights are one picture, in linear light.
+    clamp : bool
+        Clamp the light to the bounds, and leave it at that.
+    deadline_ms : float, optional
+        Milliseconds after which no further projected step is begun, from the call on; without it
+        they go on until the error is the least there is up to `rtol`. The result is never worse
+        than the clamped pattern.
+    warm : bool
+        Begin the projected steps with the pattern of the frame before, where that is nearer than
+        the clamped one. False gives each frame the same pattern whatever came before.
+    decode : "auto", "srgb" or "linear"
+        What the codes of frames mean; "auto" takes whole numbers as sRGB and floats as linear
+        light. Whole numbers have white at the largest code, floats at 1.
+    encode : "srgb", "linear" or a response
+        Codes of the projector: with white at the upper bound, or those of a measured response, such
+        as ``setup.calibration.projector`` of a scan, for light relative to its white.
+    dtype : "uint8", "uint16" or "float32"
+        Type of the projector's codes. Linear floats are the light as it is.
+    film : iterable of frames, optional
+        Frames that decide on gain="auto".
+    gain_change, fps : float
+        A gain that follows changes by at most this factor in a second of so many frames.
+    depth : int
+        Frames that may be on their way at once after `submit`.
+    late : "wait" or "drop"
+        What becomes of a frame that is submitted when `depth` frames are on their way: it waits, or
+        its result is None.
+
+    Attributes
+    ----------
+    gain : float
+        That of the next frame.
+    rtol : float
+        Tolerance, as given, or what was chosen.
+    statistics : FrameStatistics
+
+    Raises
+    ------
+    InputError, InputTypeError
+        Those of `ltcl.compensate`; another name of a curve or type, gain="auto" without a film, or
+        a T whose light cannot be undone in a fixed number of steps, with ``clamp=True``.
+
+    Notes
+    -----
+    Without an inverse, light is undone by as many steps of Chebyshev's iteration as probes need:
+    the light of white, of a random pattern and a random picture are within half of `rtol`. What a
+    frame has reached is told by `judge`, when it is asked.
+
+    One thread at a time calls a compensator. A frame may be an array of the device of T, and so may
+    `out`.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> compensator = ltcl.Compensator(T, encode="linear", dtype="float32")
+    >>> compensator(numpy.array([[0.3, 0.3]])).round(2).tolist()
+    [[0.5, 0.5]]
+    >>> future = compensator.submit(numpy.array([[0.15, 0.15]]))
+    >>> future.result().round(2).tolist(), compensator.statistics.frames
+    ([[0.25, 0.25]], 2)
+    """
+
+    def __init__(
+        self,
+        T: Transport,
+        *,
+        gain: float | str = 1.0,
+        bounds: tuple[float, float] = (0.0, 1.0),
+        background: Any = None,
+        weights: Any = None,
+        inverse: Inverse | None = None,
+        rtol: float | None = None,
+        clamp: bool = False,
+        deadline_ms: float | None = None,
+        warm: bool = True,
+        decode: str = AUTO,
+        encode: Any = SRGB,
+        dtype: str = "uint8",
+        film: Iterable[Any] | None = None,
+        gain_change: float = GAIN_CHANGE,
+        fps: float = 25.0,
+        depth: int = 3,
+        late: str = "wait",
+    ) -> None:
+        self._decode = checks.one_of("decode", decode, DECODES)
+        if dtype not in CODE_TYPES:
+            raise InputError(f"dtype is {checks.shown(dtype)}; it must be one of {CODE_NAMES}")
+        self._dtype = dtype
+        self._depth = checks.count("depth", depth)
+        self._drops = checks.one_of("late", late, LATE) == "drop"
+        self._seconds = math.inf
+        if deadline_ms is not None:
+            self._seconds = checks.number("deadline_ms", deadline_ms, above=0.0) / 1e3
+        change = checks.number("gain_change", gain_change, least=1.0)
+        self._frame_change = change ** (1.0 / checks.number("fps", fps, above=0.0))
+        self._clamp = checks.flag("clamp", clamp)
+        self._is_warm = checks.flag("warm", warm)
+        self.T = T
+        self._options = {
+            "bounds": bounds,
+            "background": background,
+            "weights": weights,
+            "method": "auto",
+            "rtol": rtol,
+            "exact": None,
+            "inverse": inverse,
+            "clamp": clamp,
+            "loss": None,
+            "options": {},
+        }
+        self.follows_gain = gain == "follow"
+        self._has_gain = not self.follows_gain
+        self.gain = 1.0
+        # Checks all arguments, before anything is uploaded.
+        request = self._request(3 if getattr(T, "channels", 3) == 3 else 1)
+        self.rtol = request.problem.settings.rtol
+        if self.follows_gain and not T.is_square:
+            raise InputError(
+                "gain is 'follow', but this T has no S, whose light it follows; give a number"
+            )
+        self._encode = encode
+        white = float(request.problem.limits.high)
+        self._table = code_table(encode, dtype, 3 if T.channels == 3 else 1, white)
+        self._prepared: dict[tuple[int, str], PreparedFrames] = {}
+        # Of the last frame.
+        self._last: tuple[PreparedFrames, float] | None = None
+        if not self.follows_gain:
+            self.gain = self._find_gain(gain, film)
+
+        self._lock = threading.Lock()
+        self._latencies: deque[float] = deque(maxlen=MAX_LATENCIES)
+        self._frames = 0
+        self._dropped = 0
+        self._on_the_way: deque[Future[Any]] = deque()
+        self._turn = 0
+        self._collector = ThreadPoolExecutor(1, thread_name_prefix="ltcl-frames")
+        # The kind of frame that is most likely, so that the first one does not wait for it.
+        self._frames_of(3 if T.channels == 3 else 1, np.dtype(np.uint8))
+
+    # Preparation.
+
+    def _request(self, colours: int) -> Any:
+        """Checked inputs for black pictures of so many colours."""
+        grid = getattr(self.T, "camera_grid", (1, 1))
+        shape = (*grid, 3) if colours == 3 else grid
+        return check_inputs(self.T, np.zeros(shape, np.float32), gain=1.0, **self._options)
+
+    def _find_gain(self, gain: Any, film: Iterable[Any] | None) -> float:
+        """The gain of all frames."""
+        if gain == "auto":
+            if film is None:
+                raise InputError("gain is 'auto', but film is None; give the frames it is for")
+            light = np.stack([self._light_of_frame(np.asarray(frame)) for frame in film])
+            options = {**self._options}
+            extra = options.pop("options")
+            return compensate(self.T, light, gain="auto", **options, **extra).gain
+        if film is not None:
+            raise InputError(f"film is given, but gain is {gain!r}; a film belongs to 'auto'")
+        if isinstance(gain, str):
+            raise InputError(f"gain is {gain!r}; it must be 'auto', 'follow' or a number above 0")
+        return checks.number("gain", gain, above=0.0)
+
+    def _light_of_frame(self, frame: np.ndarray) -> np.ndarray:
+        """Linear light of codes; (h, w, 3) where T is in colour."""
+        self._check_frame(frame)
+        if frame.dtype.kind == "f":
+            light = srgb_light(frame) if self._decode == SRGB else frame
+        else:
+            light = light_of_codes(self._decode, frame.dtype)[frame]
+        if light.ndim == 2 and self.T.channels == 3:
+            light = np.repeat(light[..., None], 3, axis=-1)
+        return light
+
+    def _frames_of(self, colours: int, dtype: np.dtype) -> PreparedFrames:
+        """What is prepared for frames of so many colours and one type; made at the first one."""
+        key = (colours, dtype.name)
+        if key not in self._prepared:
+            self._prepared[key] = self._prepare(colours, dtype)
+        return self._prepared[key]
+
+    def _prepare(self, colours: int, dtype: np.dtype) -> PreparedFrames:
+        channels = 3 if self.T.channels == 3 else colours
+        for known in self._prepared.values():
+            if known.colours == channels:
+                return known.for_codes(colours, dtype, self._decode)
+        table = self._table
+        request = self._request(channels)
+        if len(table.starts) != channels:
+            white = float(request.problem.limits.high)
+            table = code_table(self._encode, self._dtype, channels, white)
+        return PreparedFrames(
+            request,
+            frame_colours=colours,
+            frame_dtype=dtype,
+            decode=self._decode,
+            dtype=self._dtype,
+            table=table,
+            is_bounded=not self._clamp,
+            is_warm=self._is_warm,
+            has_peaks=self.follows_gain,
+            slots=self._depth,
+        )
+
+    # Frames.
+
+    def __call__(self, frame: Any, out: np.ndarray | Array | None = None) -> Any:
+        """Codes of the projector for a frame; waits.
+
+        Parameters
+        ----------
+        frame : (h, w) or (h, w, 3), array or device array
+            uint8, uint16 or float.
+        out : array or device array, optional
+            Where the codes are written, which is then returned.
+
+        Returns
+        -------
+        array
+            (h, w) on the projector's grid, or (h, w, 3) where T or the frame is in colour.
+        """
+        with self._lock:
+            for future in self._on_the_way:
+                future.result()
+            self._on_the_way.clear()
+            prepared, slot = self._begin(frame)
+            if not self._has_gain:
+                self._first_gain(prepared, slot, frame)
+            return self._end(prepared, slot, out)
+
+    def submit(self, frame: Any) -> Future[np.ndarray | None]:
+        """Take a frame, and give its codes later, in order.
+
+        Copies and launches of neighbouring frames overlap. The result is None if the frame was
+        dropped. Where light is brought within the bounds by projected steps, this returns when they
+        are done.
+        """
+        with self._lock:
+            self._forget_done()
+            if len(self._on_the_way) >= self._depth:
+                if self._drops:
+                    self._dropped += 1
+                    dropped: Future[np.ndarray | None] = Future()
+                    dropped.set_result(None)
+                    return dropped
+                self._on_the_way.popleft().result()
+            prepared, slot = self._begin(frame)
+            if not self._has_gain:
+                self._first_gain(prepared, slot, frame)
+            prepared.keep_within_bounds(slot.begun_at + self._seconds)
+            prepared.end(slot)
+            future: Future[Any] = self._collector.submit(self._collect, prepared, slot)
+            self._on_the_way.append(future)
+            return future
+
+    def _forget_done(self) -> None:
+        while self._on_the_way and self._on_the_way[0].done():
+            self._on_the_way.popleft()
+
+    def _begin(self, frame: Any) -> tuple[PreparedFrames, Slot]:
+        """Queue a frame in the next slot."""
+        codes = self._codes_of(frame)
+        colours = 3 if len(codes.shape) == 3 else 1
+        prepared = self._frames_of(colours, codes.dtype)
+        slot = prepared.slots[self._turn % self._depth]
+        self._turn += 1
+        prepared.begin(slot, codes, self.gain)
+        self._last = (prepared, self.gain)
+        return prepared, slot
+
+    def _codes_of(self, frame: Any) -> np.ndarray | Array:
+        """The frame as the device takes it: uint8, uint16, or linear float32."""
+        if isinstance(frame, Array):
+            self._check_frame(frame)
+            if frame.dtype.kind == "f" and self._decode == SRGB:
+                raise InputError(
+                    "frame is a device array of floats, but decode is 'srgb'; give codes of whole "
+                    "numbers, or decode='auto'"
+                )
+            if frame.device is not self.T.device:
+                raise InputError(f"frame is on {frame.device}; it must be on {self.T.device}")
+            return frame
+        codes = np.asarray(frame)
+        self._check_frame(codes)
+        if codes.dtype.kind != "f":
+            return codes
+        light = srgb_light(codes) if self._decode == SRGB else codes
+        return checks.finite("frame", light).astype(np.float32, copy=False)
+
+    def _check_frame(self, frame: Any) -> None:
+        grid = self.T.camera_grid
+        if frame.shape not in (grid, (*grid, 3)):
+            raise InputError(f"frame has shape {frame.shape}; it must be {grid} or {(*grid, 3)}")
+        if frame.dtype.name not in ("uint8", "uint16", "float32", "float64", "float16"):
+            raise InputTypeError(f"frame holds {frame.dtype}; it must be uint8, uint16 or floats")
+
+    def _end(self, prepared: PreparedFrames, slot: Slot, out: Any) -> Any:
+        prepared.keep_within_bounds(slot.begun_at + self._seconds)
+        prepared.end(slot)
+        codes = self._collect(prepared, slot)
+        if out is None:
+            return codes
+        if isinstance(out, Array):
+            return out.set(codes.reshape(out.shape))
+        np.copyto(out, codes)
+        return out
+
+    def _collect(self, prepared: PreparedFrames, slot: Slot) -> np.ndarray:
+        """Wait for the codes of a frame, and take note of it."""
+        codes = prepared.take(slot)
+        self._latencies.append(time.perf_counter() - slot.begun_at)
+        self._frames += 1
+        if self.follows_gain:
+            self._follow(slot)
+        return codes
+
+    # The gain that follows.
+
+    def _first_gain(self, prepared: PreparedFrames, slot: Slot, frame: Any) -> None:
+        """Begin at the gain of the first frame, which is then computed again."""
+        prepared.end(slot)
+        prepared.take(slot)
+        wanted = _gain_of_peaks(slot)
+        self._has_gain = True
+        if wanted is None:
+            return
+        self.gain = wanted
+        codes = self._codes_of(frame)
+        prepared.begin(slot, codes, self.gain)
+        self._last = (prepared, self.gain)
+
+    def _follow(self, slot: Slot) -> None:
+        """Bring the gain of frames to come nearer to what this one allows."""
+        wanted = _gain_of_peaks(slot)
+        if wanted is not None:
+            lowest = self.gain / self._frame_change
+            highest = self.gain * self._frame_change
+            self.gain = min(max(wanted, lowest), highest)
+
+    # Facts.
+
+    @property
+    def statistics(self) -> FrameStatistics:
+        """Numbers so far."""
+        p50 = math.nan
+        p99 = math.nan
+        latencies = list(self._latencies)
+        if latencies:
+            p50, p99 = np.quantile(latencies, [0.5, 0.99]).tolist()
+        prepared = next(iter(self._prepared.values()))
+        products = 0
+        if prepared.direct_steps is not None:
+            products = prepared.direct_steps.products
+        last_gain = self.gain if self._last is None else self._last[1]
+        return FrameStatistics(
+            frames=self._frames,
+            dropped=self._dropped,
+            latency_p50=p50,
+            latency_p99=p99,
+            gain=last_gain,
+            products=products,
+        )
+
+    def light(self) -> np.ndarray:
+        """The projector light of the last frame, (h, w) or (h, w, 3) float32.
+
+        InputError before the first frame.
+        """
+        with self._lock:
+            if self._last is None:
+                raise InputError("no frame was given yet, whose light could be told")
+            prepared = self._last[0]
+            light = prepared.light()
+        h, w = self.T.grid
+        return light.reshape((h, w, 3) if prepared.colours == 3 else (h, w))
+
+    def judge(self) -> FrameError:
+        """The error and the clipped share of the last frame, by a product with T.
+
+        InputError before the first frame.
+        """
+        with self._lock:
+            for future in self._on_the_way:
+                future.result()
+            if self._last is None:
+                raise InputError("no frame was given yet, which could be judged")
+            error, clipped = self._last[0].judge()
+        return FrameError(error=error, clipped=clipped)
+
+    def close(self) -> None:
+        """Wait for the frames on their way, and end the thread that waits for the device."""
+        self._collector.shutdown(wait=True)
+
+    def __enter__(self) -> Compensator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _gain_of_peaks(slot: Slot) -> float | None:
+    """The gain at which the light of a frame would reach the upper bound; None for a dark one."""
+    peaks = np.sort(slot.peaks_host)
+    place = math.ceil((1.0 - BRIGHT_SHARE) * (len(peaks) - 1))
+    peak = float(peaks[place])
+    if not peak > 0.0:
+        return None
+    return slot.gain / peak

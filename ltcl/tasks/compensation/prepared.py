@@ -1,0 +1,700 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The steps of a prepared compensation on the device: buffers and bound launches, made once.
+
+    codes -> light to add -> direct light -> projector light within the bounds -> codes
+
+Light stands in units in which the brightest is near 1, so that squares stay within float32. The
+three colours are one vector, channel below channel, and one system.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ltcl.device import Array, Device, vectors
+from ltcl.device.kernels import Kernel, Launch, Queued, in_order
+from ltcl.errors import InputError
+from ltcl.operators import Dense, IdentityPlus, Operator, block_diagonal
+from ltcl.operators.epilogue import Epilogue
+from ltcl.solvers.auto import SMALL
+from ltcl.solvers.bounded import Descent, Search
+from ltcl.solvers.chebyshev import chebyshev_steps
+from ltcl.solvers.survey import survey
+from ltcl.tasks.compensation.codes import CODE_TYPES, CodeTable, light_of_codes
+from ltcl.tasks.compensation.inputs import CompensationRequest
+from ltcl.tasks.compensation.problem import BOUNDS_SLACK
+
+# Work-items of a group on a GPU, and spans of pixels for each unit of a CPU.
+GROUP = 64
+SPANS_PER_UNIT = 16
+# Pixels whose brightest light counts as one.
+STRIP_PIXELS = 256
+# Of the tolerance: what probes may leave after a fixed number of steps, since frames are others.
+PROBE_SHARE = 0.5
+# Steps beyond which fixed steps are given up.
+MAX_FIXED_STEPS = 60
+# Products of the norms of S and S^-1 up to which float32 holds an inverse of a small system.
+MAX_CONDITION = 1e5
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightLayout:
+    """Where the light of each pixel and channel stands: (rows, columns) on the device."""
+
+    pixels: int
+    channels: int
+    is_stacked: bool
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Channel below channel, or side by side."""
+        if self.is_stacked:
+            return self.channels * self.pixels, 1
+        return self.pixels, self.channels
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """Defines of the kernels."""
+        return {"CHANNELS": self.channels, "STACKED": int(self.is_stacked)}
+
+    def from_channels(self, channels: Sequence[np.ndarray]) -> np.ndarray:
+        """Values of this layout from (pixels, 1) of each channel, or one (pixels, channels)."""
+        if self.is_stacked:
+            return np.concatenate([np.ravel(channel) for channel in channels])[:, None]
+        return np.broadcast_to(channels[0], self.shape)
+
+    def to_channels(self, values: np.ndarray) -> np.ndarray:
+        """(pixels, channels) of values in this layout."""
+        if self.is_stacked:
+            return values.reshape(self.channels, self.pixels).T
+        return values.reshape(self.pixels, self.channels)
+
+
+class ByInverse:
+    """Direct light by a kept inverse: one product."""
+
+    products = 1
+
+    def __init__(self, inverse: Operator, target: Array, direct: Array) -> None:
+        self.queue = inverse.bind(target, direct)
+
+
+def _dense_inverses(systems: Sequence[Operator]) -> list[Dense] | None:
+    """S^-1 of small systems, by a factorization in float64; None if one is singular."""
+    inverses = []
+    for S in systems:
+        matrix, _ = S.matrix_float64()
+        try:
+            inverse = np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:
+            return None
+        size = float(np.linalg.norm(inverse)) * float(np.linalg.norm(matrix))
+        if not size < MAX_CONDITION:
+            return None
+        inverses.append(Dense(S.device, inverse))
+    return inverses
+
+
+class ByFixedSteps:
+    """Direct light by so many steps of Chebyshev's iteration as probes need to the tolerance.
+
+    With x = b + e and r = b - S b = -R b, S e = r is solved from e = 0, on coefficients where there
+    is a basis W: x = b + W^T e.
+
+    Attributes
+    ----------
+    products : int
+        Products with R, of all frames alike; 0 if no number of steps was enough.
+    residual : float
+        The largest relative residual of the probes.
+    """
+
+    def __init__(
+        self, S: IdentityPlus, target: Array, direct: Array, rtol: float, probes: np.ndarray
+    ) -> None:
+        self._target = target
+        self._direct = direct
+        W = S.coefficient_basis
+        system = S.on_coefficients() if W is not None else S
+        assert isinstance(system, IdentityPlus)  # noqa: S101 - so it is made
+        a = target
+        launches: list[Queued] = []
+        if W is not None:
+            a = S.device.empty((W.shape[0], target.columns))
+            launches.append(W.bind(target, a))
+        self._r = a.like()
+        self._e = a.like()
+        launches.append(system.R.bind(a, self._r, Epilogue(a=-system.sign)))
+        launches.append(vectors.bind_fill(self._e, 0.0))
+        self._begin = in_order(launches)
+        self._stepper = system.stepper(self._e, self._r, slots=MAX_FIXED_STEPS + 1)
+        if W is None:
+            self._finish: Queued = vectors.bind_axpby(1.0, target, 1.0, self._e, direct)
+        else:
+            added = Epilogue(b=1.0, y=target)
+            self._finish = W.bind(self._e, direct, added, transpose=True)
+        bounds = survey(S).spectrum
+        self._numbers: list[tuple[float, float]] = []
+        self.residual = math.inf
+        self.products = 0
+        self._choose_steps(S, bounds, rtol, probes)
+
+    def _choose_steps(
+        self, S: Operator, bounds: tuple[float, float], rtol: float, probes: np.ndarray
+    ) -> None:
+        """Take a step more until all probes are within the share of the tolerance."""
+        steps = chebyshev_steps(*bounds)
+        all_numbers = [next(steps) for _ in range(MAX_FIXED_STEPS)]
+        for count in range(1, MAX_FIXED_STEPS):
+            # The numbers of the last direction, which no step takes, do not count.
+            self._numbers = all_numbers[: count + 1]
+            residual = max(self._residual(S, probe) for probe in probes)
+            if not math.isfinite(residual):
+                break
+            if residual <= PROBE_SHARE * rtol:
+                self.residual = residual
+                self.products = count + 1
+                return
+        self._numbers = []
+
+    def _residual(self, S: Operator, probe: np.ndarray) -> float:
+        """||b - S x|| / ||b|| of a probe b, of the worst column."""
+        self._target.set(probe)
+        self.queue()
+        left = S.apply(self._direct, scale=-1.0, add=self._target)
+        left_norms, norms = vectors.norms(left, self._target)
+        return float(np.max(left_norms / np.where(norms > 0.0, norms, 1.0)))
+
+    def queue(self) -> None:
+        """Queue all launches."""
+        self._begin()
+        stepper = self._stepper
+        # Norms of the steps are not read.
+        stepper.waiting = 0
+        stepper.start(self._numbers[0][1])
+        for keep, gain in self._numbers[1:]:
+            stepper.step(keep, gain)
+        self._finish()
+
+
+class WithinBounds:
+    """Light within the bounds by projected steps, warm from the light of the frame before.
+
+    Attributes
+    ----------
+    start : Array
+        The clamped light of this frame, as unknowns, which the caller writes.
+    x, target : Array
+        The result, and the light to add.
+    errors : (k,), optional
+        ||w (A x - b)|| of the last frame, if steps were taken.
+    steps : int
+        Of the last frame.
+    """
+
+    def __init__(
+        self,
+        A: Operator,
+        columns: int,
+        weights: np.ndarray | None,
+        box: Any,
+        rtol: float,
+        is_warm: bool,
+    ) -> None:
+        self.descent = Descent(A, columns, weights, box)
+        self._lower, self._upper = (bound[:, None] for bound in box)
+        self.target = self.descent.b
+        self.x = self.descent.x
+        self.start = self.x.like()
+        self._last = self.x.like()
+        self._is_warm = is_warm
+        self._has_last = False
+        self._rtol = rtol
+        self.errors: np.ndarray | None = None
+        self.steps = 0
+
+    def keep_start(self) -> None:
+        """Take the clamped light as it is, where that is the best there is."""
+        self.x.copy_from(self.start)
+        self.errors = None
+        self.steps = 0
+        self._keep()
+
+    def solve(self, deadline: float) -> None:
+        """Lower the error from the better of two starts, until the tolerance or the deadline."""
+        descent = self.descent
+        self.x.copy_from(self.start)
+        descent.begin()
+        clamped_errors, _ = descent.read()
+        if self._has_last:
+            self.x.copy_from(self._last)
+            descent.refresh()
+            errors, _ = descent.read()
+            if np.linalg.norm(errors) < np.linalg.norm(clamped_errors):
+                self.start.copy_from(self._last)
+            else:
+                self.x.copy_from(self.start)
+                descent.refresh()
+        search = Search(descent, self._rtol, deadline=deadline)
+        search.run()
+        self.steps = len(search.residuals) - 1
+        self.errors = search.errors
+        if search.is_worse.any():
+            self.x.copy_from(self.start)
+            self.errors = search.initial
+        self._keep()
+
+    def _keep(self) -> None:
+        if self._is_warm:
+            self._last.copy_from(self.x)
+            self._has_last = True
+
+    def saturated(self) -> int:
+        """The number of values at a bound, beyond which a step would go."""
+        x = self.x.get()
+        is_at_bound = (x <= self._lower) | (x >= self._upper)
+        return int(np.count_nonzero(self.descent.saturated(x) & is_at_bound))
+
+
+@dataclass(eq=False, kw_only=True)
+class Slot:
+    """Buffers of one frame on its way, on the device and on the host."""
+
+    frame: Array
+    codes: Array
+    decode: Launch
+    encode: Launch
+    frame_host: np.ndarray
+    codes_host: np.ndarray
+    peaks_host: np.ndarray
+    event: Any = None
+    begun_at: float = 0.0
+    gain: float = 1.0
+
+
+class PreparedFrames:
+    """All that frames of one kind take.
+
+    Parameters
+    ----------
+    request : CompensationRequest
+        Of a picture of the same colours, as `check_inputs` made it.
+    frame_colours : 1 or 3
+    frame_dtype, dtype : numpy type, str
+        Types of the codes of frames and of the projector.
+    decode : str
+    table : CodeTable
+    is_bounded, is_warm : bool
+        Whether projected steps follow where light is beyond the bounds, and whether they may begin
+        with the light of the frame before.
+    has_peaks : bool
+        Whether the brightest light of each strip of pixels is wanted.
+    slots : int
+        Frames that may be on their way.
+    """
+
+    def __init__(
+        self,
+        request: CompensationRequest,
+        *,
+        frame_colours: int,
+        frame_dtype: Any,
+        decode: str,
+        dtype: str,
+        table: CodeTable,
+        is_bounded: bool,
+        is_warm: bool,
+        has_peaks: bool,
+        slots: int,
+    ) -> None:
+        T = request.T
+        self.device: Device = request.problem.systems[0].A.device
+        self.frame_colours = frame_colours
+        self.frame_dtype = np.dtype(frame_dtype)
+        self.dtype = dtype
+        self._request = request
+        self._table = table
+        is_stacked = T.channels == 3
+        colours = 3 if is_stacked else frame_colours
+        self.colours = colours
+        h, w = T.grid
+        H, W = T.camera_grid
+        self.seen = LightLayout(pixels=H * W, channels=colours, is_stacked=is_stacked)
+        self.shown = LightLayout(pixels=h * w, channels=colours, is_stacked=is_stacked)
+        self.grid = T.grid
+        self.camera_grid = T.camera_grid
+        self.unit = self._find_unit()
+        self._device_tables(decode)
+        self._is_warm = is_warm
+        self._make_steps(is_bounded, has_peaks)
+        self.slots = [self._slot() for _ in range(slots)]
+
+    def for_codes(self, frame_colours: int, frame_dtype: Any, decode: str) -> PreparedFrames:
+        """The same for frames of other codes, which share all buffers but those of the codes."""
+        other = copy.copy(self)
+        other.frame_colours = frame_colours
+        other.frame_dtype = np.dtype(frame_dtype)
+        other._set_light_table(decode)
+        other.slots = [other._slot() for _ in self.slots]
+        return other
+
+    # Preparation.
+
+    def _find_unit(self) -> float:
+        """A power of two near the brightest light that the projector makes."""
+        limits = self._request.problem.limits
+        brightest = max(abs(limits.low), abs(limits.high))
+        largest_scale = max(float(scale.max()) for _, scale in self._request.problem.systems)
+        size = brightest * largest_scale
+        if not size > 0.0:
+            return 1.0
+        return float(np.exp2(np.floor(np.log2(size))))
+
+    def _device_tables(self, decode: str) -> None:
+        """Upload the tables of codes and the factors of light."""
+        request = self._request
+        device = self.device
+        self._set_light_table(decode)
+        background = self.seen.from_channels(request.problem.background)
+        self._subtracts = float(request.problem.has_background)
+        self._background_host = background
+        self._background = device.upload(background / self.unit)
+        self._starts = device.upload(self._table.starts, np.int32)
+        self._thresholds = device.upload(self._table.thresholds)
+        mixing = np.eye(self.colours)
+        self._is_mixed = request.T.mixing is not None
+        if request.T.mixing is not None:
+            mixing = np.linalg.inv(request.T.mixing)
+        self._mixing = device.upload(mixing)
+
+    def _set_light_table(self, decode: str) -> None:
+        self._light_table = self.device.upload(light_of_codes(decode, self.frame_dtype))
+        self._has_table = self.frame_dtype.kind != "f"
+
+    def _factors(self) -> np.ndarray:
+        """Projector light per direct light, of each pixel and channel; 0 at masked ones."""
+        F = self._request.first_bounce
+        is_lit = (F > 0.0) & ~self._request.T.masked
+        factors = np.divide(self.unit, F, out=np.zeros_like(F), where=is_lit)
+        return self.shown.from_channels([f[:, None] for f in factors])
+
+    def _scales(self) -> np.ndarray:
+        """Unknowns of the bounded solve per projector light."""
+        problem = self._request.problem
+        masked = problem.limits.masked
+        scales = []
+        for _, scale in problem.systems:
+            scales.append(np.where(masked, 0.0, scale)[:, None] / self.unit)
+        return self.shown.from_channels(scales)
+
+    def _make_steps(self, is_bounded: bool, has_peaks: bool) -> None:
+        """Make buffers and launches between the codes."""
+        request = self._request
+        device = self.device
+        self.bounded: WithinBounds | None = None
+        if is_bounded:
+            self.bounded = self._bounded_steps()
+            self.target = self.bounded.target
+        else:
+            self.target = device.empty(self.seen.shape)
+        self.direct_steps: ByInverse | ByFixedSteps | None = None
+        if request.T.is_square:
+            self.direct = device.empty(self.shown.shape)
+            self._direct_factors = device.upload(self._factors())
+            self.direct_steps = self._direct_steps()
+        self._exceeded = device.upload(np.zeros(1), np.int32)
+        self._no_excess = np.zeros(1, np.int32)
+        self._unknown_scales = device.upload(self._scales())
+        self._judge: WithinBounds | None = self.bounded
+        self._make_final()
+        if self.bounded is not None and self.direct_steps is not None:
+            self._clip = self._bind_clip(self.bounded)
+        strips = -(-self.shown.pixels // STRIP_PIXELS)
+        self._peaks = device.empty(strips)
+        self._find_peaks: Launch | None = None
+        if has_peaks and self.direct_steps is not None:
+            self._find_peaks = self._bind_peaks()
+
+    def _bounded_steps(self) -> WithinBounds:
+        problem = self._request.problem
+        A = block_diagonal([system.A for system in problem.systems])
+        scales = self._scales()[:, :1]
+        lower = (scales * problem.limits.low).astype(np.float32)[:, 0]
+        upper = (scales * problem.limits.high).astype(np.float32)[:, 0]
+        weights = None
+        if problem.weights is not None:
+            weights = self.seen.from_channels(problem.weights)
+        columns = self.seen.shape[1]
+        rtol = problem.settings.rtol
+        return WithinBounds(A, columns, weights, (lower, upper), rtol, self._is_warm)
+
+    def _direct_steps(self) -> ByInverse | ByFixedSteps | None:
+        """The way from light to add to direct light; None if steps do not converge."""
+        request = self._request
+        if request.inverse is not None:
+            inverse = block_diagonal(request.inverse.systems)
+            return ByInverse(inverse, self.target, self.direct)
+        if request.T.shape[0] <= SMALL:
+            inverses = _dense_inverses(request.T.systems)
+            if inverses is not None:
+                return ByInverse(block_diagonal(inverses), self.target, self.direct)
+        S = block_diagonal(request.T.systems)
+        assert isinstance(S, IdentityPlus)  # noqa: S101 - as all systems are
+        rtol = request.problem.settings.rtol
+        steps = ByFixedSteps(S, self.target, self.direct, rtol, self._probes(S))
+        if steps.products:
+            return steps
+        if self.bounded is None:
+            raise InputError(
+                f"clamp is True, but {MAX_FIXED_STEPS} steps do not undo the light of this T to "
+                f"{rtol:g}; give inverse=ltcl.invert(T), or leave out clamp"
+            )
+        return None
+
+    def _probes(self, S: Operator) -> np.ndarray:
+        """Light of white, of a random pattern, and a random picture, (3, rows, columns)."""
+        random = np.random.default_rng(0)
+        white = self.shown.from_channels([f[:, None] for f in self._request.first_bounce])
+        white = white.astype(np.float32) / np.float32(self.unit)
+        noise = random.random(self.shown.shape, np.float32)
+        probes = [S @ white, S @ (noise * white), random.random(self.shown.shape, np.float32)]
+        return np.stack([np.reshape(probe, self.shown.shape) for probe in probes])
+
+    def _light_arguments(self, factors: Array, direct: Array) -> dict[str, Any]:
+        limits = self._request.problem.limits
+        return {
+            "pixels": self.shown.pixels,
+            "low": limits.low,
+            "high": limits.high,
+            "mixing": self._mixing,
+            "factors": factors,
+            "direct": direct,
+        }
+
+    def _make_final(self) -> None:
+        """Choose the light that becomes codes: direct light, or the unknowns within the bounds."""
+        if self.bounded is None:
+            self._final = self._light_arguments(self._direct_factors, self.direct)
+            self._is_final_mixed = self._is_mixed
+            return
+        scales = self._scales()
+        inverses = np.divide(1.0, scales, out=np.zeros_like(scales), where=scales > 0.0)
+        factors = self.device.upload(inverses)
+        self._final = self._light_arguments(factors, self.bounded.x)
+        self._is_final_mixed = False
+
+    def _bind_clip(self, bounded: WithinBounds) -> Launch:
+        limits = self._request.problem.limits
+        kernel = self._kernel("clip", "float32", self.shown, MIXED=int(self._is_mixed))
+        return self._bind(
+            kernel,
+            self.shown,
+            slack=BOUNDS_SLACK * (limits.high - limits.low),
+            scales=self._unknown_scales,
+            x=bounded.start,
+            exceeded=self._exceeded,
+            **self._light_arguments(self._direct_factors, self.direct),
+        )
+
+    def _bind_peaks(self) -> Launch:
+        """The launch of the peaks, after the light of the background itself is found."""
+        assert self.direct_steps is not None  # noqa: S101 - only then is it called
+        shift = self._peaks
+        if self._subtracts:
+            self.target.set(np.asarray(self._background_host / self.unit, np.float32))
+            self.direct_steps.queue()
+            shift = self.device.empty(self.shown.shape)
+            shift.set(self.light_of_direct())
+        kernel = self._kernel("peaks", "float32", self.shown, MIXED=int(self._is_mixed))
+        return kernel.bind(
+            self._peaks.size,
+            GROUP,
+            span=STRIP_PIXELS,
+            shifts=self._subtracts,
+            shift=shift,
+            peaks=self._peaks,
+            **self._light_arguments(self._direct_factors, self.direct),
+        )
+
+    def _kernel(self, name: str, dtype: str, light: LightLayout, **defines: int) -> Kernel:
+        """A kernel of frames.cl for codes of a type, and for light that stands so."""
+        code = CODE_TYPES[dtype]
+        return self.device.kernel("frames", f"frames_{name}", CODE=code, **light.defines, **defines)
+
+    def _bind(self, kernel: Kernel, light: LightLayout, **arguments: Any) -> Launch:
+        """The launch of a kernel: a pixel an item, or some long spans of pixels on a CPU."""
+        span = 1
+        if self.device.is_cpu:
+            spans = SPANS_PER_UNIT * self.device.compute_units
+            span = max(1, -(-light.pixels // spans))
+        group = 1 if span > 1 else GROUP
+        return kernel.bind(-(-light.pixels // span), group, span=span, **arguments)
+
+    def _slot(self) -> Slot:
+        seen = self.seen
+        shown = self.shown
+        dtype = np.dtype(self.dtype)
+        frame = self.device.empty((seen.pixels, self.frame_colours), self.frame_dtype)
+        codes = self.device.empty((shown.pixels, self.colours), dtype)
+        return Slot(
+            frame=frame,
+            codes=codes,
+            decode=self._bind_decode(frame),
+            encode=self._bind_encode(codes, self.dtype, self._table),
+            frame_host=np.empty(frame.shape, frame.dtype),
+            codes_host=np.empty(codes.shape, codes.dtype),
+            peaks_host=np.zeros(self._peaks.size, np.float32),
+        )
+
+    def _bind_decode(self, frame: Array) -> Launch:
+        kernel = self._kernel(
+            "decode",
+            self.frame_dtype.name,
+            self.seen,
+            COLOURS=self.frame_colours,
+            TABLE=int(self._has_table),
+        )
+        return self._bind(
+            kernel,
+            self.seen,
+            pixels=self.seen.pixels,
+            gain=1.0,
+            subtracts=self._subtracts,
+            codes=frame,
+            table=self._light_table,
+            background=self._background,
+            out=self.target,
+        )
+
+    def _bind_encode(self, codes: Array, dtype: str, table: CodeTable) -> Launch:
+        kernel = self._kernel(
+            "encode",
+            dtype,
+            self.shown,
+            MIXED=int(self._is_final_mixed),
+            STEPS=table.steps,
+            BETWEEN=int(table.is_between),
+        )
+        return self._bind(
+            kernel,
+            self.shown,
+            count=table.thresholds.shape[1],
+            cells=table.starts.shape[1],
+            cells_per_light=table.cells_per_light,
+            first_light=table.first_light,
+            starts=self._starts,
+            thresholds=self._thresholds,
+            codes=codes,
+            **self._final,
+        )
+
+    # Frames.
+
+    def begin(self, slot: Slot, frame: np.ndarray | Array, gain: float) -> None:
+        """Queue the upload of a frame, and all launches up to direct light."""
+        slot.begun_at = time.perf_counter()
+        slot.gain = gain
+        if isinstance(frame, Array):
+            self.device.copy(slot.frame.buffer, frame.buffer, byte_count=slot.frame.nbytes)
+        else:
+            np.copyto(slot.frame_host, frame.reshape(slot.frame_host.shape))
+            self.device.queue_copy(slot.frame.buffer, slot.frame_host)
+        slot.decode.set(gain=gain / self.unit)
+        slot.decode()
+        if self.direct_steps is not None:
+            self.direct_steps.queue()
+
+    def keep_within_bounds(self, deadline: float) -> None:
+        """Take projected steps, if some light is beyond the bounds; waits for the device."""
+        bounded = self.bounded
+        if bounded is None:
+            return
+        if self.direct_steps is None:
+            vectors.fill(bounded.start, 0.0)
+            bounded.solve(deadline)
+            return
+        if self._count_exceeded():
+            bounded.solve(deadline)
+        else:
+            bounded.keep_start()
+
+    def _count_exceeded(self) -> int:
+        """Clip the light to the bounds, and count what was beyond; waits."""
+        self._exceeded.set(self._no_excess)
+        self._clip()
+        return int(self._exceeded.get()[0])
+
+    def judge(self) -> tuple[float, float]:
+        """The relative error and the clipped share of the last frame, by one product; waits."""
+        if self._judge is None:
+            self._judge = self._bounded_steps()
+            self._clip = self._bind_clip(self._judge)
+        judge = self._judge
+        clipped = 0
+        if self.bounded is None:
+            judge.target.copy_from(self.target)
+            clipped = self._count_exceeded()
+            judge.keep_start()
+        elif judge.errors is not None:
+            clipped = judge.saturated()
+        errors = judge.errors
+        if errors is None:
+            errors = judge.descent.measure()
+        size = self._size_of_target(judge)
+        lit_values = self.colours * np.count_nonzero(~self._request.T.masked)
+        error = float(np.linalg.norm(errors))
+        if size > 0.0:
+            error /= size
+        else:
+            # Errors of a black target are not relative.
+            error *= self.unit * self._request.problem.weight_unit
+        return error, clipped / lit_values
+
+    def _size_of_target(self, judge: WithinBounds) -> float:
+        """||w gain desired|| of the last frame, in units of light."""
+        target = judge.target
+        if self._subtracts:
+            target = vectors.axpby(1.0, target, 1.0, self._background, target.like())
+        return float(np.linalg.norm(judge.descent.norm_of(target)))
+
+    def end(self, slot: Slot) -> None:
+        """Queue the codes and their download."""
+        slot.encode()
+        if self._find_peaks is not None:
+            self._find_peaks()
+            self.device.queue_copy(slot.peaks_host, self._peaks.buffer)
+        slot.event = self.device.queue_copy(slot.codes_host, slot.codes.buffer)
+        self.device.flush()
+
+    def take(self, slot: Slot) -> np.ndarray:
+        """Wait for the codes of a frame; (h, w) or (h, w, 3)."""
+        slot.event.wait()
+        codes = slot.codes_host
+        # The next frame of this slot gets a new array: the caller keeps this one.
+        slot.codes_host = np.empty_like(codes)
+        h, w = self.grid
+        return codes.reshape((h, w, 3) if self.colours == 3 else (h, w))
+
+    def light(self) -> np.ndarray:
+        """Projector light of the last frame, (pixels, colours) float32."""
+        codes = self.device.empty((self.shown.pixels, self.colours))
+        self._bind_encode(codes, "float32", CodeTable.of_light())()
+        return codes.get()
+
+    def light_of_direct(self) -> np.ndarray:
+        """Projector light without bounds of what stands in `direct`, in its layout."""
+        direct = self.direct.get()
+        factors = self._direct_factors.get()
+        light = self.shown.to_channels(factors * direct)
+        if self._is_mixed:
+            light = light @ self._mixing.get().T
+        if self.shown.is_stacked:
+            return np.ascontiguousarray(light.T.reshape(self.shown.shape), np.float32)
+        return np.ascontiguousarray(light, np.float32)
