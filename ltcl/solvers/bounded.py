@@ -341,7 +341,6 @@ class Descent:
     def _bind(self) -> None:
         """Bind the launches of a step, and those that start anew."""
         self._look_anew = self._bind_look(restart=1)
-        self._square_b = self._bind_squares(self.b)
         # Without slices nothing moves, and r is weighted alone.
         self._weigh_r = self._bind_move(slices=0)
         self._launches = (
@@ -421,10 +420,20 @@ class Descent:
         for launch in self._zeros:
             launch()
         self._numbers.set(self._first_numbers)
-        self._square_b()
-        squares = self._curvatures.get().astype(np.float64)
-        self.norms = np.sqrt(squares.sum(axis=0)).ravel()
+        self.norms = self.norm_of(self.b)
         self.refresh()
+
+    def norm_of(self, picture: Array) -> np.ndarray:
+        """||w picture|| of a picture (M, k) on the device, (k,); waits."""
+        self._bind_squares(picture)()
+        squares = self._curvatures.get().astype(np.float64)
+        return np.sqrt(squares.sum(axis=0)).ravel()
+
+    def measure(self) -> np.ndarray:
+        """||w (b - A x)|| of x as it is on the device, (k,), by one product; waits."""
+        self.A.apply(self.x, self.r, scale=-1.0, add=self.b)
+        self.products += 1
+        return self.norm_of(self.r)
 
     def refresh(self) -> None:
         """Compute r and g from x itself, instead of by recursion."""

@@ -204,6 +204,22 @@ def most_patterns(grid: tuple[int, int], rounds: int = 0) -> int:
     return BATCH_SIZE * (-(-count_patterns(grid) // BATCH_SIZE) + rounds)
 
 
+def photographs_of_round(exposures: int) -> int:
+    """Photographs of a round; a batch ends with one that was taken before."""
+    return exposures * BATCH_SIZE + 1
+
+
+def most_rounds(photographs: int | None, rtol: float | None, first: int, exposures: int) -> int:
+    """Rounds at most within some photographs, of which set-up and first patterns take `first`.
+
+    >>> most_rounds(150, None, 98, 1), most_rounds(None, None, 98, 1)
+    (3, 0)
+    """
+    if photographs is None:
+        return 0 if rtol is None else MAX_ROUNDS
+    return min(max((photographs - first) // photographs_of_round(exposures), 0), MAX_ROUNDS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
     """How long a sketch goes on after its first patterns.
