@@ -97,8 +97,7 @@ INLINE real projector_light(
         global const real *factors, global const real *direct
 #define LIGHT(channel) projector_light(pixel, pixels, channel, mixing, factors, direct)
 
-// x = scale * clip(p); exceeded[0] is 1 if some p is outside by more than `slack`, and else as it
-// was.
+// x = scale * clip(p); exceeded[0] grows by the number of p that are outside by more than `slack`.
 kernel void frames_clip(
     LIGHT_ARGUMENTS,
     real slack,                 // light beyond a bound by less counts as inside
@@ -106,16 +105,16 @@ kernel void frames_clip(
     global real *x,             // like direct
     global int *exceeded)       // [1]
 {
-    bool is_outside = false;
+    int outside = 0;
     EACH_PIXEL(pixel)
         for (int c = 0; c < CHANNELS; ++c) {
             const real light = LIGHT(c);
             const bool is_lit = factors[AT(c)] != 0;
-            is_outside |= is_lit && !(light >= low - slack && light <= high + slack);
+            outside += is_lit && !(light >= low - slack && light <= high + slack);
             x[AT(c)] = is_lit ? scales[AT(c)] * clamp(light, low, high) : 0;
         }
-    if (is_outside)
-        atomic_or(exceeded, 1);
+    if (outside)
+        atomic_add(exceeded, outside);
 }
 
 kernel void frames_encode(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ImageFile`: pictures in a temporary file instead of memory, read back whole or by rows.
+"""Arrays in temporary files instead of memory: `ImageFile`, `scratch_array`, `ScratchFrames`.
 
 A calibration takes about 150 photographs, of which 45 megapixels in colour are 20 gigabytes.
 """
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 # Bytes of a scratch array that are kept in memory.
-MAX_ARRAY_BYTES = 1 << 26
+MAX_ARRAY_BYTES = 1 << 24
 # Values of a strip of rows.
 STRIP_VALUES = 1 << 20
 
@@ -84,6 +84,41 @@ def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         return np.zeros(shape, dtype)
     with tempfile.TemporaryFile(prefix="ltcl-") as file:
         return np.memmap(file, dtype, "w+", shape=shape)
+
+
+class ScratchFrames:
+    """Frames of one shape, to which more are added, in a temporary file once they are large.
+
+    Examples
+    --------
+    >>> frames = ScratchFrames((2,), "float32")
+    >>> frames.extend(1)[0] = 1, 2
+    >>> frames.extend(2).tolist()
+    [[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]]
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: Any) -> None:
+        self.array = np.zeros((0, *shape), dtype)
+        self._file: Any = None
+
+    def extend(self, count: int) -> np.ndarray:
+        """All frames with `count` more of zeros; arrays from before must not be written to."""
+        before = self.array
+        shape = (len(before) + count, *before.shape[1:])
+        if self._file is None and math.prod(shape) * before.itemsize <= MAX_ARRAY_BYTES:
+            self.array = np.concatenate([before, np.zeros((count, *shape[1:]), before.dtype)])
+            return self.array
+        if self._file is None:
+            file = tempfile.TemporaryFile(prefix="ltcl-")  # noqa: SIM115
+            weakref.finalize(self, file.close)
+            self._file = file
+            self.array = np.memmap(file, before.dtype, "w+", shape=shape)
+            self.array[: len(before)] = before
+            return self.array
+        # Makes the file longer, and keeps what it holds.
+        file: Any = self._file
+        self.array = np.memmap(file, before.dtype, "r+", shape=shape)
+        return self.array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -427,7 +427,8 @@ def _store_sizes(
     pixels = math.prod(grid.grid)
     if strategy in PICTURE_STRATEGIES:
         if strategy == "sketch":
-            rounds = _most_rounds(settings, chosen.photographs, exposures)
+            first = chosen.photographs
+            rounds = sketch.most_rounds(settings.photographs, settings.rtol, first, exposures)
             most = sketch.most_patterns(grid.grid, rounds)
         elif strategy == "direct":
             most = direct.most_patterns(grid.grid)
@@ -515,15 +516,8 @@ def _rounds(store: BlockStore, settings: ScanSettings) -> sketch.Rounds:
     planned = store.attributes["plan"]
     exposures = len(Calibration.of(store).exposures)
     first = int(planned["photographs"])
-    return sketch.Rounds(most=_most_rounds(settings, first, exposures), rtol=settings.rtol)
-
-
-def _most_rounds(settings: ScanSettings, first: int, exposures: int) -> int:
-    """Rounds of a sketch at most, whose first patterns and set-up take `first` photographs."""
-    if settings.photographs is None:
-        return 0 if settings.rtol is None else sketch.MAX_ROUNDS
-    of_round = exposures * BATCH_SIZE + 1
-    return min(max((settings.photographs - first) // of_round, 0), sketch.MAX_ROUNDS)
+    most = sketch.most_rounds(settings.photographs, settings.rtol, first, exposures)
+    return sketch.Rounds(most=most, rtol=settings.rtol)
 
 
 def _tell_left_out(share: float) -> None:
@@ -543,9 +537,11 @@ def _advise_another_scan(grid: ScanGrid, error: float) -> None:
     candidates = plan.plans(
         grid.grid, known.exposures, known.noise, plan.measured(known), channels=grid.channels
     )
+    adaptive_scan = candidates["adaptive"]
     logger.warning(
         "pictures T p by this sketch are off by %.1f %%: light changes abruptly in this scene; "
-        "strategy 'adaptive' finds where, with up to %d photographs",
+        "strategy 'adaptive' finds where, with up to %d photographs, %.2g minutes of exposures",
         100 * error,
-        candidates["adaptive"].photographs,
+        adaptive_scan.photographs,
+        adaptive_scan.seconds / 60.0,
     )

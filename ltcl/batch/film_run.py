@@ -22,14 +22,18 @@ from ltcl.batch import manifest
 from ltcl.batch.manifest import FrameRecord, OtherRun, identity
 from ltcl.errors import FileError, InputError, LtclError
 from ltcl.files import read_ahead
+from ltcl.images.encoding import from_linear
 from ltcl.images.frames import Frame, Source
 from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
-from ltcl.tasks.compensation import compensate
+from ltcl.tasks.compensation import Compensator, compensate
+from ltcl.tasks.compensation.codes import LINEAR, SRGB
 from ltcl.transport.transport import Transport
 
 # Broken frames that an error names.
 MAX_NAMED = 5
+# Options of `compensate` that prepared frames have, too.
+PREPARED_OPTIONS = {"bounds", "background", "weights", "rtol", "inverse", "clamp"}
 # Threads that compress and flush files, side by side.
 WRITERS = 4
 
@@ -43,7 +47,10 @@ class ReadFrame(NamedTuple):
 
 
 class SolvedBatch(NamedTuple):
-    """Patterns and appearances of the frames of a batch, with their errors and clipped shares."""
+    """Patterns and appearances of the frames of a batch, with their errors and clipped shares.
+
+    Patterns are light, or uint16 codes of sRGB with white at the upper bound.
+    """
 
     pattern: np.ndarray
     appearance: np.ndarray | None
@@ -55,12 +62,15 @@ class SolvedBatch(NamedTuple):
 class BatchSolver:
     """Solve a batch of pictures; it is sent to each worker once.
 
-    On workers `reload` reads T from its file, instead of a T that was sent.
+    On workers `reload` reads T from its file, instead of a T that was sent. Frames go one by one
+    through a prepared `Compensator`, cold, so that none depends on those before; where options ask
+    for what that has not, `compensate` takes the whole batch.
     """
 
     T: Transport
     options: dict[str, Any]
     needs_appearance: bool
+    needs_codes: bool = False
     identity: dict[str, Any]
     reload: Callable[[], Transport] | None = None
     gain: Any = None  # of all frames, when it is known
@@ -69,18 +79,89 @@ class BatchSolver:
         """Solve the pictures (k, h, w[, 3]) of frames with these numbers."""
         numbers, pictures = batch
         try:
-            self._survey()
             pictures = _unambiguous(pictures, self.T)
-            solved = compensate(self.T, pictures, gain=self.gain, **self.options)
+            compensator = self._compensator()
+            if compensator is None:
+                return self._solve_together(pictures)
+            solved = [self._solve_prepared(compensator, picture) for picture in pictures]
         except LtclError as error:
             error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
             raise
+        appearances = [batch.appearance for batch in solved if batch.appearance is not None]
         return SolvedBatch(
-            pattern=solved.pattern,
+            pattern=np.concatenate([batch.pattern for batch in solved]),
+            appearance=np.concatenate(appearances) if appearances else None,
+            errors=[error for batch in solved for error in batch.errors],
+            clipped=[clipped for batch in solved for clipped in batch.clipped],
+        )
+
+    def _solve_together(self, pictures: np.ndarray) -> SolvedBatch:
+        """Solve pictures (k, h, w[, 3]) at once."""
+        self._survey()
+        solved = compensate(self.T, pictures, gain=self.gain, **self.options)
+        pattern = solved.pattern
+        if self.needs_codes:
+            pattern = from_linear(pattern / self._white(), "srgb", 16, is_float=False)
+        return SolvedBatch(
+            pattern=pattern,
             appearance=solved.appearance if self.needs_appearance else None,
             errors=solved.frame_errors.tolist(),
             clipped=solved.frame_clipped.tolist(),
         )
+
+    def _solve_prepared(self, compensator: Compensator, picture: np.ndarray) -> SolvedBatch:
+        """Solve one picture; together with its error, which decides whether that was enough."""
+        pattern = compensator(picture)
+        facts = compensator.judge()
+        if facts.clipped == 0.0 and facts.error > compensator.rtol:
+            # Fixed steps were too few for this one.
+            return self._solve_together(picture[None])
+        appearance = None
+        if self.needs_appearance:
+            light = compensator.light()
+            appearance = self.T @ light
+            background = self.options.get("background")
+            if background is not None:
+                appearance = appearance + background
+            appearance = appearance[None].astype(np.float32)
+        return SolvedBatch(
+            pattern=pattern[None],
+            appearance=appearance,
+            errors=[facts.error],
+            clipped=[facts.clipped],
+        )
+
+    def _compensator(self) -> Compensator | None:
+        """What frames go through, made at the first one; None if the options ask for more."""
+        if self._is_prepared or not PREPARED_OPTIONS.issuperset(self._given_options()):
+            return self._prepared
+        self._is_prepared = True
+        options: dict[str, Any] = {}
+        for name in self._given_options():
+            options[name] = self.options[name]
+        options.pop("method", None)
+        dtype = "uint16" if self.needs_codes else "float32"
+        encode = SRGB if self.needs_codes else LINEAR
+        try:
+            self._prepared = Compensator(
+                self.T, gain=self.gain, dtype=dtype, encode=encode, warm=False, **options
+            )
+        except InputError:
+            if not options.get("clamp"):
+                raise
+        return self._prepared
+
+    def _given_options(self) -> set[str]:
+        """Names of the options that are not the default."""
+        given = {name for name, value in self.options.items() if value is not None}
+        if self.options.get("method") == "auto":
+            given.remove("method")
+        return given - {"callback"}
+
+    def _white(self) -> np.float32:
+        """Light that is white in .png."""
+        _, high = self.options.get("bounds") or (0.0, 1.0)
+        return np.float32(high if high > 0 else 1.0)
 
     def _survey(self) -> None:
         """Let "auto" see one survey of S in every batch, so that all choose the same method."""
@@ -88,6 +169,11 @@ class BatchSolver:
         if is_auto and self.T.is_square and self.T.shape[0] > SMALL:
             for S in self.T.systems:
                 survey(S)
+
+    def __post_init__(self) -> None:
+        # Not fields: they stay with their device.
+        self._prepared: Compensator | None = None
+        self._is_prepared = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what `_on_worker` takes: T only if it has no file there."""
@@ -295,7 +381,9 @@ class FilmRun:
         """Write the files of a frame; return their digest."""
         files = self._files(number)
         pattern_file, *appearance_file = files
-        if self.codes is not None and self.format == "png":
+        if pattern.dtype == np.uint16:
+            images.write_codes(pattern_file, pattern)
+        elif self.codes is not None and self.format == "png":
             images.write(pattern_file, self.codes(pattern), bits=16, encoding="linear")
         else:
             self._write_light(pattern_file, pattern, self.white)

@@ -217,6 +217,7 @@ def compensate_frames(
         T=T,
         options=options,
         needs_appearance=appearance,
+        needs_codes=format == "png" and codes is None,
         identity=head["transport"],
         reload=_reload_on_workers(T, client),
     )

@@ -73,6 +73,7 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
     are guessed. No camera is opened.
     """
     from ltcl.acquisition import Project
+    from ltcl.acquisition.scanning import sketch
     from ltcl.acquisition.scanning.pace import seconds_per_megapixel
     from ltcl.acquisition.scanning.plan import choose, plans
 
@@ -82,10 +83,14 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
         pace = seconds_per_megapixel(facts["channels"])
         strategies = plans(**facts, overhead=overhead, pace=pace)
     best, why = choose(strategies)
+    is_measured = project.state != "new"
+    # Before that exposures are guessed for scans that take several; a sketch takes one.
+    exposures = len(facts["exposures"]) if is_measured else 1
+    first = strategies["sketch"].photographs
     report = PlanReport(
         folder=folder,
         rig=_rig_kind(project),
-        measured=project.state != "new",
+        measured=is_measured,
         asked_for=settings.strategy,
         auto=best,
         why=why,
@@ -95,6 +100,8 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
         channels=facts["channels"],
         megapixels=facts["megapixels"],
         pace=pace,
+        rounds=sketch.most_rounds(settings.photographs, settings.rtol, first, exposures),
+        photographs_of_round=sketch.photographs_of_round(exposures),
         plans={},
     )
     for name, strategy in strategies.items():
@@ -124,14 +131,19 @@ def _plan_lines(report: PlanReport) -> list[str]:
     advice = f"auto takes {report.auto}: {report.why}"
     if report.asked_for != "auto":
         advice = f"acquisition.toml asks for {report.asked_for}; {advice}"
-    return [
+    lines = [
         f"{report.folder}: {report.rig} rig, {report.channels} channel(s)",
         f"exposures {exposures} s, noise and light {source}\n",
         table(PLAN_COLUMNS, rows),
         "\nphotographs: all, with those of the calibration; error of T p: forecast, relative",
         _computing_line(report),
-        advice,
     ]
+    if report.rounds:
+        lines.append(
+            f"a sketch goes on for up to {report.rounds} rounds of {report.photographs_of_round} "
+            "photographs each, as asked for by rtol or photographs"
+        )
+    return [*lines, advice]
 
 
 def _computing_line(report: PlanReport) -> str:

@@ -9,6 +9,6 @@ thumbnails   small pictures in HTML for notebooks
 """
 
 from ltcl.images.encoding import from_srgb, to_srgb
-from ltcl.images.pictures import BITS, read, read_codes, resize, write
+from ltcl.images.pictures import BITS, read, read_codes, resize, write, write_codes
 
-__all__ = ["BITS", "from_srgb", "read", "read_codes", "resize", "to_srgb", "write"]
+__all__ = ["BITS", "from_srgb", "read", "read_codes", "resize", "to_srgb", "write", "write_codes"]

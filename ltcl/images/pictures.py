@@ -165,6 +165,35 @@ def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
     return np.ascontiguousarray(_decode(as_path(path), NO_LIMIT).codes)
 
 
+def write_codes(path: str | os.PathLike[str], codes: np.ndarray) -> None:
+    """Write codes as they are, without curve or scale; `read_codes` reads them.
+
+    Parameters
+    ----------
+    path : path
+        The extension names the format, as in `read`; it must hold as many bits as the codes have.
+    codes : (h, w) or (h, w, 3) RGB, uint8 or uint16
+
+    Raises
+    ------
+    InputError
+        Codes of another shape or type, or of bits that the format has not.
+    FileError
+        The extension is unknown, or the file cannot be written.
+    """
+    path = as_path(path)
+    is_picture = codes.ndim == 2 or codes.shape[2:] == (3,)
+    if not is_picture or codes.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"codes are {codes.shape} of {codes.dtype}; they must be (h, w) or (h, w, 3), uint8 or "
+            "uint16"
+        )
+    bits = 8 * codes.dtype.itemsize
+    if bits not in _possible_bits(path):
+        raise InputError(f"codes have {bits} bits, which {path.suffix} does not hold")
+    _write(path, codes)
+
+
 def write(
     path: str | os.PathLike[str],
     image: ArrayLike,
@@ -204,6 +233,12 @@ def write(
         raise InputError(f"bits is {bits!r}; for {path.suffix} it must be {allowed}")
     is_float = suffix == ".exr" or bits == 32
     codes = from_linear(as_picture("image", image), encoding, bits, is_float=is_float)
+    _write(path, codes)
+
+
+def _write(path: Path, codes: np.ndarray) -> None:
+    """Replace a file by one of these codes, (h, w) or (h, w, 3) RGB."""
+    suffix = path.suffix.lower()
     with replace_file(path) as temporary:
         try:
             if suffix == ".exr":

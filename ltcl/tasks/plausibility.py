@@ -13,12 +13,17 @@ from contextlib import suppress
 import numpy as np
 
 from ltcl.errors import InputError
+from ltcl.transport.covariance import EntryErrors
+from ltcl.transport.diagnostics import PARTS_PER_SIDE, negative_bounce, picture_parts
+from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport
 
 # Largest defect and share of negative light of a scene that is taken for Lambertian: noise of path
 # tracing alone gives a defect of 0.05 and a share of 0.0004.
 LARGEST_DEFECT = 0.1
 LARGEST_NEGATIVE = 0.005
+# Standard deviations of noise that negative light between parts of a picture does not exceed.
+NEGATIVE_SIGMAS = 3.0
 # Largest share of ambient light, as in `ltcl.transport.verdict`: clean scenes have 0, and scenes
 # with 1 % of ambient light mostly more.
 LARGEST_AMBIENT = 0.05
@@ -115,6 +120,23 @@ def bounce_limits(T: Transport) -> str:
     return f"{text}; std is the effect of noise in T alone"
 
 
+def _negative_beyond_noise(T: Transport, noise: Noise) -> list[float]:
+    """Share of light that one bounce takes away beyond noise of T, for each channel."""
+    errors = EntryErrors(T, noise)
+    parts = picture_parts(T.grid, PARTS_PER_SIDE)
+    pixels = parts.sum(axis=0)
+    shares = []
+    for channel, F in enumerate(np.atleast_2d(T.first_bounce)):
+        inverse_F = np.divide(1.0, F, out=np.zeros_like(F), where=F > 0)
+        # The errors of the bounce are about those of T F^-1.
+        squares = inverse_F[:, None] ** 2 * parts
+        variances = parts.T @ np.maximum(errors.variance(channel, squares), 0.0)
+        deviation = np.sqrt(variances) / (pixels[:, None] * pixels)
+        allowed = NEGATIVE_SIGMAS * deviation
+        shares.append(negative_bounce(T.systems[channel], T.grid, allowed))
+    return shares
+
+
 def bounce_warning(T: Transport) -> str:
     """The reasons why bounces by T are only approximate; empty if T shows none."""
     warnings = []
@@ -131,8 +153,10 @@ def bounce_warning(T: Transport) -> str:
         reasons.append(
             f"T is not reciprocal (defect {T.reciprocity_defect:.2g}, above {largest_defect:.2g})"
         )
-    negative = max(T.negative_bounces)
     largest_negative = LARGEST_NEGATIVE + T.error
+    negative = max(T.negative_bounces)
+    if negative > largest_negative and T.measured_noise is not None:
+        negative = max(_negative_beyond_noise(T, T.measured_noise))
     if negative > largest_negative:
         reasons.append(
             f"a bounce holds a share {negative:.2g} of negative light "

@@ -14,7 +14,7 @@ import logging
 import math
 import weakref
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -416,10 +416,20 @@ class Transport:
 
     @cached_property
     def reciprocity_defect(self) -> float:
-        """Deviation of the worst channel from reciprocity, by a sample of pixels; computed once."""
+        """Deviation of the worst channel from reciprocity, by a sample of pixels; computed once.
+
+        It is what lies beyond the noise, if that was measured.
+        """
         defects = []
-        for T, F in zip(self.matrices, self._require_first_bounce(), strict=True):
-            defects.append(diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK_ENTRIES))
+        first_bounce = self._require_first_bounce()
+        for channel, (T, F) in enumerate(zip(self.matrices, first_bounce, strict=True)):
+            variance = None
+            if self.measured_noise is not None:
+                variance = partial(self.measured_noise.entry_variance, channel)
+            defect = diagnostics.reciprocity_defect(
+                T, F, entries=diagnostics.QUICK_ENTRIES, variance=variance
+            )
+            defects.append(defect)
         return max(defects)
 
     @cached_property

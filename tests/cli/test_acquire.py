@@ -106,6 +106,17 @@ def test_plans_before_and_after_the_calibration(program, simulated, acquired):
     assert after["exposures"] == program("acquire", "report", acquired, "--json").json["exposures"]
 
 
+def test_a_plan_says_rounds(program, simulated):
+    report = program("acquire", "plan", simulated, "--json").json
+    assert report["rounds"] == 0
+    first = report["plans"]["sketch"]["photographs"]
+    with (simulated / "acquisition.toml").open("a") as file:
+        file.write(f"photographs = {first + 40}\n")
+    report = program("acquire", "plan", simulated, "--json").json
+    assert (report["rounds"], report["photographs_of_round"]) == (2, 17)
+    assert "up to 2 rounds of 17 photographs each" in program("acquire", "plan", simulated).out
+
+
 def test_overhead_counts_for_each_photograph(program, simulated):
     fast = program("acquire", "plan", simulated, "--json").json["plans"]["pixel"]
     slow = program("acquire", "plan", simulated, "--overhead", "10", "--json").json["plans"][

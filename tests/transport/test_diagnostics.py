@@ -107,6 +107,21 @@ def test_what_is_not_reciprocal_shows_at_its_size(form, T, defect, tolerance):
     )
 
 
+def test_noise_is_no_defect() -> None:
+    """Noise of known variance is subtracted; light that goes one way is left."""
+
+    def defect(T: np.ndarray, deviation: np.ndarray) -> float:
+        return diagnostics.reciprocity_defect(
+            T + deviation * NOISE, np.diag(DIFFUSE), variance=lambda i, j, _: deviation[i, j] ** 2
+        )
+
+    assert defect(DIFFUSE, 0.5 * DIFFUSE) < 0.15
+    glossy = DIFFUSE * np.exp(0.3 * np.random.default_rng(1).normal(size=DIFFUSE.shape))
+    expected = diagnostics.reciprocity_defect(glossy, np.diag(DIFFUSE))
+    assert expected > 0.2
+    assert defect(glossy, 0.1 * DIFFUSE) == pytest.approx(expected, rel=0.1)
+
+
 @FORMS
 def test_a_sample_is_like_the_whole(form):
     T = DIFFUSE * (1 + 0.3 * NOISE)

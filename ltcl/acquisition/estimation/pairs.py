@@ -17,6 +17,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition.agreement import standardised
 from ltcl.acquisition.geometry import Resampling
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.errors import AcquisitionError, InputError
 
 # Pairs from which a transport can be judged.
@@ -85,12 +86,12 @@ class Pairs:
         return self.photographs.shape[2]
 
     def select(self, chosen: np.ndarray | slice) -> Self:
-        """Some of the pairs."""
-        variance = None if self.variance is None else self.variance[chosen]
+        """Some of the pairs; a slice copies nothing."""
+        variance = None if self.variance is None else _some(self.variance, chosen)
         return replace(
             self,
-            patterns=self.patterns[chosen],
-            photographs=self.photographs[chosen],
+            patterns=_some(self.patterns, chosen),
+            photographs=_some(self.photographs, chosen),
             variance=variance,
         )
 
@@ -190,6 +191,19 @@ class Pairs:
     def _compared_pixels(self) -> np.ndarray:
         pixels = self.patterns.shape[1]
         return np.linspace(0, pixels - 1, min(pixels, COMPARED_PIXELS)).astype(int)
+
+
+def _some(frames: np.ndarray, chosen: np.ndarray | slice) -> np.ndarray:
+    """Some frames (frames, N, channels), in a temporary file if they are large."""
+    if isinstance(chosen, slice):
+        return frames[chosen]
+    is_grey = frames.strides[2] == 0
+    planes = frames[:, :, :1] if is_grey else frames
+    numbers = np.arange(len(frames))[chosen]
+    some = scratch_array((len(numbers), *planes.shape[1:]), frames.dtype)
+    for place, number in enumerate(numbers):
+        some[place] = planes[number]
+    return np.broadcast_to(some, (len(numbers), *frames.shape[1:]))
 
 
 def gains(photographs: np.ndarray, explained: np.ndarray) -> np.ndarray:

@@ -41,6 +41,7 @@ from ltcl.acquisition.estimation.near import (
 )
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import between, solve_channels
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.transport import stored
 from ltcl.transport.first_bounce import drop_uncertain
 from ltcl.transport.noise import Noise
@@ -54,7 +55,7 @@ LEVELS_OF_STAGE = 2
 # Nodes that are solved, and rows of T that are made, at once.
 CHUNK_NODES = 512
 CHUNKS_OF_WORKER = 16
-ROWS_AT_ONCE = 1 << 13
+ROWS_AT_ONCE = 1 << 12
 # Pixels between which the noise of entries is looked at, about.
 NOISE_PIXELS = 2048
 # Light of a near function that is left out: relative to that of the camera pixel, and in standard
@@ -615,21 +616,23 @@ def averages(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Photographs relative to white, and their variances, averaged under the hats of a level.
 
-    `light` is that under white, (N, channels); the results are (frames, nodes, channels).
+    `light` is that under white, (N, channels); the results are (frames, nodes, channels), in
+    temporary files if they are large.
     """
-    pictures = []
-    variances = []
+    shape = (len(pairs), hats.nodes_of(level), pairs.channels)
+    pictures = scratch_array(shape, np.float32)
+    variances = None
+    if pairs.variance is not None:
+        variances = scratch_array(shape, np.float32)
     for frame in range(len(pairs)):
         relative = pairs.photographs[frame] / light
         is_known = np.ones(relative.shape)
-        if pairs.variance is not None:
+        if pairs.variance is not None and variances is not None:
             variance = pairs.variance[frame] / light**2
             is_known = (variance < MAX_RELATIVE_VARIANCE).astype(float)
-            variances.append(_variance_of_means(hats, level, variance, is_known))
-        pictures.append(_means(hats, level, relative, is_known))
-    if pairs.variance is None:
-        return np.stack(pictures), None
-    return np.stack(pictures), np.stack(variances)
+            variances[frame] = _variance_of_means(hats, level, variance, is_known)
+        pictures[frame] = _means(hats, level, relative, is_known)
+    return pictures, variances
 
 
 def _means(hats: HatLevels, level: int, values: np.ndarray, is_known: np.ndarray) -> np.ndarray:

@@ -33,8 +33,8 @@ from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
-from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, ScanGrid
-from ltcl.acquisition.scratch import scratch_array
+from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, ScanGrid
+from ltcl.acquisition.scanning.sketch_pictures import SketchPictures
 from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore, CompressedRecord
 
@@ -204,6 +204,22 @@ def most_patterns(grid: tuple[int, int], rounds: int = 0) -> int:
     return BATCH_SIZE * (-(-count_patterns(grid) // BATCH_SIZE) + rounds)
 
 
+def photographs_of_round(exposures: int) -> int:
+    """Photographs of a round; a batch ends with one that was taken before."""
+    return exposures * BATCH_SIZE + 1
+
+
+def most_rounds(photographs: int | None, rtol: float | None, first: int, exposures: int) -> int:
+    """Rounds at most within some photographs, of which set-up and first patterns take `first`.
+
+    >>> most_rounds(150, None, 98, 1), most_rounds(None, None, 98, 1)
+    (3, 0)
+    """
+    if photographs is None:
+        return 0 if rtol is None else MAX_ROUNDS
+    return min(max((photographs - first) // photographs_of_round(exposures), 0), MAX_ROUNDS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
     """How long a sketch goes on after its first patterns.
@@ -276,16 +292,16 @@ def scan(
     if rounds is None or math.prod(grid.grid) < LEAST_PIXELS:
         rounds = Rounds()
     shown = [*patterns(grid.grid), *judges(grid.grid)]
-    judging = np.arange(len(shown) - JUDGES, len(shown)) + 1
     log.announce(shown)
-    pairs = _photograph(grid, shown, log)
-    estimate = _estimate(grid, pairs, judging, log.names, progress)
+    pictures = SketchPictures(grid, log, JUDGES)
+    pictures.take(shown)
+    estimate = _estimate(grid, pictures, progress)
     errors = [estimate.error]
     while rounds.go_on(errors) and log.can_take:
         shown = more_patterns(grid.grid, len(errors) - 1)
         log.announce(shown)
-        pairs = pairs.joined(_photograph(grid, shown, log).select(slice(1, None)))
-        estimate = _estimate(grid, pairs, judging, log.names, progress)
+        pictures.take(shown)
+        estimate = _estimate(grid, pictures, progress)
         errors.append(estimate.error)
         logger.info("round %d: error of T p %.2f %%", len(errors) - 1, 100 * estimate.error)
     # Once, not in each round.
@@ -295,28 +311,24 @@ def scan(
 
 def _estimate(
     grid: ScanGrid,
-    pairs: Pairs,
-    judging: np.ndarray,
-    names: Sequence[str],
+    pictures: SketchPictures,
     progress: Callable[[str, int, int], object] | None,
 ) -> _Estimate:
-    """Estimate T from all pairs that are not `judging`, white first, and judge it by these."""
+    """Estimate T from all pictures but those that judge it, and judge it."""
     known_mixing = _known_mixing(grid.calibration.mixing, grid.channels)
+    pairs = pictures.pairs()
+    judging = pictures.judging
+    fitted = pairs.select(slice(0, judging[0]))
 
     def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
         estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-        if judging[-1] == len(pairs) - 1:
-            # A slice copies no pictures.
-            fitted = pairs.select(slice(0, judging[0]))
-            estimator.learn(fitted.without(wrong))
-        else:
-            left_out = np.union1d(judging, wrong).astype(int)
-            estimator.learn(pairs.select(np.setdiff1d(np.arange(len(pairs)), left_out)))
+        estimator.learn(fitted.without([number for number in wrong if number < len(fitted)]))
         return estimator
 
     wrong, estimator = find_wrong_pictures(pairs, learn)
-    _refuse_several(wrong, names)
-    return _judged(estimator, pairs.select(np.setdiff1d(judging, wrong)), wrong)
+    _refuse_several(wrong, pictures.names)
+    judges_left = pairs.select(np.setdiff1d(judging, wrong))
+    return _judged(estimator, judges_left, [pictures.numbers[number] for number in wrong])
 
 
 def _refuse_several(wrong: Sequence[int], names: Sequence[str]) -> None:
@@ -344,38 +356,6 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
     if mixing is None:
         return np.eye(channels)
     return mixing
-
-
-def _photograph(grid: ScanGrid, shown: list[np.ndarray], log: PictureLog) -> Pairs:
-    """Pairs of all patterns and their pictures; white, which the calibration has, comes first.
-
-    Pictures of a scan are in units of the light that a channel answers to, those of pairs in that
-    of the camera.
-    """
-    light = grid.calibration.light.astype(np.float32)
-    frames = len(shown) + 1
-    shape = (frames, len(grid.seen), grid.channels)
-    photographs = scratch_array(shape, np.float32)
-    variance = scratch_array(shape, np.float32)
-    photographs[0] = grid.white.value.T * light
-    variance[0] = grid.white.variance.T * light**2
-    frame = 1
-    for start in range(0, len(shown), BATCH_SIZE):
-        for picture in log.take(shown[start : start + BATCH_SIZE]):
-            photographs[frame] = picture.value.T * light
-            noise = np.where(picture.known, picture.variance + grid.ambient, UNKNOWN)
-            variance[frame] = noise.T * light**2
-            frame += 1
-    lit = np.ones((frames, *grid.grid), np.uint8)
-    for number, pattern in enumerate(shown):
-        lit[number + 1] = pattern
-    return Pairs(
-        grid=grid.grid,
-        camera_grid=grid.grid,
-        patterns=np.broadcast_to(lit.reshape(frames, -1, 1), shape),
-        photographs=photographs,
-        variance=variance,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -91,6 +91,8 @@ class PlanReport(FolderReport):
     channels: Channels
     megapixels: Annotated[float | None, "Pixels of the camera in millions; null if not known."]
     pace: Annotated[float, "Seconds of computing for each photograph and megapixel, as measured."]
+    rounds: Annotated[int, "Rounds at most that a sketch takes beyond its plan, as asked for."]
+    photographs_of_round: Annotated[int, "Photographs of each of these rounds."]
     plans: Annotated[
         dict[str, StrategyPlan],
         "Plans by strategy, as `ltcl.acquisition.scanning.Plan`.",

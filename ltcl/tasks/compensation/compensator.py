@@ -86,7 +86,7 @@ class FrameError:
         ``||W (appearance - target)|| / ||W target||``; where the target is black, without the
         divisor.
     clipped : float
-        Share of the values of lit pixels that are at a bound.
+        Share of the values of lit pixels that would go beyond a bound.
     """
 
     error: float
@@ -109,9 +109,11 @@ class Compensator:
         Clamp the light to the bounds, and leave it at that.
     deadline_ms : float, optional
         Milliseconds after which no further projected step is begun, from the call on; without it
-        they go on until the error is the least there is up to `rtol`. The steps begin with the
-        pattern of the frame before, where that is nearer than the clamped one: the result is never
-        worse than the clamped pattern.
+        they go on until the error is the least there is up to `rtol`. The result is never worse
+        than the clamped pattern.
+    warm : bool
+        Begin the projected steps with the pattern of the frame before, where that is nearer than
+        the clamped one. False gives each frame the same pattern whatever came before.
     decode : "auto", "srgb" or "linear"
         What the codes of frames mean; "auto" takes whole numbers as sRGB and floats as linear
         light. Whole numbers have white at the largest code, floats at 1.
@@ -134,6 +136,8 @@ class Compensator:
     ----------
     gain : float
         That of the next frame.
+    rtol : float
+        Tolerance, as given, or what was chosen.
     statistics : FrameStatistics
 
     Raises
@@ -175,6 +179,7 @@ class Compensator:
         rtol: float | None = None,
         clamp: bool = False,
         deadline_ms: float | None = None,
+        warm: bool = True,
         decode: str = AUTO,
         encode: Any = SRGB,
         dtype: str = "uint8",
@@ -196,6 +201,7 @@ class Compensator:
         change = checks.number("gain_change", gain_change, least=1.0)
         self._frame_change = change ** (1.0 / checks.number("fps", fps, above=0.0))
         self._clamp = checks.flag("clamp", clamp)
+        self._is_warm = checks.flag("warm", warm)
         self.T = T
         self._options = {
             "bounds": bounds,
@@ -214,6 +220,7 @@ class Compensator:
         self.gain = 1.0
         # Checks all arguments, before anything is uploaded.
         request = self._request(3 if getattr(T, "channels", 3) == 3 else 1)
+        self.rtol = request.problem.settings.rtol
         if self.follows_gain and not T.is_square:
             raise InputError(
                 "gain is 'follow', but this T has no S, whose light it follows; give a number"
@@ -222,7 +229,8 @@ class Compensator:
         white = float(request.problem.limits.high)
         self._table = code_table(encode, dtype, 3 if T.channels == 3 else 1, white)
         self._prepared: dict[tuple[int, str], PreparedFrames] = {}
-        self._last: tuple[PreparedFrames, np.ndarray | Array, float] | None = None
+        # Of the last frame.
+        self._last: tuple[PreparedFrames, float] | None = None
         if not self.follows_gain:
             self.gain = self._find_gain(gain, film)
 
@@ -274,23 +282,31 @@ class Compensator:
         """What is prepared for frames of so many colours and one type; made at the first one."""
         key = (colours, dtype.name)
         if key not in self._prepared:
-            channels = 3 if self.T.channels == 3 else colours
-            table = self._table
-            if len(table.starts) != channels:
-                white = float(self._request(channels).problem.limits.high)
-                table = code_table(self._encode, self._dtype, channels, white)
-            self._prepared[key] = PreparedFrames(
-                self._request(channels),
-                frame_colours=colours,
-                frame_dtype=dtype,
-                decode=self._decode,
-                dtype=self._dtype,
-                table=table,
-                is_bounded=not self._clamp,
-                has_peaks=self.follows_gain,
-                slots=self._depth,
-            )
+            self._prepared[key] = self._prepare(colours, dtype)
         return self._prepared[key]
+
+    def _prepare(self, colours: int, dtype: np.dtype) -> PreparedFrames:
+        channels = 3 if self.T.channels == 3 else colours
+        for known in self._prepared.values():
+            if known.colours == channels:
+                return known.for_codes(colours, dtype, self._decode)
+        table = self._table
+        request = self._request(channels)
+        if len(table.starts) != channels:
+            white = float(request.problem.limits.high)
+            table = code_table(self._encode, self._dtype, channels, white)
+        return PreparedFrames(
+            request,
+            frame_colours=colours,
+            frame_dtype=dtype,
+            decode=self._decode,
+            dtype=self._dtype,
+            table=table,
+            is_bounded=not self._clamp,
+            is_warm=self._is_warm,
+            has_peaks=self.follows_gain,
+            slots=self._depth,
+        )
 
     # Frames.
 
@@ -355,7 +371,7 @@ class Compensator:
         slot = prepared.slots[self._turn % self._depth]
         self._turn += 1
         prepared.begin(slot, codes, self.gain)
-        self._last = (prepared, codes, self.gain)
+        self._last = (prepared, self.gain)
         return prepared, slot
 
     def _codes_of(self, frame: Any) -> np.ndarray | Array:
@@ -417,7 +433,7 @@ class Compensator:
         self.gain = wanted
         codes = self._codes_of(frame)
         prepared.begin(slot, codes, self.gain)
-        self._last = (prepared, codes, self.gain)
+        self._last = (prepared, self.gain)
 
     def _follow(self, slot: Slot) -> None:
         """Bring the gain of frames to come nearer to what this one allows."""
@@ -441,7 +457,7 @@ class Compensator:
         products = 0
         if prepared.direct_steps is not None:
             products = prepared.direct_steps.products
-        last_gain = self.gain if self._last is None else self._last[2]
+        last_gain = self.gain if self._last is None else self._last[1]
         return FrameStatistics(
             frames=self._frames,
             dropped=self._dropped,
@@ -450,6 +466,19 @@ class Compensator:
             gain=last_gain,
             products=products,
         )
+
+    def light(self) -> np.ndarray:
+        """The projector light of the last frame, (h, w) or (h, w, 3) float32.
+
+        InputError before the first frame.
+        """
+        with self._lock:
+            if self._last is None:
+                raise InputError("no frame was given yet, whose light could be told")
+            prepared = self._last[0]
+            light = prepared.light()
+        h, w = self.T.grid
+        return light.reshape((h, w, 3) if prepared.colours == 3 else (h, w))
 
     def judge(self) -> FrameError:
         """The error and the clipped share of the last frame, by a product with T.
@@ -461,36 +490,8 @@ class Compensator:
                 future.result()
             if self._last is None:
                 raise InputError("no frame was given yet, which could be judged")
-            prepared, codes, gain = self._last
-            if isinstance(codes, Array):
-                codes = codes.get()
-            colours = 3 if self.T.channels == 3 or codes.ndim == 3 else 1
-            request = self._request(colours)
-            light = prepared.light()
-        h, w = self.T.grid
-        pattern = light.reshape((h, w, 3) if colours == 3 else (h, w))
-        linear = codes
-        if codes.dtype.kind != "f":
-            linear = light_of_codes(self._decode, codes.dtype)[codes]
-        target = gain * np.broadcast_to(
-            linear.reshape(*linear.shape[:2], -1), (*self.T.camera_grid, colours)
-        )
-        appearance = (self.T @ pattern).reshape(target.shape)
-        background = request.shape.pack(request.problem.background, self.T.camera_grid)
-        missing = target - appearance - background.reshape(target.shape)
-        weights = np.ones_like(missing)
-        if request.problem.weights is not None:
-            packed = request.shape.pack(request.problem.weights, self.T.camera_grid)
-            weights = packed.reshape(target.shape)
-        size = float(np.linalg.norm(weights * target)) or 1.0 / request.problem.weight_unit
-        limits = request.problem.limits
-        is_lit = ~self.T.masked
-        values = light[is_lit]
-        is_at_bound = (values <= limits.low) | (values >= limits.high)
-        return FrameError(
-            error=float(np.linalg.norm(weights * missing)) / size,
-            clipped=float(np.mean(is_at_bound)),
-        )
+            error, clipped = self._last[0].judge()
+        return FrameError(error=error, clipped=clipped)
 
     def close(self) -> None:
         """Wait for the frames on their way, and end the thread that waits for the device."""

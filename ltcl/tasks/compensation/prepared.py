@@ -9,6 +9,7 @@ three colours are one vector, channel below channel, and one system.
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Sequence
@@ -20,8 +21,9 @@ import numpy as np
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import InputError
-from ltcl.operators import IdentityPlus, Operator, block_diagonal
+from ltcl.operators import Dense, IdentityPlus, Operator, block_diagonal
 from ltcl.operators.epilogue import Epilogue
+from ltcl.solvers.auto import SMALL
 from ltcl.solvers.bounded import Descent, Search
 from ltcl.solvers.chebyshev import chebyshev_steps
 from ltcl.solvers.survey import survey
@@ -38,6 +40,8 @@ STRIP_PIXELS = 256
 PROBE_SHARE = 0.5
 # Steps beyond which fixed steps are given up.
 MAX_FIXED_STEPS = 60
+# Products of the norms of S and S^-1 up to which float32 holds an inverse of a small system.
+MAX_CONDITION = 1e5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +84,22 @@ class ByInverse:
 
     def __init__(self, inverse: Operator, target: Array, direct: Array) -> None:
         self.queue = inverse.bind(target, direct)
+
+
+def _dense_inverses(systems: Sequence[Operator]) -> list[Dense] | None:
+    """S^-1 of small systems, by a factorization in float64; None if one is singular."""
+    inverses = []
+    for S in systems:
+        matrix, _ = S.matrix_float64()
+        try:
+            inverse = np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:
+            return None
+        size = float(np.linalg.norm(inverse)) * float(np.linalg.norm(matrix))
+        if not size < MAX_CONDITION:
+            return None
+        inverses.append(Dense(S.device, inverse))
+    return inverses
 
 
 class ByFixedSteps:
@@ -173,31 +193,38 @@ class WithinBounds:
         The clamped light of this frame, as unknowns, which the caller writes.
     x, target : Array
         The result, and the light to add.
-    errors, norms : (k,)
-        Of the last frame: ||w (A x - b)|| and ||w b||.
+    errors : (k,), optional
+        ||w (A x - b)|| of the last frame, if steps were taken.
+    steps : int
+        Of the last frame.
     """
 
     def __init__(
-        self, A: Operator, columns: int, weights: np.ndarray | None, box: Any, rtol: float
+        self,
+        A: Operator,
+        columns: int,
+        weights: np.ndarray | None,
+        box: Any,
+        rtol: float,
+        is_warm: bool,
     ) -> None:
         self.descent = Descent(A, columns, weights, box)
+        self._lower, self._upper = (bound[:, None] for bound in box)
         self.target = self.descent.b
         self.x = self.descent.x
         self.start = self.x.like()
         self._last = self.x.like()
+        self._is_warm = is_warm
         self._has_last = False
         self._rtol = rtol
-        self.errors = np.zeros(columns)
+        self.errors: np.ndarray | None = None
         self.steps = 0
-
-    @property
-    def norms(self) -> np.ndarray:
-        """Norms of w b, (k,)."""
-        return self.descent.norms
 
     def keep_start(self) -> None:
         """Take the clamped light as it is, where that is the best there is."""
         self.x.copy_from(self.start)
+        self.errors = None
+        self.steps = 0
         self._keep()
 
     def solve(self, deadline: float) -> None:
@@ -225,8 +252,15 @@ class WithinBounds:
         self._keep()
 
     def _keep(self) -> None:
-        self._last.copy_from(self.x)
-        self._has_last = True
+        if self._is_warm:
+            self._last.copy_from(self.x)
+            self._has_last = True
+
+    def saturated(self) -> int:
+        """The number of values at a bound, beyond which a step would go."""
+        x = self.x.get()
+        is_at_bound = (x <= self._lower) | (x >= self._upper)
+        return int(np.count_nonzero(self.descent.saturated(x) & is_at_bound))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -257,8 +291,9 @@ class PreparedFrames:
         Types of the codes of frames and of the projector.
     decode : str
     table : CodeTable
-    is_bounded : bool
-        Whether projected steps follow where light is beyond the bounds.
+    is_bounded, is_warm : bool
+        Whether projected steps follow where light is beyond the bounds, and whether they may begin
+        with the light of the frame before.
     has_peaks : bool
         Whether the brightest light of each strip of pixels is wanted.
     slots : int
@@ -275,6 +310,7 @@ class PreparedFrames:
         dtype: str,
         table: CodeTable,
         is_bounded: bool,
+        is_warm: bool,
         has_peaks: bool,
         slots: int,
     ) -> None:
@@ -296,8 +332,18 @@ class PreparedFrames:
         self.camera_grid = T.camera_grid
         self.unit = self._find_unit()
         self._device_tables(decode)
+        self._is_warm = is_warm
         self._make_steps(is_bounded, has_peaks)
         self.slots = [self._slot() for _ in range(slots)]
+
+    def for_codes(self, frame_colours: int, frame_dtype: Any, decode: str) -> PreparedFrames:
+        """The same for frames of other codes, which share all buffers but those of the codes."""
+        other = copy.copy(self)
+        other.frame_colours = frame_colours
+        other.frame_dtype = np.dtype(frame_dtype)
+        other._set_light_table(decode)
+        other.slots = [other._slot() for _ in self.slots]
+        return other
 
     # Preparation.
 
@@ -315,8 +361,7 @@ class PreparedFrames:
         """Upload the tables of codes and the factors of light."""
         request = self._request
         device = self.device
-        self._light_table = device.upload(light_of_codes(decode, self.frame_dtype))
-        self._has_table = self.frame_dtype.kind != "f"
+        self._set_light_table(decode)
         background = self.seen.from_channels(request.problem.background)
         self._subtracts = float(request.problem.has_background)
         self._background_host = background
@@ -328,6 +373,10 @@ class PreparedFrames:
         if request.T.mixing is not None:
             mixing = np.linalg.inv(request.T.mixing)
         self._mixing = device.upload(mixing)
+
+    def _set_light_table(self, decode: str) -> None:
+        self._light_table = self.device.upload(light_of_codes(decode, self.frame_dtype))
+        self._has_table = self.frame_dtype.kind != "f"
 
     def _factors(self) -> np.ndarray:
         """Projector light per direct light, of each pixel and channel; 0 at masked ones."""
@@ -362,9 +411,11 @@ class PreparedFrames:
             self.direct_steps = self._direct_steps()
         self._exceeded = device.upload(np.zeros(1), np.int32)
         self._no_excess = np.zeros(1, np.int32)
-        self._make_final(is_bounded)
-        if is_bounded and self.direct_steps is not None:
-            self._clip = self._bind_clip()
+        self._unknown_scales = device.upload(self._scales())
+        self._judge: WithinBounds | None = self.bounded
+        self._make_final()
+        if self.bounded is not None and self.direct_steps is not None:
+            self._clip = self._bind_clip(self.bounded)
         strips = -(-self.shown.pixels // STRIP_PIXELS)
         self._peaks = device.empty(strips)
         self._find_peaks: Launch | None = None
@@ -381,7 +432,8 @@ class PreparedFrames:
         if problem.weights is not None:
             weights = self.seen.from_channels(problem.weights)
         columns = self.seen.shape[1]
-        return WithinBounds(A, columns, weights, (lower, upper), problem.settings.rtol)
+        rtol = problem.settings.rtol
+        return WithinBounds(A, columns, weights, (lower, upper), rtol, self._is_warm)
 
     def _direct_steps(self) -> ByInverse | ByFixedSteps | None:
         """The way from light to add to direct light; None if steps do not converge."""
@@ -389,6 +441,10 @@ class PreparedFrames:
         if request.inverse is not None:
             inverse = block_diagonal(request.inverse.systems)
             return ByInverse(inverse, self.target, self.direct)
+        if request.T.shape[0] <= SMALL:
+            inverses = _dense_inverses(request.T.systems)
+            if inverses is not None:
+                return ByInverse(block_diagonal(inverses), self.target, self.direct)
         S = block_diagonal(request.T.systems)
         assert isinstance(S, IdentityPlus)  # noqa: S101 - as all systems are
         rtol = request.problem.settings.rtol
@@ -422,21 +478,19 @@ class PreparedFrames:
             "direct": direct,
         }
 
-    def _make_final(self, is_bounded: bool) -> None:
+    def _make_final(self) -> None:
         """Choose the light that becomes codes: direct light, or the unknowns within the bounds."""
-        if not is_bounded or self.bounded is None:
+        if self.bounded is None:
             self._final = self._light_arguments(self._direct_factors, self.direct)
             self._is_final_mixed = self._is_mixed
             return
         scales = self._scales()
         inverses = np.divide(1.0, scales, out=np.zeros_like(scales), where=scales > 0.0)
-        self._unknown_scales = self.device.upload(scales)
         factors = self.device.upload(inverses)
         self._final = self._light_arguments(factors, self.bounded.x)
         self._is_final_mixed = False
 
-    def _bind_clip(self) -> Launch:
-        assert self.bounded is not None  # noqa: S101 - only then is it called
+    def _bind_clip(self, bounded: WithinBounds) -> Launch:
         limits = self._request.problem.limits
         kernel = self._kernel("clip", "float32", self.shown, MIXED=int(self._is_mixed))
         return self._bind(
@@ -444,7 +498,7 @@ class PreparedFrames:
             self.shown,
             slack=BOUNDS_SLACK * (limits.high - limits.low),
             scales=self._unknown_scales,
-            x=self.bounded.start,
+            x=bounded.start,
             exceeded=self._exceeded,
             **self._light_arguments(self._direct_factors, self.direct),
         )
@@ -566,12 +620,49 @@ class PreparedFrames:
             vectors.fill(bounded.start, 0.0)
             bounded.solve(deadline)
             return
-        self._exceeded.set(self._no_excess)
-        self._clip()
-        if self._exceeded.get()[0]:
+        if self._count_exceeded():
             bounded.solve(deadline)
         else:
             bounded.keep_start()
+
+    def _count_exceeded(self) -> int:
+        """Clip the light to the bounds, and count what was beyond; waits."""
+        self._exceeded.set(self._no_excess)
+        self._clip()
+        return int(self._exceeded.get()[0])
+
+    def judge(self) -> tuple[float, float]:
+        """The relative error and the clipped share of the last frame, by one product; waits."""
+        if self._judge is None:
+            self._judge = self._bounded_steps()
+            self._clip = self._bind_clip(self._judge)
+        judge = self._judge
+        clipped = 0
+        if self.bounded is None:
+            judge.target.copy_from(self.target)
+            clipped = self._count_exceeded()
+            judge.keep_start()
+        elif judge.errors is not None:
+            clipped = judge.saturated()
+        errors = judge.errors
+        if errors is None:
+            errors = judge.descent.measure()
+        size = self._size_of_target(judge)
+        lit_values = self.colours * np.count_nonzero(~self._request.T.masked)
+        error = float(np.linalg.norm(errors))
+        if size > 0.0:
+            error /= size
+        else:
+            # Errors of a black target are not relative.
+            error *= self.unit * self._request.problem.weight_unit
+        return error, clipped / lit_values
+
+    def _size_of_target(self, judge: WithinBounds) -> float:
+        """||w gain desired|| of the last frame, in units of light."""
+        target = judge.target
+        if self._subtracts:
+            target = vectors.axpby(1.0, target, 1.0, self._background, target.like())
+        return float(np.linalg.norm(judge.descent.norm_of(target)))
 
     def end(self, slot: Slot) -> None:
         """Queue the codes and their download."""

@@ -33,11 +33,14 @@ SOLVE_RTOL = 1e-3
 AMBIENT_SOLVE_RTOL = 1e-2
 
 
-def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
+def negative_bounce(
+    S: IdentityPlus, grid: tuple[int, int], allowed: np.ndarray | float = 0.0
+) -> float:
     """Share of light that one bounce between parts of the picture takes away.
 
     In [0, 1], and 0 in a Lambertian scene; NaN if no method solves with S. A few products with 16
-    right-hand sides.
+    right-hand sides. `allowed` is the mean light between parts, (parts, parts), up to which noise
+    explains what is negative.
 
     Examples
     --------
@@ -56,7 +59,7 @@ def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
     light = np.nansum(np.abs(between))
     if light == 0.0:
         return 0.0
-    return float(np.nansum(np.maximum(-between, 0.0)) / light)
+    return float(np.nansum(np.maximum(-between - allowed, 0.0)) / light)
 
 
 def between_parts(

@@ -12,7 +12,8 @@ compared with its transpose:
     N = D^-1/2 R D^1/2,    defect = ||N - N^T||_F / (sqrt(2) ||N||_F), diagonals left out
 
 The defect is 0 for a reciprocal T, about e if every entry has independent relative noise e, and 1
-if light goes one way only. A view-dependent (glossy) surface breaks reciprocity, as does a camera
+if light goes one way only. Noise of known variances is subtracted: ||N - N^T||^2 is expected to be
+twice their sum. A view-dependent (glossy) surface breaks reciprocity, as does a camera
 off the projector's pixels: only for one projector and one camera at one place is the theory exact
 (section 8.4).
 
@@ -22,6 +23,8 @@ with N_ij^2 = R_ij R_ji, a graph Laplacian solved by conjugate gradients.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -29,6 +32,9 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from ltcl import checks
+
+# Variances of entries of T, (n,), by their rows, columns and light.
+EntryVariance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 # Entries to compare at most, in `analyze` and in passing.
 ALL_ENTRIES = 1 << 22
@@ -43,7 +49,12 @@ MAX_LOG_SCALE = 60.0
 
 
 def reciprocity_defect(
-    T: Any, F: np.ndarray, *, entries: int = ALL_ENTRIES, seed: int = 0
+    T: Any,
+    F: np.ndarray,
+    *,
+    entries: int = ALL_ENTRIES,
+    seed: int = 0,
+    variance: EntryVariance | None = None,
 ) -> float:
     """The defect of T, (N, N), as this module defines it; NaN if T does not show its entries.
 
@@ -57,6 +68,8 @@ def reciprocity_defect(
     entries, seed : int
         Size of a random sample and its seed. If T has more `entries`, only the pixels of a sample
         count that has about so many: any part of a reciprocal T is reciprocal.
+    variance : function of rows, columns and light, optional
+        Variances of entries of T by noise; the defect is what is left beyond theirs.
 
     Examples
     --------
@@ -83,12 +96,25 @@ def reciprocity_defect(
     else:
         return float("nan")
     R = _indirect(light, F[pixels])
+    largest = np.abs(R.data).max(initial=0.0)
+    if largest == 0.0:
+        return 0.0
+    R = R / largest
     root = np.exp(_log_scale(R) / 2)
     N = scipy.sparse.diags_array(1 / root) @ R @ scipy.sparse.diags_array(root)
     norm = scipy.sparse.linalg.norm(N)
     if not norm > 0:
         return 0.0
-    return float(scipy.sparse.linalg.norm(N - N.T) / (np.sqrt(2) * norm))
+    defect = float(scipy.sparse.linalg.norm(N - N.T) / (np.sqrt(2) * norm))
+    if variance is None:
+        return defect
+    entries_of_T = scipy.sparse.coo_array(light)
+    i, j = entries_of_T.coords
+    # From variances of T to those of N.
+    factor = root[j] / root[i] / F[pixels][j] / largest
+    noise = factor**2 * variance(pixels[i], pixels[j], entries_of_T.data)
+    noise_power = float(noise[i != j].sum())
+    return math.sqrt(max(defect**2 - noise_power / norm**2, 0.0))
 
 
 def _sample(pixels: np.ndarray, count: int, n: int, entries: int, seed: int) -> np.ndarray:
@@ -101,13 +127,9 @@ def _sample(pixels: np.ndarray, count: int, n: int, entries: int, seed: int) -> 
 
 
 def _indirect(T: Any, F: np.ndarray) -> Any:
-    """R without its diagonal, csr_array float64, largest entry 1."""
+    """R without its diagonal, csr_array float64."""
     R = scipy.sparse.csr_array(T) @ scipy.sparse.diags_array(1.0 / F)
-    R = scipy.sparse.csr_array(R - scipy.sparse.diags_array(R.diagonal()))
-    largest = np.abs(R.data).max(initial=0.0)
-    if largest == 0.0:
-        return R
-    return R / largest
+    return scipy.sparse.csr_array(R - scipy.sparse.diags_array(R.diagonal()))
 
 
 def _log_scale(R: Any) -> np.ndarray:

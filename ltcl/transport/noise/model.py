@@ -194,6 +194,13 @@ class Noise:
             np.einsum("ii->i", variance)[:] *= self.direct[channel]
         return variance
 
+    def entry_variance(
+        self, channel: int, i: np.ndarray, j: np.ndarray, light: np.ndarray
+    ) -> np.ndarray:
+        """Variance of entries of a channel off the diagonal, by rows, columns and light, (n,)."""
+        variance = self.photons[channel] * np.maximum(light, 0.0) + self.floor[channel] ** 2
+        return self.rows[channel][i] * self.columns[channel][j] * variance
+
     def diagonal(self, F: Any) -> np.ndarray:
         """Standard deviation (channels, N) of the diagonal F, (channels, N) or (N,)."""
         light = self._light_variance(F)
