@@ -28,6 +28,8 @@ from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.bounded import minimise
 
 WAIT = "wait"
+# A copy that is queued.
+COPY = "copy"
 # Iterations of a solve that is counted.
 STEPS = 16
 
@@ -54,14 +56,14 @@ TARGETS = {
 
 
 class Traffic:
-    """Calls to a device in their order: names of kernels, or WAIT, with bytes over the bus."""
+    """Calls to a device in their order: kernels, WAIT or COPY, with bytes over the bus."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, int]] = []
 
     @property
     def names(self) -> list[str]:
-        """Names of kernels, or WAIT."""
+        """Names of kernels, WAIT or COPY."""
         return [name for name, _ in self.events]
 
     @property
@@ -81,6 +83,7 @@ def record_traffic() -> Iterator[Traffic]:
     traffic = Traffic()
     launch = Device.launch
     copy = Device.copy
+    queue_copy = Device.queue_copy
     finish = Device.finish
 
     def recorded_launch(self: Device, name: str, *rest: Any) -> None:
@@ -93,12 +96,22 @@ def record_traffic() -> Iterator[Traffic]:
                 traffic.events.append((WAIT, array.nbytes))
         copy(self, to, source, **sizes)
 
+    def recorded_queue_copy(self: Device, to: Any, source: Any) -> Any:
+        for array in (to, source):
+            if isinstance(array, np.ndarray):
+                traffic.events.append((COPY, array.nbytes))
+        return queue_copy(self, to, source)
+
     def recorded_finish(self: Device) -> None:
         traffic.events.append((WAIT, 0))
         finish(self)
 
     with mock.patch.multiple(
-        Device, launch=recorded_launch, copy=recorded_copy, finish=recorded_finish
+        Device,
+        launch=recorded_launch,
+        copy=recorded_copy,
+        queue_copy=recorded_queue_copy,
+        finish=recorded_finish,
     ):
         yield traffic
 

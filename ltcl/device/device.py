@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,6 +47,8 @@ class Session:
         # Plans of ltcl.device.vectors, by kernel and size.
         self.reductions: dict[tuple, Any] = {}
         self.lock = threading.RLock()
+        # Held while a program is built, for as long as a compiler takes.
+        self.building = threading.RLock()
 
 
 class Device:
@@ -112,16 +115,26 @@ class Device:
 
     def kernel(self, file: str, name: str, **defines: Any) -> Kernel:
         """Kernel `name` of `kernels/<file>.cl` with `defines`; built at the first call only."""
-        driver_errors.refuse_forked()
-        key = (file, *sorted(defines.items()))
-        programs = self.session.programs
+        program, kernels = self.program(file, defines)
         with self.session.lock:
-            if key not in programs:
-                programs[key] = sources.build(self, file, defines), {}
-            program, kernels = programs[key]
             if name not in kernels:
                 kernels[name] = Kernel(self, program, name)
             return kernels[name]
+
+    def program(self, file: str, defines: Mapping[str, Any]) -> tuple[Any, dict[str, Kernel]]:
+        """Program of `kernels/<file>.cl` and its kernels by name; built at the first call only."""
+        driver_errors.refuse_forked()
+        key = (file, *sorted(defines.items()))
+        programs = self.session.programs
+        if key not in programs:
+            with self.session.building:
+                if key not in programs:
+                    programs[key] = sources.build(self, file, defines), {}
+        return programs[key]
+
+    def has_program(self, file: str, defines: Mapping[str, Any]) -> bool:
+        """True if a program is built."""
+        return (file, *sorted(defines.items())) in self.session.programs
 
     def launch(
         self, name: str, handle: Any, items: tuple[int, ...], group: tuple[int, ...]

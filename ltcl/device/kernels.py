@@ -200,6 +200,26 @@ class Launch:
         self._size = tuple(-(-n // g) * g for n, g in zip(size, self._group, strict=True))
         self._has_items = 0 not in self._size
 
+    @property
+    def name(self) -> str:
+        """Name of its kernel."""
+        return self._name
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Work-items in each dimension, in whole work-groups."""
+        return self._size
+
+    @property
+    def items(self) -> int:
+        """Number of work-items."""
+        return math.prod(self._size)
+
+    @property
+    def groups(self) -> int:
+        """Number of work-groups."""
+        return self.items // math.prod(self._group)
+
     def __del__(self) -> None:
         if hasattr(self, "_handle"):
             self._kernel.idle.append(self._handle)

@@ -241,7 +241,7 @@ def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
         gain = exact_gain(slopes, shifts, problem.limits)
     is_on_target = gain is not None and _has_undone_light(solutions)
     if gain is None:
-        gain, light = gain_within_loss(problem, request.loss)
+        gain, light = gain_within_loss(problem, request.loss, (slopes, shifts))
     else:
         light = subtract(multiply(gain, slopes), shifts)
     return StartingLight(
