@@ -150,6 +150,14 @@ class Planes(Basis):
         W of one picture.
     count : int
         Number of pictures.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Planes, Wavelet
+    >>> W = Planes(Wavelet(ltcl.open_device(), (1, 2), "haar"), 2)
+    >>> print((W @ numpy.array([1.0, 1.0, 3.0, 3.0])).round(3) + 0)
+    [1.414 0.    4.243 0.   ]
     """
 
     def __init__(self, of: Basis, count: int) -> None:
@@ -310,7 +318,9 @@ def _bind_copies(
     part = block.device.empty((width, *x.shape[1:]))
     product = block.device.empty((height, *x.shape[1:]))
     a, b, y, c = epilogue
-    bound = block._bind_product(part, product, Epilogue(a, b, product, c), transpose)
+    # What is not added must not be read: it may be no number.
+    added = product if b else None
+    bound = block._bind_product(part, product, Epilogue(a, b, added, c), transpose)
 
     def multiply() -> None:
         x.copy_rows(place.of_x, part)

@@ -581,6 +581,7 @@ class PreparedFrames:
             MIXED=int(self._is_final_mixed),
             STEPS=table.steps,
             BETWEEN=int(table.is_between),
+            ROUNDED=int(dtype != "float32"),
         )
         return self._bind(
             kernel,
@@ -589,6 +590,7 @@ class PreparedFrames:
             cells=table.starts.shape[1],
             cells_per_light=table.cells_per_light,
             first_light=table.first_light,
+            code_step=table.code_step,
             starts=self._starts,
             thresholds=self._thresholds,
             codes=codes,
