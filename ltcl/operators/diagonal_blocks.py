@@ -294,7 +294,7 @@ def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
 
 
 def _join_csr(blocks: Sequence[Operator]) -> Operator | None:
-    """One matrix in compressed sparse rows, where it is small."""
+    """Join matrices in compressed sparse rows, where they are small."""
     if any(type(block) is not CSR for block in blocks) or _are_large(blocks):
         return None
     matrices: list[Any] = []
@@ -306,7 +306,7 @@ def _join_csr(blocks: Sequence[Operator]) -> Operator | None:
 
 
 def _join_tiles(blocks: Sequence[Operator]) -> Operator | None:
-    """One matrix of tiles, where it is small."""
+    """Join matrices of tiles, where they are small."""
     packed: list[Packed] = [block.packed for block in blocks if isinstance(block, Tiles)]
     if len(packed) != len(blocks) or _are_large(blocks):
         return None
