@@ -104,14 +104,15 @@ def write_record(path: Path, compilers: dict[str, str], entries: Iterable[Entry]
 def add_programs(entries: list[Entry], file: Path) -> None:
     """Add the programs that a run of tests has written down.
 
-    Those for GPUs are added for each number of right-hand sides: whoever asks for 15 of them gets
-    launches of 8, 4 and 3, so every K can be.
+    Those for GPUs are added for each number of right-hand sides, but for several rows a group: who
+    asks for 15 of them gets launches of 8, 4 and 3, so every K can be.
     """
     known = {entry.program: entry for entry in entries}
     for plain in json.loads(file.read_text(encoding="utf-8")):
         defines = plain["defines"]
         sides = [defines.get("K")]
-        if plain["shape"] == "gpu" and sides[0] in SIDES and plain["file"] != "walk":
+        is_default = plain["file"] != "walk" and "ROWS" not in defines
+        if plain["shape"] == "gpu" and sides[0] in SIDES and is_default:
             sides = list(SIDES)
         for k in sides:
             if k is not None:
