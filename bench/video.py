@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Video: frames a second from decoded sRGB codes to the codes of the projector, in colour.
+"""Video: frames a second from decoded sRGB codes to the codes of the projector.
 
 T has 256 x 512 pixels and is as `ltcl.compress` makes it of a smooth scene: db2 wavelets on both
 sides, with a core of some thousand coarse coefficients, ten numbers a row. Frames drift slowly and
-are compensated one by one, and by eights as `ltcl.batch.compensate_frames` does, which is timed
-with its pictures on disk.
+go through an `ltcl.Compensator`, with a kept inverse or with solves, one by one and pipelined, in
+colour and in grey; beside it by `ltcl.compensate`, one by one and by eights. The host's thread is
+timed while it queues. Films on disk go through `ltcl.batch.compensate_frames`, beside what reading
+and writing the same files alone takes on two threads.
+
+A T of 1080 x 1920 pixels in colour is as a sketch makes it: a direct part, and a smooth one that
+bounces between cells of 8 x 8 pixels (`sketch_large.py` tells its error).
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,7 +29,8 @@ import ltcl
 from _harness import Options, Row, parse_options, report, seconds
 from ltcl import Transport
 from ltcl.images import from_srgb, to_srgb
-from ltcl.operators import Compressed, Wavelet
+from ltcl.images.frames import open_frames, write_video
+from ltcl.operators import Compressed, IdentityPlus, ScaledColumns, Wavelet
 from ltcl.scenes import landscape
 
 ALBEDO = (0.4, 0.3, 0.2)
@@ -30,9 +38,8 @@ ALBEDO = (0.4, 0.3, 0.2)
 ROW_NUMBERS = 10
 RTOL = 1e-2
 BATCH = 8
-# Frames a second with solves, and with a kept inverse.
-SOLVE_TARGET = 60.0
-INVERSE_TARGET = 120.0
+# Frames of a measurement, one by one, and of a pipeline.
+FRAMES = 200
 # Light of each code, and the code of each of LIGHT_STEPS + 1 levels of light between 0 and 1.
 TO_LINEAR = from_srgb(np.arange(256, dtype=np.float32) / 255)
 LIGHT_STEPS = 4095
@@ -77,6 +84,11 @@ def symmetric_core(grid: tuple[int, int], coarse: tuple[int, int]) -> Any:
     return core
 
 
+def one_channel(T: Transport) -> Transport:
+    """The first channel of T, as a grey T."""
+    return Transport(T.matrices[0], T.grid, first_bounce=np.atleast_2d(T.first_bounce)[0])
+
+
 def film(T: Transport, frames: int) -> np.ndarray:
     """A landscape that drifts, in codes, (frames, h, w, 3) uint8, within the projector's reach."""
     h, w = T.grid
@@ -87,64 +99,223 @@ def film(T: Transport, frames: int) -> np.ndarray:
 
 
 def projector_codes(T: Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
-    """The projector's codes under which the scene looks like these."""
+    """The projector's codes under which the scene looks like these, by `compensate`."""
     rules = {"rtol": RTOL, "clamp": True, **settings}
     compensation = ltcl.compensate(T, TO_LINEAR[codes], **rules)
     levels = (LIGHT_STEPS * compensation.pattern + 0.5).astype(np.int16)
     return TO_CODES[levels]
 
 
-def measure(
+# Prepared frames.
+
+
+def cycle(frames: np.ndarray, count: int) -> Iterator[np.ndarray]:
+    for number in range(count):
+        yield frames[number % len(frames)]
+
+
+def one_by_one(T: Transport, frames: np.ndarray, count: int, **settings: Any) -> dict[str, float]:
+    """Frames a second, the 99th percentile in seconds, and what the host's thread takes."""
+    with ltcl.Compensator(T, rtol=RTOL, clamp=True, **settings) as compensator:
+        for codes in cycle(frames, 10):
+            compensator(codes)
+        latencies = []
+        for codes in cycle(frames, count):
+            start = time.perf_counter()
+            compensator(codes)
+            latencies.append(time.perf_counter() - start)
+        host = host_seconds(compensator, frames, count)
+    return {
+        "rate": 1.0 / float(np.median(latencies)),
+        "p99": float(np.quantile(latencies, 0.99)),
+        "host": host,
+    }
+
+
+def host_seconds(compensator: ltcl.Compensator, frames: np.ndarray, count: int) -> float:
+    """What the thread that submits a frame takes of the processor, the median."""
+    spent = []
+    for codes in cycle(frames, count):
+        start = time.thread_time()
+        future = compensator.submit(codes)
+        spent.append(time.thread_time() - start)
+        future.result()
+    return float(np.median(spent))
+
+
+def pipelined(T: Transport, frames: np.ndarray, count: int, **settings: Any) -> float:
+    """Frames a second, where the next ones are submitted before one has come."""
+    with ltcl.Compensator(T, rtol=RTOL, clamp=True, **settings) as compensator:
+        for codes in cycle(frames, 10):
+            compensator(codes)
+        start = time.perf_counter()
+        futures = [compensator.submit(codes) for codes in cycle(frames, count)]
+        for future in futures:
+            future.result()
+        return count / (time.perf_counter() - start)
+
+
+def prepared_rows(
     options: Options, T: Transport, inverse: ltcl.Inverse, frames: np.ndarray
-) -> dict[str, float]:
-    """Seconds of BATCH frames, in all ways."""
+) -> list[Row]:
+    """Rates of prepared frames against what is asked."""
+    count = 8 if options.smoke else FRAMES
+    grey_T = one_channel(T)
+    grey_inverse = ltcl.invert(grey_T, RTOL)
+    grey = np.ascontiguousarray(frames[..., 0])
+    kinds = [
+        ("colour, kept inverse", T, frames, {"inverse": inverse}, 240.0, 300.0),
+        ("colour, solves", T, frames, {}, 120.0, 150.0),
+        ("grey, kept inverse", grey_T, grey, {"inverse": grey_inverse}, 600.0, 600.0),
+    ]
+    rows = []
+    for name, kind_T, kind_frames, settings, asked, asked_pipelined in kinds:
+        times = one_by_one(kind_T, kind_frames, count, **settings)
+        rate = pipelined(kind_T, kind_frames, count, **settings)
+        rows.append(rate_row(f"{name}: one by one", times["rate"], asked))
+        rows.append(rate_row(f"{name}: pipelined", rate, asked_pipelined))
+        rows.append(time_row(f"{name}: 99 % of frames within", times["p99"], 6e-3))
+        rows.append(time_row(f"{name}: the host's thread", times["host"], 1e-3))
+    return rows
 
-    def run_each(**settings: Any) -> None:
-        for codes in frames:
-            projector_codes(T, codes, **settings)
 
-    def run_files(folder: Path, **settings: Any) -> None:
-        rules: Any = {"batch": BATCH, "rtol": RTOL, "clamp": True, **settings}
-        with tempfile.TemporaryDirectory() as out:
-            ltcl.batch.compensate_frames(T, folder, out, **rules)
+def rate_row(name: str, rate: float, asked: float) -> Row:
+    return Row(name, f"{asked:g} frames/s", asked, rate, "frames/s", rate / asked, 1.0)
 
+
+def time_row(name: str, spent: float, asked: float) -> Row:
+    return Row.from_times(name, f"{1e3 * asked:g} ms", 1e3 * asked, 1e3 * spent, "ms", 1.0)
+
+
+# By `compensate`.
+
+
+def compensate_rows(
+    options: Options, T: Transport, inverse: ltcl.Inverse, frames: np.ndarray
+) -> list[Row]:
+    """A solve and a compensation of one frame, and eight frames at a time."""
+    light = TO_LINEAR[frames[0]]
+    sides = [light[..., channel].ravel() for channel in range(3)]
+    actions: dict[str, Callable[[], object]] = {
+        "solve": lambda: ltcl.solvers.solve_each(T.systems, sides, rtol=RTOL),
+        "compensate": lambda: ltcl.compensate(T, light, rtol=RTOL, clamp=True),
+        "solves": lambda: projector_codes(T, frames),
+        "inverse": lambda: projector_codes(T, frames, inverse=inverse),
+    }
+    times = seconds(actions, 1 if options.smoke else 7)
+    return [
+        time_row("131 072 pixels in colour, 1 %: solve", times["solve"], 5e-3),
+        time_row("131 072 pixels in colour, 1 %: compensate", times["compensate"], 10e-3),
+        fact_row("compensate, 8 frames at once, solves", len(frames) / times["solves"]),
+        fact_row("compensate, 8 frames at once, kept inverse", len(frames) / times["inverse"]),
+    ]
+
+
+def fact_row(name: str, rate: float) -> Row:
+    return Row(name, "", rate, rate, "frames/s", 1.0)
+
+
+# Films.
+
+
+def film_rows(
+    options: Options, T: Transport, inverse: ltcl.Inverse, frames: np.ndarray
+) -> list[Row]:
+    """Films on disk against reading and writing them alone, by two threads."""
+    count = 2 if options.smoke else 24
     with tempfile.TemporaryDirectory() as parent:
         folder = Path(parent) / "film"
-        for number, codes in enumerate(frames):
-            ltcl.images.write(folder / f"{number}.png", TO_LINEAR[codes])
+        for number, codes in enumerate(cycle(frames, count)):
+            ltcl.images.write(folder / f"{number:03}.png", TO_LINEAR[codes])
+        video = Path(parent) / "film.mp4"
+        write_video(video, (TO_LINEAR[codes] for codes in cycle(frames, count)))
+        settings: dict[str, Any] = {"rtol": RTOL, "clamp": True, "inverse": inverse}
+
+        def run(source: Path) -> None:
+            with tempfile.TemporaryDirectory() as out:
+                ltcl.batch.compensate_frames(T, source, out, **settings)
+
         actions: dict[str, Callable[[], object]] = {
-            "solves, one by one": run_each,
-            "solves, 8 at a time": lambda: projector_codes(T, frames),
-            "inverse, one by one": lambda: run_each(inverse=inverse),
-            "inverse, 8 at a time": lambda: projector_codes(T, frames, inverse=inverse),
-            "solves, compensate_frames, .png to .png": lambda: run_files(folder),
-            "inverse, compensate_frames, .png to .png": lambda: run_files(folder, inverse=inverse),
+            "png": lambda: run(folder),
+            "png alone": lambda: copy_frames(folder, Path(parent) / "copy", frames),
+            "video": lambda: play_through(T, inverse, video),
+            "video alone": lambda: [frame.srgb() for frame in open_frames(video)],
         }
-        return seconds(actions, 1 if options.smoke else 7)
+        times = seconds(actions, 1 if options.smoke else 3)
+    rows = []
+    for name, title in (("png", ".png to .png"), ("video", ".mp4 to codes in memory")):
+        alone = count / times[f"{name} alone"]
+        rate = count / times[name]
+        asked = f"reading and writing alone, {alone:.0f} frames/s"
+        rows.append(Row(f"film, {title}", asked, alone, rate, "frames/s", rate / alone, 0.9))
+    return rows
 
 
-def rate_row(name: str, spent: float) -> Row:
-    rate = BATCH / spent
-    target = INVERSE_TARGET if name.startswith("inverse") else SOLVE_TARGET
-    ratio = rate / target
-    least: float | None = 1.0
-    if "png" in name:
-        # Files take as long as the machine's disk.
-        least = None
-    return Row(name, f"{target:g} frames/s", target, rate, "frames/s", ratio, least)
+def copy_frames(folder: Path, out: Path, frames: np.ndarray) -> None:
+    """Read the frames of a folder and write as many of 16 bits, on two threads."""
+    codes = frames[0].astype(np.uint16) * 257
+
+    def copy(frame: Any) -> None:
+        frame.digest()
+        frame.picture()
+        ltcl.images.write_codes(out / f"{frame.number}.png", codes)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(copy, open_frames(folder)))
+
+
+def play_through(T: Transport, inverse: ltcl.Inverse, video: Path) -> None:
+    """All frames of a video through a pipeline, in memory."""
+    with ltcl.Compensator(T, rtol=RTOL, clamp=True, inverse=inverse) as compensator:
+        futures = [compensator.submit(frame.srgb()) for frame in open_frames(video)]
+        for future in futures:
+            future.result()
+
+
+# A projector's own pixels.
+
+
+def sketch_like(options: Options, grid: tuple[int, int], cell: int) -> Transport:
+    """T = (I + W^T C W) F, with W means of cells, as of a scene that a sketch has measured."""
+    h, w = grid[0] // cell, grid[1] // cell
+    W = Wavelet(options.device, grid, "db2", levels=cell.bit_length() - 1)
+    core = symmetric_core(grid, (h, w))
+    matrices = []
+    for albedo in ALBEDO:
+        scale = albedo / (1.0 - albedo)
+        restricted, basis = ltcl.operators.restrict_to_support((core * scale).astype(np.float32), W)
+        tiles = ltcl.operators.Tiles(options.device, restricted, 1, "float16")
+        R = Compressed(tiles, basis, basis, 0.0, diagonal=np.zeros(grid[0] * grid[1]))
+        matrices.append(ScaledColumns(IdentityPlus(R), np.full(grid[0] * grid[1], albedo)))
+    first_bounce = np.repeat(np.array(ALBEDO)[:, None], grid[0] * grid[1], axis=1)
+    return Transport(matrices, grid, first_bounce=first_bounce)
+
+
+def large_rows(options: Options) -> list[Row]:
+    """1080 x 1920 pixels in colour, with solves."""
+    grid = (32, 64) if options.smoke else (1080, 1920)
+    T = sketch_like(options, grid, 8)
+    frames = film(T, 2)
+    times = one_by_one(T, frames, 2 if options.smoke else 20)
+    return [rate_row("1080 x 1920, colour, solves: one by one", times["rate"], 15.0)]
 
 
 def frame_facts(T: Transport) -> dict[str, Any]:
-    """Method, products and error of one frame."""
+    """Products and errors of one frame."""
     (codes,) = film(T, 1)
     compensation = ltcl.compensate(T, TO_LINEAR[codes], rtol=RTOL, clamp=True)
-    solutions = compensation.solution
-    if not isinstance(solutions, tuple):
-        solutions = (solutions,)
+    with ltcl.Compensator(T, rtol=RTOL, clamp=True) as compensator:
+        compensator(codes)
+        judged = compensator.judge()
+        products = compensator.statistics.products
+        before = T.device.launches.copy()
+        compensator(codes)
+        launches = (T.device.launches - before).total()
     return {
-        "method": solutions[0].method,
-        "products of a channel": max(solution.products for solution in solutions),
-        "error of a frame": compensation.error,
+        "products of a prepared frame": products,
+        "launches of a prepared frame": launches,
+        "error of a prepared frame": judged.error,
+        "error of compensate": compensation.error,
         "clipped": compensation.clipped,
     }
 
@@ -154,8 +325,13 @@ def main() -> None:
     grid, coarse = ((16, 32), (4, 8)) if options.smoke else ((256, 512), (32, 64))
     T = transport(options, grid, coarse)
     inverse = ltcl.invert(T, RTOL)
-    times = measure(options, T, inverse, film(T, BATCH))
-    rows = [rate_row(name, spent) for name, spent in times.items()]
+    frames = film(T, BATCH)
+    rows = [
+        *prepared_rows(options, T, inverse, frames),
+        *compensate_rows(options, T, inverse, frames),
+        *film_rows(options, T, inverse, frames),
+        *large_rows(options),
+    ]
     R = cast(Compressed, T.systems[0].R)
     facts = {
         "pixels": grid[0] * grid[1],

@@ -17,7 +17,8 @@
 // STACKED. Of frames_decode also COLOURS of a code, 1 or CHANNELS, and TABLE, 1 if a table tells
 // the light of each code, 0 if codes are light. Of the others MIXED. Of frames_encode STEPS: 0 if
 // codes are light; else codes are places in an ascending list of light, `thresholds`, of which less
-// than 2^STEPS lie within a cell; BETWEEN, 1 for places between two, as floats from 0 to 1.
+// than 2^STEPS lie within a cell; BETWEEN, 1 for places between two of them; ROUNDED, 1 to round
+// these to whole numbers.
 
 #include "common/real.h"
 
@@ -41,6 +42,9 @@
 #endif
 #ifndef BETWEEN
 #define BETWEEN 0
+#endif
+#ifndef ROUNDED
+#define ROUNDED 0
 #endif
 
 #if STACKED
@@ -123,6 +127,7 @@ kernel void frames_encode(
     int cells,                      // of equal width, in which light is looked up
     real cells_per_light,           // 1 / their width
     real first_light,               // where the first begins
+    real code_step,                 // with BETWEEN, codes from one place to the next
     global const int *starts,       // (CHANNELS, cells), the place at which each begins
     global const real *thresholds,  // (CHANNELS, count), ascending
     global CODE *codes)             // (pixels, CHANNELS)
@@ -142,7 +147,12 @@ kernel void frames_encode(
             const int i = clamp(place - 1, 0, count - 3);
             const real width = list[i + 1] - list[i];
             const real share = width > 0 ? clamp((light - list[i]) / width, 0.0f, 1.0f) : 1.0f;
-            codes[pixel * CHANNELS + c] = (i + share) / (count - 2);
+            const real code = (i + share) * code_step;
+#if ROUNDED
+            codes[pixel * CHANNELS + c] = code + 0.5f;
+#else
+            codes[pixel * CHANNELS + c] = code;
+#endif
 #else
             codes[pixel * CHANNELS + c] = place;
 #endif

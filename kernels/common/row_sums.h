@@ -74,6 +74,19 @@ INLINE lanes row_sum(
     lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
     run_sums even = {{0}}, odd = {{0}};
     bool has_runs = false;
+    if (!sparse && K == 1 && RUNS) {
+        // A dense row of one right-hand side comes so fast that two sums would be waited for.
+        run_sums third = {{0}}, fourth = {{0}};
+        for (; j + 32 <= end; j += 32) {
+            has_runs = true;
+            add_run(&even, LOAD8(values + j), x + j);
+            add_run(&odd, LOAD8(values + j + 8), x + j + 8);
+            add_run(&third, LOAD8(values + j + 16), x + j + 16);
+            add_run(&fourth, LOAD8(values + j + 24), x + j + 24);
+        }
+        even.part[0] += third.part[0];
+        odd.part[0] += fourth.part[0];
+    }
     while (j + 4 <= end) {
         if (RUNS && RUN(j)) {
             has_runs = true;

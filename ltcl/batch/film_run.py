@@ -58,6 +58,14 @@ class SolvedBatch(NamedTuple):
     clipped: list[float]
 
 
+class WrittenBatch(NamedTuple):
+    """A batch whose files are being written, and the digests that come of it."""
+
+    batch: Sequence[ReadFrame]
+    solved: SolvedBatch
+    digests: Iterator[str]
+
+
 @dataclass(eq=False, kw_only=True)
 class BatchSolver:
     """Solve a batch of pictures; it is sent to each worker once.
@@ -132,7 +140,7 @@ class BatchSolver:
         )
 
     def _compensator(self) -> Compensator | None:
-        """What frames go through, made at the first one; None if the options ask for more."""
+        """The compensator of all frames, made at the first one; None if options ask for more."""
         if self._is_prepared or not PREPARED_OPTIONS.issuperset(self._given_options()):
             return self._prepared
         self._is_prepared = True
@@ -244,20 +252,35 @@ class FilmRun:
         to_solve, to_write = tee(chain(first, batches))
         with ThreadPoolExecutor(WRITERS) as writers:
             results = self.stream(self.solver, map(_task, to_solve))
-            for solved, batch in zip(results, to_write, strict=True):
-                self._keep(batch, solved, writers)
+            # A batch is written while the next one is solved.
+            on_the_way: WrittenBatch | None = None
+            try:
+                for solved, batch in zip(results, to_write, strict=True):
+                    before = on_the_way
+                    on_the_way = self._begin_writing(batch, solved, writers)
+                    if before is not None:
+                        self._record(before)
+                        yield len(self.done)
+            finally:
+                if on_the_way is not None:
+                    self._record(on_the_way)
+            if on_the_way is not None:
                 yield len(self.done)
         self._name_broken()
 
-    def _keep(
+    def _begin_writing(
         self, batch: Sequence[ReadFrame], solved: SolvedBatch, writers: ThreadPoolExecutor
-    ) -> None:
-        """Write the files of a batch, and record it."""
+    ) -> WrittenBatch:
+        """Let the writers write the files of a batch."""
         numbers = [read.frame.number for read in batch]
         light = [solved.pattern]
         if solved.appearance is not None:
             light.append(solved.appearance)
-        digests = writers.map(self._write, numbers, *light)
+        return WrittenBatch(batch, solved, writers.map(self._write, numbers, *light))
+
+    def _record(self, written: WrittenBatch) -> None:
+        """Wait for the files of a batch, and record it."""
+        batch, solved, digests = written
         results = zip(batch, digests, solved.errors, solved.clipped, strict=True)
         for read, output_digest, error, clipped in results:
             record = FrameRecord(

@@ -147,7 +147,7 @@ def _plan_lines(report: PlanReport) -> list[str]:
 
 
 def _computing_line(report: PlanReport) -> str:
-    """How long the computer works besides, by the pace that was measured."""
+    """The time that the computer works besides, by the pace that was measured."""
     if report.megapixels is None:
         return (
             "time: exposures and overhead; computing adds about "

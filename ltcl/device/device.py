@@ -6,12 +6,13 @@ from __future__ import annotations
 import math
 import threading
 from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import driver_errors, sources
+from ltcl.device import driver_errors, huge_pages, sources
 from ltcl.device.arrays import Array, rounded
 from ltcl.device.kernels import Kernel
 from ltcl.errors import MemoryLimitError
@@ -46,6 +47,8 @@ class Session:
         # Plans of ltcl.device.vectors, by kernel and size.
         self.reductions: dict[tuple, Any] = {}
         self.lock = threading.RLock()
+        # Held while a program is built, for as long as a compiler takes.
+        self.building = threading.RLock()
 
 
 class Device:
@@ -112,16 +115,26 @@ class Device:
 
     def kernel(self, file: str, name: str, **defines: Any) -> Kernel:
         """Kernel `name` of `kernels/<file>.cl` with `defines`; built at the first call only."""
-        driver_errors.refuse_forked()
-        key = (file, *sorted(defines.items()))
-        programs = self.session.programs
+        program, kernels = self.program(file, defines)
         with self.session.lock:
-            if key not in programs:
-                programs[key] = sources.build(self, file, defines), {}
-            program, kernels = programs[key]
             if name not in kernels:
                 kernels[name] = Kernel(self, program, name)
             return kernels[name]
+
+    def program(self, file: str, defines: Mapping[str, Any]) -> tuple[Any, dict[str, Kernel]]:
+        """Program of `kernels/<file>.cl` and its kernels by name; built at the first call only."""
+        driver_errors.refuse_forked()
+        key = (file, *sorted(defines.items()))
+        programs = self.session.programs
+        if key not in programs:
+            with self.session.building:
+                if key not in programs:
+                    programs[key] = sources.build(self, file, defines), {}
+        return programs[key]
+
+    def has_program(self, file: str, defines: Mapping[str, Any]) -> bool:
+        """True if a program is built."""
+        return (file, *sorted(defines.items())) in self.session.programs
 
     def launch(
         self, name: str, handle: Any, items: tuple[int, ...], group: tuple[int, ...]
@@ -161,12 +174,16 @@ class Device:
         if size > self._largest_pooled:
             self.allocations += 1
             pool.free_held()
-            return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)
+            buffer = self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)
+            huge_pages.ask(self, buffer, size)
+            return buffer
         unused_blocks = pool.held_blocks
         # The pool frees unused blocks and tries again by itself.
         buffer = pool.allocate(size)
         is_new = pool.held_blocks >= unused_blocks
         self.allocations += is_new
+        if is_new:
+            huge_pages.ask(self, buffer, size)
         return buffer
 
     def upload(self, values: Any, dtype: Any = np.float32) -> Array:

@@ -11,6 +11,7 @@ import contextlib
 import functools
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +62,7 @@ def _expand(path: Path, root: Path, included_files: set[Path]) -> str:
     return "\n".join(lines)
 
 
-def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
+def build(device: Device, file: str, defines: Mapping[str, Any]) -> Any:
     """Program of `kernels/<file>.cl` for `device`, from pyopencl.
 
     Raises
@@ -71,7 +72,9 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
         PoCL, and cannot use its folder of compiled kernels.
     """
     if pocl_cache.DRIVER not in device.driver:
-        return _build(device, file, defines)
+        # Intel's compiler reports every success as a warning.
+        with warnings.catch_warnings(action="ignore", category=device.cl.CompilerWarning):
+            return _build(device, file, defines)
     with pocl_cache.checked():
         for _ in range(POCL_ATTEMPTS - 1):
             # Two processes that build the same program at the same time disturb each other.
@@ -84,17 +87,15 @@ class _FailedWithoutReason(DeviceError):
     """A program was not built, and its compiler found no error."""
 
 
-def _build(device: Device, file: str, defines: dict[str, Any]) -> Any:
+def _build(device: Device, file: str, defines: Mapping[str, Any]) -> Any:
     options = list(OPTIONS)
     for name, value in sorted(defines.items()):
         options.append(f"-D{name}={value}")
-    # Intel's compiler reports every success as a warning.
-    with warnings.catch_warnings(action="ignore", category=device.cl.CompilerWarning):
-        try:
-            return device.cl.Program(device.context, load(file)).build(options)
-        except device.cl.Error as error:
-            # pyopencl adds options and source to the log.
-            log_text = str(error).partition("(options:")[0].strip()
-            where = f"{device.name} ({device.driver}) with {' '.join(options)}"
-            kind = DeviceError if "error" in log_text else _FailedWithoutReason
-            raise kind(f"kernels/{file}.cl does not compile on {where}:\n{log_text}") from error
+    try:
+        return device.cl.Program(device.context, load(file)).build(options)
+    except device.cl.Error as error:
+        # pyopencl adds options and source to the log.
+        log_text = str(error).partition("(options:")[0].strip()
+        where = f"{device.name} ({device.driver}) with {' '.join(options)}"
+        kind = DeviceError if "error" in log_text else _FailedWithoutReason
+        raise kind(f"kernels/{file}.cl does not compile on {where}:\n{log_text}") from error

@@ -15,7 +15,7 @@ from ltcl.operators.compressed import Compressed
 from ltcl.operators.conversion import as_operator
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, RowBlocks
-from ltcl.operators.dense import Dense
+from ltcl.operators.dense import Dense, Filled
 from ltcl.operators.diagonal_blocks import BlockDiagonal, Planes, block_diagonal
 from ltcl.operators.distributed import Distributed, rank_device
 from ltcl.operators.epilogue import Epilogue
@@ -40,6 +40,7 @@ __all__ = [
     "Dense",
     "Distributed",
     "Epilogue",
+    "Filled",
     "Hats",
     "Host",
     "IdentityPlus",

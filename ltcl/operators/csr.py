@@ -123,12 +123,18 @@ class CSR(SparseRows):
             pattern = None
         bytes_per_entry = 8 if pattern is None else 4
         device.require(matrix.nnz * bytes_per_entry, f"a sparse matrix of {matrix.nnz} nonzeros")
+        self.begin(device, matrix.shape, matrix.nnz)
         if pattern is None:
             pattern = Pattern.from_csr(device, matrix)
         self.pattern = pattern
         self.slabs = self.pattern.with_values(matrix.data)
         self.nnz: int = matrix.nnz
         self._host = matrix
+
+    @classmethod
+    def begin(cls, device: Device, shape: tuple[int, int], nnz: int) -> None:
+        """Begin to build programs for a matrix that is still to come."""
+        cls.build_ahead(device, shape, 8 * nnz, {})
 
     def upload(self, rows: Any, first: int) -> list[Slab]:
         """Slabs of rows from `first` on, with a pattern of their own."""
@@ -210,6 +216,7 @@ class RowBlocks(CSR):
         SparseRows.__init__(self, device, shape)
         device.require(8 * nnz, f"a sparse matrix of {nnz} nonzeros")
         self._blocks = blocks
+        self.begin(device, shape, nnz)
         self.slabs = []
         pointers = [np.zeros(1, np.int64)]
         for first, block in self.blocks():
@@ -228,18 +235,7 @@ class RowBlocks(CSR):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """All blocks, read again; neighbouring small ones are joined."""
-        gathered: list[Any] = []
-        start = 0
-        nnz = 0
-        for first, block in self._blocks():
-            if gathered and 8 * (nnz + block.nnz) > JOINED_BYTES:
-                yield start, _joined(start, gathered)
-                gathered = []
-                start = first
-                nnz = 0
-            gathered.append(block)
-            nnz += block.nnz
-        yield start, _joined(start, gathered)
+        return joined_blocks(self._blocks)
 
     def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
         return ReadableRows._float64_form(self, reads_blocks=reads_blocks)
@@ -248,6 +244,22 @@ class RowBlocks(CSR):
     def _host(self) -> scipy.sparse.csr_array:
         checks.fits_host(f"a sparse matrix of {self.nnz} nonzeros", 24 * self.nnz)
         return _joined(0, [block for _, block in self._blocks()])
+
+
+def joined_blocks(blocks: Blocks) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
+    """(first row, rows) of all blocks, checked, in float64; neighbouring small ones are joined."""
+    gathered: list[Any] = []
+    start = 0
+    nnz = 0
+    for first, block in blocks():
+        if gathered and 8 * (nnz + block.nnz) > JOINED_BYTES:
+            yield start, _joined(start, gathered)
+            gathered = []
+            start = first
+            nnz = 0
+        gathered.append(block)
+        nnz += block.nnz
+    yield start, _joined(start, gathered)
 
 
 def _joined(first: int, blocks: list[Any]) -> scipy.sparse.csr_array:

@@ -17,7 +17,7 @@ from ltcl import checks
 from ltcl.device import Array, Device, tuning
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import Pattern, RowBlocks
-from ltcl.operators.dense import Dense
+from ltcl.operators.dense import Dense, Filled, is_filled
 from ltcl.operators.knowledge import Float64Form
 from ltcl.operators.parts import Parts, upload_part
 from ltcl.operators.rows import ReadableRows, RowOperator
@@ -108,6 +108,8 @@ def upload_matrix(
     if hasattr(matrix, "row_blocks"):
         return _upload_store(device, matrix, change, added_entries)
     if not device.others:
+        if isinstance(matrix, np.ndarray):
+            Dense.begin(device, matrix.shape)
         return upload_part(device, change(0, matrix), pattern)
     if scipy.sparse.issparse(matrix):
         matrix = checks.csr("matrix", matrix)
@@ -139,6 +141,8 @@ def _upload_store(device: Device, store: Any, change: ChangeRows, added_entries:
 
         count = share.stop - share.start
         nnz = (store.nnz + added_entries) * count // M
+        if is_filled((count, N), nnz):
+            return Filled(part_device, (count, N), blocks)
         return RowBlocks(part_device, (count, N), blocks, nnz)
 
     return split_over_devices(device, M, upload_rows)

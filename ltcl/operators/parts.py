@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR, Pattern
-from ltcl.operators.dense import Dense
+from ltcl.operators.dense import Dense, Filled, is_filled
 from ltcl.operators.epilogue import Epilogue
+from ltcl.operators.knowledge import Float64Form
 
 
 class Parts(Operator):
@@ -46,7 +48,12 @@ class Parts(Operator):
 
 
 def upload_part(device: Device, matrix: Any, pattern: Pattern | None = None) -> CSR | Dense:
-    """A sparse matrix as `CSR`, an array as `Dense`, on one device."""
-    if scipy.sparse.issparse(matrix):
+    """A sparse matrix as `CSR`, an array or a matrix with few zeros as `Dense`, on one device."""
+    if not scipy.sparse.issparse(matrix):
+        return Dense(device, matrix)
+    if not is_filled(matrix.shape, matrix.nnz):
         return CSR(device, matrix, pattern)
-    return Dense(device, matrix)
+    rows = checks.csr("matrix", matrix)
+    A = Filled(device, rows.shape, lambda: iter([(0, rows)]))
+    A.exact_form = Float64Form(matrix=rows)
+    return A

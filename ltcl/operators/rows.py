@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Array, Device, tuning, vectors
+from ltcl.device import Array, Device, ahead, tuning, vectors
 from ltcl.device.device import SPARE_BYTES
 from ltcl.device.kernels import Kernel, Launch, in_order
 from ltcl.errors import MemoryLimitError
@@ -38,6 +38,8 @@ NORM_MARGIN = 1.01
 GROUPS_OF_ROWS = ((4, 32), (8, 16))
 # Kernels count the elements of a slab in 32 bits, also a work-group beyond the end of a row.
 MAX_SLAB_ELEMENTS = (1 << 31) - 4096
+# Bytes of a matrix beside whose upload programs are built.
+MIN_BYTES_AHEAD = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -239,6 +241,15 @@ class RowOperator(ReadableRows):
         return math.sqrt(math.fsum(squares))
 
     # Kernels and their variants.
+
+    @classmethod
+    def build_ahead(
+        cls, device: Device, shape: tuple[int, int], nbytes: int, defines: Mapping[str, Any]
+    ) -> None:
+        """Begin to build the programs of a product and of a solve, beside an upload of `nbytes`."""
+        if nbytes >= MIN_BYTES_AHEAD:
+            of_product = {"K": 1, "PACKED": 1, **defines}
+            ahead.begin(device, cls.file, of_product, solves=shape[0] == shape[1])
 
     def kernel(self, name: str, width: int, columns: int, **defines: int) -> Kernel:
         """The kernel `name` for `width` of `columns` right-hand sides."""

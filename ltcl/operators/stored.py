@@ -119,7 +119,7 @@ def _number_basis(W: Basis | None, bases: dict[Basis, int]) -> int:
 
 def _core_arrays(A: Any) -> Arrays:
     for kind, known in KINDS.items():
-        if type(A) is known:
+        if isinstance(A, known):
             return {"kind": np.array(kind), "error": np.array(float(A.error)), **A.to_arrays()}
     raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
 

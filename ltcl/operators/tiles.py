@@ -83,6 +83,7 @@ class Tiles(SparseRows):
             "VALUES": list(PRECISIONS).index(self.precision),
             "PLACE": "ushort" if packed.columns.itemsize == 2 else "int",
         }
+        self.build_ahead(device, self.shape, packed.nbytes, self.defines)
         self.slabs = self._upload_slabs()
 
     def _upload_slabs(self) -> list[Slab]:

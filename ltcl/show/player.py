@@ -44,7 +44,7 @@ class Pace:
     shown, dropped : int
     gain : float
     frames_per_second : float
-        Of shown frames.
+        Shown frames a second.
     latency : float
         The median of the seconds between the due time of a frame and the end of its drawing.
     computing_p50, computing_p99 : float

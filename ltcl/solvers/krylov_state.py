@@ -8,6 +8,7 @@ steps. `kernels/krylov.cl` gets all of this by `DEFINES`.
 
 from __future__ import annotations
 
+from ltcl.device import ahead
 from ltcl.solvers.stopping import SLOTS
 
 STATE_ROWS = 16
@@ -53,6 +54,7 @@ DEFINES: dict[str, int | str] = {
     "PHASE_WAITS": f"{PHASE_WAITS}f",
     "PHASE_BROKEN": f"{PHASE_BROKEN}f",
 }
+ahead.announce("krylov", DEFINES)
 
 
 def row_in_copy(row: int, step: int) -> int:

@@ -18,7 +18,7 @@ from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.images.encoding import from_linear, to_linear
 from ltcl.images.pictures import BITS, RESIZES, as_picture
 from ltcl.tasks import report
-from ltcl.tasks.compensation import compensate
+from ltcl.tasks.compensation import Compensator, compensate
 from ltcl.tasks.separation import separate
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import ENTRIES
@@ -29,7 +29,7 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 Callback = Callable[[int, float], None]
 # Questions that take a solve, which calls back.
 LONG_QUESTIONS = ("bounces", "compensate")
-QUESTIONS = (*LONG_QUESTIONS, "column", "row", "relight", "pictures", "projector")
+QUESTIONS = (*LONG_QUESTIONS, "adjust", "column", "row", "relight", "pictures", "projector")
 # Pictures of a compensation.
 COMPENSATION_PICTURES = ("pattern", "appearance", "target", "out_of_reach")
 COMPENSATION_FACTS = ("error", "gain", "clipped", "gap", "transport_error")
@@ -45,6 +45,8 @@ LARGEST_PICTURE = 3 << 29
 # Uploaded pictures that are kept; an older one is dropped.
 MAX_UPLOADS = 16
 MAX_BOUNCES = 16
+# Milliseconds of projected steps while a slider moves.
+ADJUST_DEADLINE_MS = 30.0
 # What becomes of a picture of other proportions, unless the page chooses: nothing is distorted.
 DEFAULT_RESIZE = "crop"
 # Steps of light between black and white, each with a code: a table is faster than powers.
@@ -83,6 +85,8 @@ class ViewerScene:
         self.pixels = 1
         self._has_std = False
         self._compensation: tuple[Any, dict[str, Any]] | None = None
+        # Prepared for the bounds of the last adjustment.
+        self._compensator: tuple[Any, Compensator] | None = None
         self._pictures: dict[int, KeptPicture] = {}
         self._picture_count = 0
         self._first_pictures = len(pictures)
@@ -258,6 +262,49 @@ class ViewerScene:
         plain = desired.for_projector[resize]
         pictures["uncompensated"] = self._uncompensated(plain, result.target)
         return facts, pictures
+
+    def adjust(
+        self, picture: Any, gain: Any, bounds: Any = (0, 1), resize: Any = DEFAULT_RESIZE
+    ) -> Reply:
+        """Return the pattern for a picture while a slider moves, as good as there is time for.
+
+        It comes from a prepared compensator, whose times are among the facts, in seconds.
+        """
+        checks.one_of("resize", resize, RESIZES)
+        checks.number("gain", gain, above=0.0)
+        light = self._picture(picture).for_camera[resize]
+        compensator = self._prepared(bounds)
+        compensator.gain = float(gain)
+        pattern = compensator(light)
+        judged = compensator.judge()
+        self.pattern = pattern
+        self.white = max(float(bounds[1]), 0.0) or 1.0
+        times = compensator.statistics
+        facts = {
+            "error": judged.error,
+            "clipped": judged.clipped,
+            "gain": float(gain),
+            "p50": times.latency_p50,
+            "p99": times.latency_p99,
+        }
+        appearance = self.T @ pattern
+        if self.setup is not None:
+            appearance = appearance + self.setup.ambient
+        return facts, {"pattern": pattern, "appearance": appearance.astype(np.float32, copy=False)}
+
+    def _prepared(self, bounds: Any) -> Compensator:
+        """The compensator for these bounds; made anew where they are others."""
+        if self._compensator is None or self._compensator[0] != (self.T, bounds):
+            compensator = Compensator(
+                self.T,
+                background=None if self.setup is None else self.setup.ambient,
+                bounds=bounds,
+                deadline_ms=ADJUST_DEADLINE_MS,
+                encode="linear",
+                dtype="float32",
+            )
+            self._compensator = ((self.T, bounds), compensator)
+        return self._compensator[1]
 
     def _uncompensated(self, light: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return the scene under a picture as the pattern, made as bright as the target."""

@@ -13,25 +13,40 @@ import scipy.sparse
 
 from ltcl.device import Device, tuning
 from ltcl.errors import MemoryLimitError
-from ltcl.operators import CSR, Dense, IdentityPlus, RowBlocks, Tiles, rows
+from ltcl.operators import (
+    CSR,
+    Dense,
+    Filled,
+    IdentityPlus,
+    RowBlocks,
+    Tiles,
+    as_operator,
+    rows,
+)
 from tests import gallery, reference
 from tests.conftest import ROOM
 from tests.operators import helpers
 
 
-def in_blocks(device: Device, matrix: Any) -> RowBlocks:
+def three_blocks(matrix: Any) -> Iterator[tuple[int, Any]]:
     """Three blocks of rows, the last one of the rest."""
     size = -(-matrix.shape[0] // 3)
+    for first in range(0, matrix.shape[0], size):
+        yield first, matrix[first : first + size]
 
-    def blocks() -> Iterator[tuple[int, Any]]:
-        for first in range(0, matrix.shape[0], size):
-            yield first, matrix[first : first + size]
 
-    return RowBlocks(device, matrix.shape, blocks, matrix.nnz)
+def in_blocks(device: Device, matrix: Any) -> RowBlocks:
+    return RowBlocks(device, matrix.shape, lambda: three_blocks(matrix), matrix.nnz)
+
+
+def filled(device: Device, matrix: Any) -> Filled:
+    return Filled(device, matrix.shape, lambda: three_blocks(matrix))
 
 
 formats = pytest.mark.parametrize(
-    "make", [*helpers.FORMATS.values(), in_blocks], ids=[*helpers.FORMATS, "blocks"]
+    "make",
+    [*helpers.FORMATS.values(), in_blocks, filled],
+    ids=[*helpers.FORMATS, "blocks", "filled"],
 )
 kernels = pytest.mark.parametrize("make", helpers.FORMATS.values(), ids=list(helpers.FORMATS))
 
@@ -120,6 +135,21 @@ def test_bytes_are_those_of_the_buffers(device, make):
     A.apply_transpose(device.upload(np.ones(53)))
     transposed = 0 if isinstance(A, Dense) else A.transposed_copy().nbytes
     assert A.nbytes == before + transposed
+
+
+def test_few_zeros_become_dense(device):
+    """They took twice the bytes and time, beside the same numbers in an array."""
+    matrix = np.random.default_rng(0).uniform(-1.0, 1.0, (512, 512))
+    sparse = scipy.sparse.csr_array(np.where(matrix > -0.9, matrix, 0.0))
+    A = as_operator(sparse, device)
+    assert isinstance(A, Filled)
+    x = gallery.vectors(512, 3).astype(np.float64)
+    product = A.product_float64()
+    assert product is not None
+    np.testing.assert_allclose(product(x), sparse @ x, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(A.to_dense(), sparse.toarray())
+    mostly_zeros = scipy.sparse.csr_array(np.where(matrix > 0.9, matrix, 0.0))
+    assert isinstance(as_operator(mostly_zeros, device), CSR)
 
 
 @pytest.fixture

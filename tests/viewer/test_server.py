@@ -489,3 +489,21 @@ def test_without_the_extra_ltcl_imports_and_says_how_to_get_it():
     folder = Path(ltcl.__file__).parents[1]
     run = subprocess.run(words, capture_output=True, text=True, cwd=folder)
     assert run.stderr.splitlines()[-1].endswith("pip install 'ltcl[view]'")
+
+
+def test_pattern_while_a_slider_moves(device) -> None:
+    """It is that of the whole compensation, with its times, and made anew for other bounds."""
+    T = ltcl.scenes.dihedral(4, albedo=(0.6, 0.5, 0.3)).transport()
+    picture = np.full((*T.grid, 3), 0.2, np.float32)
+    scene = answers.ViewerScene(T, "corner", {"grey": picture}, None)
+    (number,) = [entry["picture"] for entry in scene.pictures()[0]["pictures"]]
+    for gain, bounds in ((0.5, (0, 1)), (0.7, (0, 1)), (0.7, (0, 0.2))):
+        facts, pictures = scene.adjust(number, gain, bounds)
+        expected = ltcl.compensate(T, picture, gain=gain, bounds=bounds, rtol=1e-2)
+        np.testing.assert_allclose(pictures["appearance"], expected.appearance, atol=5e-3)
+        assert facts["error"] <= expected.error + 0.01
+        assert facts["clipped"] == pytest.approx(expected.clipped, abs=0.05)
+        assert 0.0 < facts["p50"] <= facts["p99"]
+        assert scene.pattern is pictures["pattern"]
+    with pytest.raises(errors.InputError, match="gain"):
+        scene.adjust(number, 0.0)

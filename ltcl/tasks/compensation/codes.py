@@ -2,12 +2,14 @@
 """Codes of frames and of the projector, as tables that the device looks up.
 
 A table of light makes light of whole-number codes. On the way back the codes of a rising curve are
-its places in a list of light: whole-number code n stands between the lights of the codes n - 1/2
-and n + 1/2. A grid of cells of equal width tells where in the list to begin.
+its places in a list of light: code n of 8 bits stands between the lights of the codes n - 1/2 and
+n + 1/2. Codes of 16 bits and floats lie between the places of a list of 4097 codes, where the curve
+is as good as straight. A grid of cells of equal width tells where in the list to begin.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +20,7 @@ from ltcl.errors import InputError, InputTypeError
 
 # The types of codes, and their names in OpenCL C.
 CODE_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
+WHITE_CODES = {"uint8": 255, "uint16": 65535, "float32": 1}
 CODE_NAMES = ", ".join(map(repr, CODE_TYPES))
 SRGB = "srgb"
 LINEAR = "linear"
@@ -25,9 +28,8 @@ CURVES = (SRGB, LINEAR)
 # Whole numbers are sRGB, floats linear.
 AUTO = "auto"
 DECODES = (AUTO, *CURVES)
-# Codes, from 0 to 1, between which a curve is taken as straight where codes are floats: off by less
-# than 1e-8.
-FLOAT_CODES = 4097
+# Codes, from 0 to 1, between which a curve is taken as straight: off by less than 1e-8.
+LISTED_CODES = 4097
 # Numbers of cells that are tried, until one bisection is enough.
 CELL_COUNTS = (1024, 4096, 16384, 65536)
 # Of the width of a cell: rounding may put light this far into the next one.
@@ -39,7 +41,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CodeTable:
-    """How light becomes codes; arrays are float32 and int32, as the device takes them.
+    """A table by which light becomes codes; arrays are float32 and int32, as the device takes them.
 
     Attributes
     ----------
@@ -51,7 +53,9 @@ class CodeTable:
     steps : int
         Bisections that find a place in a cell, of less than 2^steps; 0 where codes are light.
     is_between : bool
-        True if codes are floats between the places.
+        True if codes lie between the places.
+    code_step : float
+        Codes from one place to the next, where they lie between.
     """
 
     thresholds: np.ndarray
@@ -60,6 +64,7 @@ class CodeTable:
     cells_per_light: float
     steps: int
     is_between: bool
+    code_step: float = 1.0
 
     @classmethod
     def of_light(cls) -> CodeTable:
@@ -76,12 +81,11 @@ class CodeTable:
     @classmethod
     def of_curves(cls, curves: list[Curve], dtype: str) -> CodeTable:
         """Codes of a type whose light the curves tell, one curve a channel."""
-        is_between = dtype == "float32"
-        if is_between:
-            codes = np.linspace(0.0, 1.0, FLOAT_CODES)
-        else:
-            largest = np.iinfo(dtype).max
-            codes = (np.arange(largest) + 0.5) / largest
+        is_between = dtype != "uint8"
+        white = WHITE_CODES[dtype]
+        codes = np.linspace(0.0, 1.0, LISTED_CODES)
+        if not is_between:
+            codes = (np.arange(white) + 0.5) / white
         rows = [np.asarray(curve(codes), np.float32) for curve in curves]
         beyond = np.full((len(rows), 1), np.inf, np.float32)
         thresholds = np.hstack([np.stack(rows), beyond])
@@ -93,7 +97,7 @@ class CodeTable:
             if best.steps == 1:
                 break
         assert best is not None  # noqa: S101 - some number of cells was tried
-        return best
+        return dataclasses.replace(best, code_step=white / (LISTED_CODES - 1))
 
     @classmethod
     def _with_cells(cls, thresholds: np.ndarray, cells: int, is_between: bool) -> CodeTable:

@@ -12,6 +12,11 @@ is convex in the gain, so that the gains with h <= 0 are an interval. Its upper 
 every c is within the loss at gains where a quadratic is at most 0, and the largest of these is in
 reach; every trial has a certificate, and with it a tangent below h, whose zero cannot be passed and
 is the next gain (Newton).
+
+Both searches are done in one bounded solve whose gain moves at each step (`gain_descent`), where
+there is a guess at the light to start from, and errors are above the rounding of float32. Systems
+of few numbers, other errors, and what takes too many steps, are searched by trials of one gain
+after the other.
 """
 
 from __future__ import annotations
@@ -21,6 +26,11 @@ from operator import attrgetter
 import numpy as np
 
 from ltcl.errors import InputError
+from ltcl.tasks.compensation.gain_descent import (
+    MIN_RESOLVED_ERROR,
+    GainDescent,
+    lowest_of_tangents,
+)
 from ltcl.tasks.compensation.gain_trials import GainTrial, GainTrials
 from ltcl.tasks.compensation.problem import Columns, CompensationProblem, Limits
 
@@ -58,17 +68,23 @@ def exact_gain(u: Columns, v: Columns, limits: Limits) -> float | None:
     return None
 
 
-def gain_within_loss(problem: CompensationProblem, loss: float | None) -> tuple[float, Columns]:
+def gain_within_loss(
+    problem: CompensationProblem, loss: float | None, undone: tuple[Columns, Columns] | None = None
+) -> tuple[float, Columns]:
     """The largest gain within `loss`, and its light.
 
-    Without a loss, the larger of rtol and 1.1 times the least error of all gains is allowed.
+    Without a loss, the larger of rtol and 1.1 times the least error of all gains is allowed. Light
+    without bounds, gain * slopes - shifts, is `undone`, where there is such light.
     """
     trials = GainTrials(problem)
+    descent = _descent(trials, undone)
     if loss is None:
-        rtol = problem.settings.rtol
-        closest = ClosestPictureSearch(trials, enough=rtol / DEFAULT_LOSS_FACTOR).run()
-        loss = max(rtol, DEFAULT_LOSS_FACTOR * closest.sine)
+        loss = _default_loss(trials, descent)
     search = LargestGainSearch(trials, loss)
+    if descent is not None and loss >= MIN_RESOLVED_ERROR:
+        found = descent.largest(loss)
+        if found is not None:
+            return found.gain, found.light
     search.run()
     if search.low > 0.0:
         return search.low, search.best_light
@@ -80,6 +96,31 @@ def gain_within_loss(problem: CompensationProblem, loss: float | None) -> tuple[
         f"gain is 'auto', but no gain brings the picture within a loss of {loss:g}; the least is "
         f"about {closest.sine:.3g}; give a larger loss, or brighten the picture's dark parts"
     )
+
+
+def _descent(trials: GainTrials, undone: tuple[Columns, Columns] | None) -> GainDescent | None:
+    """The search in one solve, if this problem allows it."""
+    if trials.is_on_host:
+        return None
+    if undone is None:
+        undone = trials.steepest_light()
+    slopes, shifts = undone
+    if not all(np.isfinite(light).all() for light in [*slopes, *shifts]):
+        return None
+    descent = GainDescent(trials, slopes, shifts, TOLERANCE)
+    return descent if descent.is_usable else None
+
+
+def _default_loss(trials: GainTrials, descent: GainDescent | None) -> float:
+    """The larger of rtol and 1.1 times the least error of all gains."""
+    rtol = trials.problem.settings.rtol
+    enough = rtol / DEFAULT_LOSS_FACTOR
+    sine = None
+    if descent is not None and enough >= MIN_RESOLVED_ERROR:
+        sine = descent.closest_sine(enough)
+    if sine is None:
+        sine = ClosestPictureSearch(trials, enough).run().sine
+    return max(rtol, DEFAULT_LOSS_FACTOR * sine)
 
 
 class LargestGainSearch:
@@ -177,7 +218,7 @@ class ClosestPictureSearch:
         sine = 1.0
         for _ in range(MAX_TRIALS):
             self._try_next(sine)
-            self._lower_bound_of_tangents()
+            self.t, self.bound = lowest_of_tangents(self.tangents, 2 * self.farthest)
             sine = min(trial.sine for trial in self.tried)
             if sine <= max(self.enough, (1.0 + TOLERANCE) * self.bound):
                 break
@@ -192,16 +233,3 @@ class ClosestPictureSearch:
         self.light = trial.light
         self.tangents.append((trial.slope, (trial.least - trial.slope) / self.t))
         self.farthest = max(self.farthest, self.t)
-
-    def _lower_bound_of_tangents(self) -> None:
-        """Find where in (0, 2 farthest] the largest of the tangents is lowest, and how low."""
-        end = 2 * self.farthest
-        a, b = np.array(self.tangents).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
-        is_inside = (crossings > 0.0) & (crossings < end)
-        candidates = np.append(crossings[is_inside], end)
-        heights = np.max(a + b * candidates[:, None], axis=1)
-        lowest = np.argmin(heights)
-        self.t = float(candidates[lowest])
-        self.bound = float(heights[lowest])

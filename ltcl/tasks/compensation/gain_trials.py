@@ -33,6 +33,33 @@ MAX_SOLVE_STEPS = 200
 MAX_HOST_ENTRIES = 1 << 14
 
 
+class PictureDirection(NamedTuple):
+    """The cosine and sine between W c and W d, and the norm of W c over that of W d.
+
+    The sine is the error of c at the gain that suits it best, 1 if there is none.
+    """
+
+    cosine: float
+    sine: float
+    size: float
+
+    def largest_gain(self, loss: float) -> float:
+        """The largest gain at which this picture is within `loss`; 0 if it is at none."""
+        if self.sine > loss or self.cosine <= 0.0:
+            return 0.0
+        root = float(np.sqrt(loss**2 - self.sine**2))
+        return self.size * (self.cosine + root) / (1.0 - loss**2)
+
+
+def combined_direction(along: float, across: float) -> PictureDirection:
+    """The direction of a picture with these parts along W d and across it, over ||W d||."""
+    size = float(np.hypot(along, across))
+    if size == 0.0:
+        return PictureDirection(0.0, 1.0, 0.0)
+    sine = across / size if along > 0.0 else 1.0
+    return PictureDirection(along / size, sine, size)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GainTrial:
     """The nearest light that was found at a gain; errors are relative to ||gain W d||.
@@ -47,10 +74,7 @@ class GainTrial:
     slope : float
         For every gain' min ||W (gain' d - c)|| / ||W d|| is at least
         gain * least + slope * (gain' - gain).
-    cosine, size : float
-        The cosine between W c and W d, and the norm of W c over that of W d.
-    sine : float
-        The error of this light at the gain that suits it best.
+    direction : PictureDirection
     is_settled : bool
         Another trial at this gain gives nothing better: its error is zero, the steps allowed are
         used up, or it was solved on the host.
@@ -61,17 +85,17 @@ class GainTrial:
     error: float
     least: float
     slope: float
-    cosine: float
-    sine: float
-    size: float
+    direction: PictureDirection
     is_settled: bool
+
+    @property
+    def sine(self) -> float:
+        """The error of this light at the gain that suits it best."""
+        return self.direction.sine
 
     def largest_gain(self, loss: float) -> float:
         """The largest gain at which this light is within `loss`; 0 if it is at none."""
-        if self.sine > loss or self.cosine <= 0.0:
-            return 0.0
-        root = float(np.sqrt(loss**2 - self.sine**2))
-        return self.size * (self.cosine + root) / (1.0 - loss**2)
+        return self.direction.largest_gain(loss)
 
 
 class SystemLight(NamedTuple):
@@ -125,6 +149,27 @@ class GainTrials:
                 "desired than darkness does: desired or T is negative"
             )
         return largest_product / ((1.0 - loss) * self.desired_norm**2), light
+
+    def steepest_light(self) -> tuple[Columns, Columns]:
+        """Light along T^T W^2 d that comes nearest to desired, and none for the background.
+
+        A guess at light without bounds, as slopes and shifts, where T has no S.
+        """
+        problem = self.problem
+        twice_weighted = problem.weighted(problem.weighted(problem.desired))
+        slopes = []
+        for index, (system, wwd) in enumerate(zip(problem.systems, twice_weighted, strict=True)):
+            A, scale = system
+            x = A.T @ wwd
+            picture = A @ x
+            if problem.weights is not None:
+                picture = picture * problem.weights[index]
+            problem.products[index] += 2
+            square = float(np.sum(np.square(picture)))
+            length = float(np.sum(np.square(x))) / square if square > 0.0 else 0.0
+            divisor = np.where(scale > 0.0, scale, 1.0)[:, None]
+            slopes.append(length * x / divisor)
+        return slopes, [np.zeros(slope.shape) for slope in slopes]
 
     def nearest(self, gain: float, start: Columns, accuracy: float) -> GainTrial:
         """Try this gain.
@@ -197,26 +242,26 @@ class GainTrials:
         for system in solved:
             above_least += float(np.sum(system.errors * (system.errors - system.least)))
 
-        # W c in parts along W d and across it.
-        Wc = subtract(multiply(gain, Wd), missing)
-        norm = float(np.sqrt(inner_product(Wc, Wc)))
-        along = inner_product(Wc, Wd) / self.desired_norm**2
-        across = subtract(Wc, multiply(along, Wd))
-        norm_divisor = norm if norm > 0.0 else 1.0
-        sine = 1.0
-        if along > 0.0:
-            sine = float(np.sqrt(inner_product(across, across))) / norm_divisor
         return GainTrial(
             gain=gain,
             light=[system.light for system in solved],
             error=error / (gain * self.desired_norm),
             least=(error - above_least / divisor) / (gain * self.desired_norm),
             slope=inner_product(missing, Wd) / (divisor * self.desired_norm),
-            cosine=along * self.desired_norm / norm_divisor,
-            sine=sine,
-            size=norm / self.desired_norm,
+            direction=self._direction(subtract(multiply(gain, Wd), missing)),
             is_settled=all(system.is_settled for system in solved),
         )
+
+    def direction(self, light: Columns) -> PictureDirection:
+        """The direction of the picture of this light: one product a system."""
+        return self._direction(multiply(-1.0, self._weighted_missing(0.0, light)))
+
+    def _direction(self, Wc: Columns) -> PictureDirection:
+        Wd = self.problem.weighted(self.problem.desired)
+        along = inner_product(Wc, Wd) / self.desired_norm**2
+        across = subtract(Wc, multiply(along, Wd))
+        across_norm = float(np.sqrt(inner_product(across, across)))
+        return combined_direction(along, across_norm / self.desired_norm)
 
     def _weighted_missing(self, gain: float, light: Columns) -> Columns:
         """W (gain d - c) of the pictures c of this light."""

@@ -193,13 +193,20 @@ class CompensationProblem:
             errors=solution.errors * self.weight_unit,
             least=solution.least * self.weight_unit,
         )
-        x = solution.x
+        return self.light_of(index, solution.x, lower, upper), solution
+
+    def light_of(
+        self, index: int, x: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> np.ndarray:
+        """The light (N, k) of one system of unknowns x, from lower to upper, (N, 1) float32."""
+        limits = self.limits
+        free_scale = np.where(limits.masked, 0.0, self.systems[index].scale)[:, None]
         is_free = free_scale > 0
         light = np.divide(x, free_scale, out=np.zeros(x.shape), where=is_free)
         # Division rounds: values at a bound are to stay there.
         light = np.where(x <= lower, limits.low, light)
         light = np.where(x >= upper, np.where(is_free, limits.high, 0.0), light)
-        return limits.clip(light), solution
+        return limits.clip(light)
 
 
 def multiply(factor: float, columns: Columns) -> Columns:

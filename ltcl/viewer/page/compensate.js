@@ -14,6 +14,7 @@ export function compensate({ $, ask, hello }) {
   const pattern = panel("pattern", "Pattern", hello.grid);
   const reach = panel("reach", "Out of reach", hello.camera_grid);
   const line = document.createElement("span"), source = $("compensate-source");
+  let solved = null, solves = 0; // the last certified compensation, and how many were asked for
   Object.assign(line, { className: "line", hidden: true });
   wipe.sheet.append(line);
   wipe.others = [0, 1];
@@ -26,7 +27,25 @@ export function compensate({ $, ask, hello }) {
     wipe.redrawSoon();
   }
 
+  const settings = () => {
+    const [gain, low, high] = ["gain", "low", "high"].map((name) => Number($(`compensate-${name}`).value));
+    return { picture: Number(source.value), gain, bounds: [low, high], resize: $("compensate-resize").value };
+  };
+
+  // While the slider moves: as good as there is time for.
+  async function adjust() {
+    if (!source.value) return;
+    $("compensate-gain-value").textContent = $("compensate-gain").value;
+    const before = solves, answer = await ask("adjust", settings());
+    if (!answer || !solved || before !== solves) return; // a solve was asked for since then
+    const { arrays } = answer;
+    wipe.show([arrays.appearance, solved.arrays.uncompensated], [1, 0], solved.arrays.target.white());
+    pattern.show(arrays.pattern);
+    wipe.note = `error ${percent(answer.error)}, 99 % of frames within ${(1000 * answer.p99).toPrecision(2)} ms`;
+  }
+
   async function solve() {
+    solves++;
     wipe.note = source.value ? "solving…" : "open or drop the picture that the scene should look like";
     if (!source.value) return;
     const [auto, gain, low, high] = ["auto", "gain", "low", "high"].map((name) => $(`compensate-${name}`));
@@ -39,6 +58,7 @@ export function compensate({ $, ask, hello }) {
     const picture = source.value, resize = $("compensate-resize").value;
     const answer = await ask("compensate", { picture: Number(picture), gain: level, bounds, resize });
     if (!answer || picture !== source.value || resize !== $("compensate-resize").value) return;
+    solved = answer;
     const { arrays } = answer, white = arrays.target.white();
     wipe.note = "without ◂ ▸ with compensation";
     wipe.show([arrays.appearance, arrays.uncompensated], [1, 0], white);
@@ -70,7 +90,9 @@ export function compensate({ $, ask, hello }) {
     $("compensate-residuals").firstElementChild.setAttribute("points", points.join(" "));
   }
 
-  for (const name of ["auto", "gain", "low", "high"]) $(`compensate-${name}`).oninput = solve;
+  for (const name of ["auto", "low", "high"]) $(`compensate-${name}`).oninput = solve;
+  $("compensate-gain").oninput = adjust;
+  $("compensate-gain").onchange = solve;
   source.onchange = solve;
   return { start: solve };
 }
