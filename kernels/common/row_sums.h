@@ -17,14 +17,24 @@
 // 16 columns side by side: most light comes so.
 #define RUN(j) ((j) + 16 <= end && COLUMN((j) + 15) == COLUMN(j) + 15)
 
-// Add every `step`-th entry from j on.
+// Add every `step`-th entry from j on. Four entries are on their way at once: each is a column, and
+// then the numbers at it.
 INLINE void row_add(
     bool sparse, real *sum, global const int *columns, global const real *values,
     global const real *x, int stride, int j, int end, int step)
 {
+    for (; j < end - 3 * step; j += 4 * step) {
+        int at[4];
+        real v[4];
+        for (int u = 0; u < 4; ++u) {
+            at[u] = COLUMN(j + u * step) * stride;
+            v[u] = values[j + u * step];
+        }
+        for (int u = 0; u < 4; ++u)
+            add_pixel(sum, v[u], x + at[u]);
+    }
     for (; j < end; j += step)
-        for (int c = 0; c < K; ++c)
-            sum[c] = values[j] * x[COLUMN(j) * stride + c] + sum[c];
+        add_pixel(sum, values[j], x + COLUMN(j) * stride);
 }
 
 // A run of 8 neighbouring columns times x, whose 8 K values lie side by side, needs K wide loads
