@@ -127,9 +127,9 @@ kernel void relax_rows(RELAX_ARGUMENTS,
     real sum[2 * K] = {0};
     row_add(SPARSE, sum, columns, VALUES(row), x, stride, ROW_BEGIN(row) + me, split, items);
     row_add(SPARSE, sum + K, columns, VALUES(row), x, stride, split + me, ROW_END(row), items);
-    group_sums(sum, scratch, 1);
+    group_sums(sum, scratch);
     // Other memory: the tree of the first sums may be at work.
-    group_sums(sum + K, scratch + K * get_local_size(0), 1);
+    group_sums(sum + K, scratch + K * get_local_size(0));
     for (int c = 0, j = (first + row) * stride; me == 0 && c < K; ++c, ++j) {
         const real from_x = shift * x[j] + scale * sum[K + c];
         r[j] = carry[j] - from_x;

@@ -43,14 +43,15 @@ typedef OF(real, K) lanes;
 #define ALIGNED_LANES 4
 #endif
 typedef OF(real, ALIGNED_LANES) aligned_lanes;
+typedef union {
+    aligned_lanes part[K / ALIGNED_LANES];
+    real item[K];
+} aligned_pixel;
 #endif
 
 // The sums of a row, one for each right-hand side.
 typedef union {
     lanes vector;
-#ifdef ALIGNED_LANES
-    aligned_lanes aligned[K / ALIGNED_LANES];
-#endif
     real item[sizeof(lanes) / sizeof(real)];
 } lane_sums;
 
@@ -58,9 +59,9 @@ typedef union {
 INLINE void add_pixel(real *sum, real v, global const real *p)
 {
 #ifdef ALIGNED_LANES
-    lane_sums pixel;
+    aligned_pixel pixel;
     for (int part = 0; part < K / ALIGNED_LANES; ++part)
-        pixel.aligned[part] = ((global const aligned_lanes *)p)[part];
+        pixel.part[part] = ((global const aligned_lanes *)p)[part];
     for (int c = 0; c < K; ++c)
         sum[c] = v * pixel.item[c] + sum[c];
 #else

@@ -26,20 +26,31 @@
 #define ROWS 1
 #endif
 
-// The sum of each of K values over the items of a row, of `rows` rows in a work-group, in every
-// item.
-INLINE void group_sums(real *value, local real *scratch, int rows)
+// The sum of each of K values over a work-group, in every item.
+INLINE void group_sums(real *value, local real *scratch)
 {
-    const int items = get_local_size(0) / rows;
-    // One row has all items, without a division.
-    const int row = rows == 1 ? 0 : get_local_id(0) / items;
+    for (int k = 0; k < K; ++k)
+        scratch[get_local_id(0) * K + k] = value[k];
+    fold(scratch, K * (int)get_local_size(0), K, K);
+    for (int k = 0; k < K; ++k)
+        value[k] = scratch[k];
+}
+
+// The same over the items of a row, of ROWS rows in a work-group.
+#if ROWS > 1
+INLINE void row_totals(real *value, local real *scratch)
+{
+    const int items = get_local_size(0) / ROWS, row = get_local_id(0) / items;
     const int me = (int)get_local_id(0) - row * items;
     for (int k = 0; k < K; ++k)
-        scratch[(me * rows + row) * K + k] = value[k];
-    fold(scratch, K * rows * items, K * rows, K * rows);
+        scratch[(me * ROWS + row) * K + k] = value[k];
+    fold(scratch, K * ROWS * items, K * ROWS, K * ROWS);
     for (int k = 0; k < K; ++k)
         value[k] = scratch[row * K + k];
 }
+#else
+#define row_totals group_sums
+#endif
 
 #ifdef STEP
 #include "product_step.h"
@@ -67,7 +78,7 @@ INLINE void group_sums(real *value, local real *scratch, int rows)
     lane_sums sum = {0}; \
     if (row < rows) \
         row_sum; \
-    group_sums(sum.item, scratch, ROWS); \
+    row_totals(sum.item, scratch); \
     const bool is_first = me == 0 && row < rows; \
     if (is_first) \
         finish_row(PRODUCT_NAMES, row, sum.item); \

@@ -16,6 +16,7 @@ from ltcl import checks, store
 from ltcl.cli import options
 from ltcl.cli.command import WAITING, Answer, Context, command
 from ltcl.cli.fit import fit
+from ltcl.cli.importing import import_photographs
 from ltcl.cli.options import file_option, option
 from ltcl.cli.reports.acquisition import (
     NextPhotograph,
@@ -360,6 +361,7 @@ def _channels(result: Any) -> Channels:
 
 
 app.command("fit")(fit)
+app.command("import")(import_photographs)
 
 
 @app.command("report")

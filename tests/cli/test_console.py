@@ -51,6 +51,7 @@ COMMANDS = [
     "acquire plan",
     "acquire run",
     "acquire fit",
+    "acquire import",
     "acquire report",
 ]
 CODES = [

@@ -204,3 +204,22 @@ class FitReport(FolderReport):
     worst: Annotated[float, "The largest of their errors."]
     drift: Annotated[float, "Change of brightness over all pairs, which was corrected."]
     noise: Annotated[float, "What T leaves of a photograph, relative to the light of a pixel."]
+
+
+@dataclass(kw_only=True)
+class ImportReport(FolderReport):
+    """`ltcl acquire import`."""
+
+    photographs: Annotated[int, "Number of photographs."]
+    grid: ProjectorGrid
+    camera_grid: Annotated[tuple[int, int], "Height and width of the photographs."]
+    decoded: Annotated[float, "Share of the camera's pixels in the map."]
+    seen: Annotated[float, "Share of the projector's pixels that the camera sees."]
+    saturated: Annotated[
+        float | None, "Share of the lit camera pixels that are saturated; null without white."
+    ]
+    indirect: Annotated[
+        float | None,
+        "Share of the light of white that is not direct, at the median pixel; null without white.",
+    ]
+    files: Files

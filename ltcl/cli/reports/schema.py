@@ -55,6 +55,7 @@ COMMANDS: dict[str, Any] = {
         "`ltcl acquire run`: the report of the finished scan, or the next photograph.",
     ],
     "acquire-fit": acquisition.FitReport,
+    "acquire-import": acquisition.ImportReport,
     "acquire-update": Annotated[
         acquisition.UpdateReport | acquisition.PhotographMissing,
         "`ltcl acquire update`: the new transport and its error, or the next photograph.",
