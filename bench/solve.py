@@ -6,6 +6,12 @@ A closed box of 4056 pixels (dense) and a sparse R of 131072 pixels, 256 nonzero
 does not; and 3 and 8 right-hand sides at once. Ours is `ltcl.solve` as it is called, `auto`,
 transfers included; operators lie on the device and were surveyed before. Competitors get float32.
 Every solution is checked in float64.
+
+Where the time of the dense solve goes, which SciPy's GMRES beats: of 6 ms two products take 3.6, 25
+launches of dots, updates and copies 1.3, and the host's checks and small algebra the rest; SciPy
+takes 4.5 for three products. Of the sparse 19 ms two products take 12, and passes over 131072
+numbers that the matrix has driven from the caches 3. First solves: programs are built by a thread
+beside the upload (`ltcl.device.ahead`), whatever of it is left at the first product is waited for.
 """
 
 from __future__ import annotations

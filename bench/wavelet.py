@@ -4,6 +4,11 @@
 Three planes of 256 x 512 pixels stand one below the other (`ltcl.operators.Planes`). A transform
 reads each number once and writes it once, which the triad's rate turns into milliseconds; a copy of
 the same numbers is timed, too. Vectors are on the device, as inside a solve.
+
+Of an analysis by db2 of 0.5 ms the first level takes 0.17, as a copy of its numbers; launches of
+the other levels, each of which waits for the one before, take most of the rest, and more than twice
+as much at real-time priority (``chrt``) as without, 0.28 ms on an idle machine: threads then wake
+late on the processor that they had before.
 """
 
 from __future__ import annotations
