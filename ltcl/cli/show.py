@@ -8,7 +8,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ltcl.cli import compensation, loading, options, pipe
+from ltcl.cli import compensation, control, loading, options, pipe
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option, picture_option
 from ltcl.cli.reports.program import PlayReport, ShowReport
@@ -17,7 +17,13 @@ from ltcl.cli.view import address, address_options
 from ltcl.errors import InputError
 
 
-@command(*options.READ_OPTIONS, options.frame_options, address_options, pipe.pipe_options)
+@command(
+    *options.READ_OPTIONS,
+    options.frame_options,
+    address_options,
+    pipe.pipe_options,
+    control.control_options,
+)
 def play(
     context: Context,
     film: Annotated[
@@ -44,6 +50,7 @@ def play(
 
     With --pipe frames come as raw video from stdin, and their codes go to stdout, for other
     programs: ffmpeg ... -f rawvideo - | ltcl play --pipe ... - TRANSPORT | ffplay ...
+    With --osc other programs control the show.
     """
     is_stdin = str(film) == "-"
     if context.options["pipe"] != is_stdin:
@@ -51,9 +58,11 @@ def play(
         raise InputError(f"FILM is {film}, but --pipe is {given}; raw video on stdin takes both")
     if is_stdin:
         pipe.check(context, gain)
-        scene, settings = _load_scene(context, transport)
-        return pipe.run(context, scene, gain, resize, settings)
-    return _play_in_window(context, film, transport, gain, resize)
+    with control.controlled(context) as asked:
+        if is_stdin:
+            scene, settings = _load_scene(context, transport)
+            return pipe.run(context, scene, gain, resize, {**settings, "control": asked})
+        return _play_in_window(context, film, transport, gain, resize, asked)
 
 
 def _load_scene(context: Context, transport: Path) -> tuple[Any, dict[str, Any]]:
@@ -71,7 +80,7 @@ def _load_scene(context: Context, transport: Path) -> tuple[Any, dict[str, Any]]
 
 
 def _play_in_window(
-    context: Context, film: Path, transport: Path, gain: Any, resize: str
+    context: Context, film: Path, transport: Path, gain: Any, resize: str, control: Any
 ) -> Answer:
     """Play a film in a projector window."""
     from ltcl.images.frames import open_frames
@@ -91,6 +100,7 @@ def _play_in_window(
                 compensation.resolve_gain(gain, scene.setup),
                 context.progress,
                 resize,
+                control=control,
                 **settings,
             )
             report = PlayReport(film=film, **dataclasses.asdict(pace))
