@@ -48,6 +48,7 @@ COMMANDS = [
     "view",
     "play",
     "show",
+    "export",
     "acquire plan",
     "acquire run",
     "acquire fit",

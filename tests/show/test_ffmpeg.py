@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 
 import ltcl
+from ltcl.acquisition.radiometry import Response
+from ltcl.images import from_srgb
+from ltcl.show.export import write_cubes
 from ltcl.show.pipes import RawVideo
 from ltcl.show.projection import Projection
 from ltcl.viewer.answers import ViewerScene
@@ -81,6 +84,40 @@ def test_video_goes_through(ffmpeg, transport, pixel_format):
         picture = video.from_bytes(frames[begin : begin + size])
         shown = video.from_bytes(received[begin : begin + size])
         np.testing.assert_allclose(shown, projection.codes(picture), rtol=1e-5, atol=1e-6)
+
+
+class Calibrated:
+    """A projector of which only colours and response are known."""
+
+    name = "projector"
+    projector = Response(np.linspace(0.0, 1.0, 257)[None] ** 1.8)
+    mixing = np.array([[1.0, 0.1, 0.0], [0.05, 1.0, 0.1], [0.0, 0.2, 1.0]])
+
+    @property
+    def calibration(self) -> Calibrated:
+        return self
+
+
+@pytest.mark.parametrize("kind", ["lut1d", "lut3d"])
+def test_ffmpeg_reads_cubes(ffmpeg, tmp_path, kind):
+    projector: Any = Calibrated()
+    files = write_cubes(tmp_path, projector, "a remark")
+    file = tmp_path / files[kind == "lut3d"]
+    # Colours on the places of both tables.
+    steps = np.linspace(0.0, 1.0, 33)[::4].astype(np.float32)
+    colours = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(1, -1, 3)
+    video = RawVideo(width=colours.shape[1], height=1, pixel_format="gbrpf32le")
+    words = [*ffmpeg, *video.options.split(), "-i", "-", "-vf", f"{kind}=file={file}"]
+    words += ["-f", "rawvideo", "-pix_fmt", "gbrpf32le", "-"]
+    data = video.to_bytes(colours)
+    shown = subprocess.run(words, input=data, capture_output=True, check=True).stdout
+    codes = video.from_bytes(shown)
+    light = from_srgb(colours.astype(np.float64))[0]
+    if kind == "lut3d":
+        white = projector.mixing.sum(axis=1)
+        light = np.linalg.solve(projector.mixing, (light * white).T).T
+    expected = projector.projector.codes(np.clip(light, 0.0, 1.0))
+    np.testing.assert_allclose(codes[0], expected, atol=2e-3)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from ltcl.cli.reports import acquisition, parts, pictures, program, transports
+from ltcl.cli.reports import acquisition, export, parts, pictures, program, transports
 from ltcl.cli.reports.report import Report
 
 DESCRIPTION = (
@@ -49,6 +49,7 @@ COMMANDS: dict[str, Any] = {
     "view": program.ViewReport,
     "play": program.PlayReport,
     "show": program.ShowReport,
+    "export": export.ExportReport,
     "acquire-plan": acquisition.PlanReport,
     "acquire-run": Annotated[
         acquisition.ScanReport | acquisition.PhotographMissing,
