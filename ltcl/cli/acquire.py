@@ -14,6 +14,7 @@ import typer
 
 from ltcl import checks, store
 from ltcl.cli import options
+from ltcl.cli.aim import aim
 from ltcl.cli.command import WAITING, Answer, Context, command
 from ltcl.cli.fit import fit
 from ltcl.cli.importing import import_photographs
@@ -360,6 +361,7 @@ def _channels(result: Any) -> Channels:
     return result.transport.channels
 
 
+app.command("aim")(aim)
 app.command("fit")(fit)
 app.command("import")(import_photographs)
 

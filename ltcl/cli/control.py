@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -59,6 +60,8 @@ def controlled(context: Context) -> Iterator[Any]:
         return
     if asked["pictures"] is not None and not asked["pictures"].is_dir():
         raise FileError(f"{asked['pictures']}: is not a folder; --pictures needs one")
+    # python-osc logs by functions of the root logger, which would get a handler of its own.
+    logging.getLogger().addHandler(logging.NullHandler())
     control = ShowControl(asked["pictures"])
     with OscServer(control, asked["osc"], asked["osc_host"]) as server:
         note(f"OSC on {server.host}:{server.port}")

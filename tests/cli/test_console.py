@@ -51,6 +51,7 @@ COMMANDS = [
     "export",
     "acquire plan",
     "acquire run",
+    "acquire aim",
     "acquire fit",
     "acquire import",
     "acquire report",

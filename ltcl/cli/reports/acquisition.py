@@ -223,3 +223,22 @@ class ImportReport(FolderReport):
         "Share of the light of white that is not direct, at the median pixel; null without white.",
     ]
     files: Files
+
+
+@dataclass(kw_only=True)
+class AimReport(Report):
+    """`ltcl acquire aim`: the last look; without one only `folder` and `looks`."""
+
+    folder: Annotated[Path, "Folder of the acquisition."]
+    looks: Annotated[int, "Number of looks."] = 0
+    seconds: Annotated[float | None, "Exposure; left out if it is not known."] = None
+    brightness: Annotated[float | None, "Code of the brightest lit pixels, of full scale."] = None
+    saturated: Annotated[float | None, "Share of the lit area that is saturated."] = None
+    lit: Annotated[float | None, "Share of the photograph that the projector lights."] = None
+    focus: Annotated[
+        float | None, "Contrast of stripes of 2 projector pixels; left out of a single photograph."
+    ] = None
+    sharpness: Annotated[
+        float | None, "Mean difference of lit pixels from their neighbours, relative."
+    ] = None
+    advice: Annotated[list[str], "What should be better."] = field(default_factory=list)

@@ -55,6 +55,7 @@ COMMANDS: dict[str, Any] = {
         acquisition.ScanReport | acquisition.PhotographMissing,
         "`ltcl acquire run`: the report of the finished scan, or the next photograph.",
     ],
+    "acquire-aim": acquisition.AimReport,
     "acquire-fit": acquisition.FitReport,
     "acquire-import": acquisition.ImportReport,
     "acquire-update": Annotated[
