@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 from itertools import chain, islice, repeat, tee
@@ -240,7 +240,7 @@ class FilmRun:
             return self.source.count
         return min(self.source.count, self.limit)
 
-    def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
+    def solve(self, gain: float | str, loss: float | None) -> Generator[int, None, None]:
         """Solve all batches; yields how many frames are done, at first and after each batch."""
         # The next batch is read while one is solved.
         ahead = read_ahead(lambda batches: next(batches, None), repeat(self._batches()), 1)

@@ -93,7 +93,7 @@ def trials(device: Device) -> Iterator[Trial]:
         kind="product", name="visibility", call=partial(_visibility, device), truth=np.eye(2)
     )
     some = SubsetBasis(device, scene.grid, [5, 0, 2], W)
-    picked = (W @ x)[[5, 0, 2]]
+    picked = np.asarray(W @ x)[[5, 0, 2]]
     kept = np.zeros(x.shape)
     kept[[5, 0, 2]] = picked
     yield Trial(
