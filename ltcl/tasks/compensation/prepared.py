@@ -17,11 +17,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import InputError
-from ltcl.operators import Dense, IdentityPlus, Operator, block_diagonal
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, block_diagonal
 from ltcl.operators.epilogue import Epilogue
 from ltcl.solvers.auto import SMALL
 from ltcl.solvers.bounded import Descent, Search
@@ -182,6 +183,22 @@ class ByFixedSteps:
         for keep, gain in self._numbers[1:]:
             stepper.step(keep, gain)
         self._finish()
+
+
+@dataclass(frozen=True, eq=False)
+class SharedStart:
+    """The start of several projectors: direct light by `steps`, clipped and shared out.
+
+    The drive of all projectors within the bounds gives each of them no more than its ceiling.
+    """
+
+    steps: ByInverse | ByFixedSteps
+    share: Queued
+
+    def queue(self) -> None:
+        """Queue all launches."""
+        self.steps.queue()
+        self.share()
 
 
 class WithinBounds:
@@ -406,14 +423,16 @@ class PreparedFrames:
             self.target = device.empty(self.seen.shape)
         self.direct_steps: ByInverse | ByFixedSteps | None = None
         if request.T.is_square:
-            self.direct = device.empty(self.shown.shape)
+            self.direct = device.empty(self.seen.shape)
             self._direct_factors = device.upload(self._factors())
             self.direct_steps = self._direct_steps()
+        self._share: SharedStart | None = None
         self._exceeded = device.upload(np.zeros(1), np.int32)
         self._no_excess = np.zeros(1, np.int32)
         self._unknown_scales = device.upload(self._scales())
         self._judge: WithinBounds | None = self.bounded
         self._make_final()
+        self._share = self._bind_share()
         if self.bounded is not None and self.direct_steps is not None:
             self._clip = self._bind_clip(self.bounded)
         strips = -(-self.shown.pixels // STRIP_PIXELS)
@@ -427,7 +446,11 @@ class PreparedFrames:
         A = block_diagonal([system.A for system in problem.systems])
         scales = self._scales()[:, :1]
         lower = (scales * problem.limits.low).astype(np.float32)[:, 0]
-        upper = (scales * problem.limits.high).astype(np.float32)[:, 0]
+        highest = []
+        for _, scale in problem.systems:
+            highest.append(np.broadcast_to(problem.limits.highest, (len(scale), 1)))
+        upper = scales * self.shown.from_channels(highest)[:, :1]
+        upper = upper.astype(np.float32)[:, 0]
         weights = None
         if problem.weights is not None:
             weights = self.seen.from_channels(problem.weights)
@@ -441,11 +464,12 @@ class PreparedFrames:
         if request.inverse is not None:
             inverse = block_diagonal(request.inverse.systems)
             return ByInverse(inverse, self.target, self.direct)
-        if request.T.shape[0] <= SMALL:
-            inverses = _dense_inverses(request.T.systems)
+        systems = request.T.scene.systems
+        if systems[0].shape[0] <= SMALL:
+            inverses = _dense_inverses(systems)
             if inverses is not None:
                 return ByInverse(block_diagonal(inverses), self.target, self.direct)
-        S = block_diagonal(request.T.systems)
+        S = block_diagonal(systems)
         assert isinstance(S, IdentityPlus)  # noqa: S101 - as all systems are
         rtol = request.problem.settings.rtol
         steps = ByFixedSteps(S, self.target, self.direct, rtol, self._probes(S))
@@ -461,11 +485,12 @@ class PreparedFrames:
     def _probes(self, S: Operator) -> np.ndarray:
         """Light of white, of a random pattern, and a random picture, (3, rows, columns)."""
         random = np.random.default_rng(0)
-        white = self.shown.from_channels([f[:, None] for f in self._request.first_bounce])
+        light_of_white = self._request.T.light_of_white
+        white = self.seen.from_channels([f[:, None] for f in light_of_white])
         white = white.astype(np.float32) / np.float32(self.unit)
-        noise = random.random(self.shown.shape, np.float32)
-        probes = [S @ white, S @ (noise * white), random.random(self.shown.shape, np.float32)]
-        return np.stack([np.reshape(probe, self.shown.shape) for probe in probes])
+        noise = random.random(self.seen.shape, np.float32)
+        probes = [S @ white, S @ (noise * white), random.random(self.seen.shape, np.float32)]
+        return np.stack([np.reshape(probe, self.seen.shape) for probe in probes])
 
     def _light_arguments(self, factors: Array, direct: Array) -> dict[str, Any]:
         limits = self._request.problem.limits
@@ -502,6 +527,40 @@ class PreparedFrames:
             exceeded=self._exceeded,
             **self._light_arguments(self._direct_factors, self.direct),
         )
+
+    def _bind_share(self) -> SharedStart | None:
+        """The start by light that several projectors share; None for one, or mixed colours."""
+        request = self._request
+        T = request.T
+        limits = request.problem.limits
+        if self.bounded is None or T.scene is T or T.couples or limits.low > 0.0:
+            return None
+        device = self.device
+        self.direct = device.empty(self.seen.shape)
+        steps = self._direct_steps()
+        if steps is None:
+            return None
+        divisors = [divisor[:, None] for divisor in T.light_of_white]
+        light = self.seen.from_channels(divisors)
+        factors = np.divide(self.unit, light, out=np.zeros_like(light), where=light > 0.0)
+        drive = device.empty(self.seen.shape)
+        arguments = self._light_arguments(device.upload(factors), self.direct)
+        clip = self._bind(
+            self._kernel("clip", "float32", self.seen, MIXED=0),
+            self.seen,
+            slack=0.0,
+            scales=device.upload(np.ones(self.seen.shape)),
+            x=drive,
+            exceeded=self._exceeded,
+            **arguments | {"pixels": self.seen.pixels},
+        )
+        sharing = T.sharing_matrix()
+        operators = []
+        for _, scale in request.problem.systems:
+            rows = scipy.sparse.diags_array(scale / self.unit) @ sharing
+            operators.append(CSR(device, scipy.sparse.csr_array(rows)))
+        share = block_diagonal(operators).bind(drive, self.bounded.start)
+        return SharedStart(steps, in_order([clip, share]))
 
     def _bind_peaks(self) -> Launch:
         """The launch of the peaks, after the light of the background itself is found."""
@@ -619,7 +678,10 @@ class PreparedFrames:
         if bounded is None:
             return
         if self.direct_steps is None:
-            vectors.fill(bounded.start, 0.0)
+            if self._share is None:
+                vectors.fill(bounded.start, 0.0)
+            else:
+                self._share.queue()
             bounded.solve(deadline)
             return
         if self._count_exceeded():
