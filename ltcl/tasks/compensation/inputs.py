@@ -129,7 +129,7 @@ def check_inputs(
         if T.is_compressed or inverse is not None:
             rtol = default_rtol(RTOL, T, exact, inverse)
     settings = check_settings(T, method, rtol, options)
-    if checks.flag("clamp", clamp) and not T.is_square:
+    if checks.flag("clamp", clamp) and not T.is_square and T.scene is T:
         raise InputError(
             "clamp is True, but this T has no S; its light is found within the bounds only"
         )

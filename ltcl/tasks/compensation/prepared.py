@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Kernel, Launch, Queued, in_order
@@ -185,20 +184,32 @@ class ByFixedSteps:
         self._finish()
 
 
-@dataclass(frozen=True, eq=False)
-class SharedStart:
-    """The start of several projectors: direct light by `steps`, clipped and shared out.
+class BySharing:
+    """Light of several projectors: direct light by `steps`, clipped as their drive, and shared.
 
-    The drive of all projectors within the bounds gives each of them no more than its ceiling.
+    A drive within the bounds gives each projector no more than its ceiling.
     """
 
-    steps: ByInverse | ByFixedSteps
-    share: Queued
+    def __init__(
+        self, steps: ByInverse | ByFixedSteps, clip: Launch, share: Queued, exceeded: Array
+    ) -> None:
+        self.products = steps.products
+        self._steps = steps
+        self._clip = clip
+        self._share = share
+        self._exceeded = exceeded
 
     def queue(self) -> None:
         """Queue all launches."""
-        self.steps.queue()
-        self.share()
+        self._steps.queue()
+        self._clip()
+        self._share()
+
+    def count_clipped(self) -> int:
+        """The number of values of the drive that were beyond the bounds; waits."""
+        self._exceeded.set(np.zeros(1, np.int32))
+        self._clip()
+        return int(self._exceeded.get()[0])
 
 
 class WithinBounds:
@@ -421,18 +432,21 @@ class PreparedFrames:
             self.target = self.bounded.target
         else:
             self.target = device.empty(self.seen.shape)
-        self.direct_steps: ByInverse | ByFixedSteps | None = None
+        self.direct_steps: ByInverse | ByFixedSteps | BySharing | None = None
         if request.T.is_square:
-            self.direct = device.empty(self.seen.shape)
+            self.direct = device.empty(self.shown.shape)
             self._direct_factors = device.upload(self._factors())
-            self.direct_steps = self._direct_steps()
-        self._share: SharedStart | None = None
+            self.direct_steps = self._direct_steps(self.direct)
+        elif request.T.scene is not request.T:
+            self.direct = device.empty(self.shown.shape)
+            lit = np.where(request.T.masked, 0.0, self.unit)[:, None]
+            self._direct_factors = device.upload(self.shown.from_channels([lit] * self.colours))
+            self.direct_steps = self._sharing_steps()
         self._exceeded = device.upload(np.zeros(1), np.int32)
         self._no_excess = np.zeros(1, np.int32)
         self._unknown_scales = device.upload(self._scales())
         self._judge: WithinBounds | None = self.bounded
         self._make_final()
-        self._share = self._bind_share()
         if self.bounded is not None and self.direct_steps is not None:
             self._clip = self._bind_clip(self.bounded)
         strips = -(-self.shown.pixels // STRIP_PIXELS)
@@ -458,21 +472,21 @@ class PreparedFrames:
         rtol = problem.settings.rtol
         return WithinBounds(A, columns, weights, (lower, upper), rtol, self._is_warm)
 
-    def _direct_steps(self) -> ByInverse | ByFixedSteps | None:
+    def _direct_steps(self, direct: Array) -> ByInverse | ByFixedSteps | None:
         """The way from light to add to direct light; None if steps do not converge."""
         request = self._request
         if request.inverse is not None:
             inverse = block_diagonal(request.inverse.systems)
-            return ByInverse(inverse, self.target, self.direct)
+            return ByInverse(inverse, self.target, direct)
         systems = request.T.scene.systems
         if systems[0].shape[0] <= SMALL:
             inverses = _dense_inverses(systems)
             if inverses is not None:
-                return ByInverse(block_diagonal(inverses), self.target, self.direct)
+                return ByInverse(block_diagonal(inverses), self.target, direct)
         S = block_diagonal(systems)
         assert isinstance(S, IdentityPlus)  # noqa: S101 - as all systems are
         rtol = request.problem.settings.rtol
-        steps = ByFixedSteps(S, self.target, self.direct, rtol, self._probes(S))
+        steps = ByFixedSteps(S, self.target, direct, rtol, self._probes(S))
         if steps.products:
             return steps
         if self.bounded is None:
@@ -528,39 +542,40 @@ class PreparedFrames:
             **self._light_arguments(self._direct_factors, self.direct),
         )
 
-    def _bind_share(self) -> SharedStart | None:
-        """The start by light that several projectors share; None for one, or mixed colours."""
+    def _sharing_steps(self) -> BySharing | None:
+        """The way from light to add to the light of several projectors; None for mixed colours."""
         request = self._request
         T = request.T
-        limits = request.problem.limits
-        if self.bounded is None or T.scene is T or T.couples or limits.low > 0.0:
+        if T.couples or request.problem.limits.low > 0.0:
+            if self.bounded is None:
+                raise InputError(
+                    "clamp is True, but projectors that mix colours, or a lower bound above 0, "
+                    "need the solve within the bounds; leave out clamp"
+                )
             return None
         device = self.device
-        self.direct = device.empty(self.seen.shape)
-        steps = self._direct_steps()
+        direct = device.empty(self.seen.shape)
+        steps = self._direct_steps(direct)
         if steps is None:
             return None
-        divisors = [divisor[:, None] for divisor in T.light_of_white]
-        light = self.seen.from_channels(divisors)
-        factors = np.divide(self.unit, light, out=np.zeros_like(light), where=light > 0.0)
+        divisors = self.seen.from_channels([divisor[:, None] for divisor in T.light_of_white])
+        factors = np.divide(self.unit, divisors, out=np.zeros_like(divisors), where=divisors > 0.0)
         drive = device.empty(self.seen.shape)
-        arguments = self._light_arguments(device.upload(factors), self.direct)
+        exceeded = device.upload(np.zeros(1), np.int32)
+        arguments = self._light_arguments(device.upload(factors), direct)
         clip = self._bind(
             self._kernel("clip", "float32", self.seen, MIXED=0),
             self.seen,
             slack=0.0,
             scales=device.upload(np.ones(self.seen.shape)),
             x=drive,
-            exceeded=self._exceeded,
+            exceeded=exceeded,
             **arguments | {"pixels": self.seen.pixels},
         )
-        sharing = T.sharing_matrix()
-        operators = []
-        for _, scale in request.problem.systems:
-            rows = scipy.sparse.diags_array(scale / self.unit) @ sharing
-            operators.append(CSR(device, scipy.sparse.csr_array(rows)))
-        share = block_diagonal(operators).bind(drive, self.bounded.start)
-        return SharedStart(steps, in_order([clip, share]))
+        matrix = T.sharing_matrix() / self.unit
+        count = self.seen.channels if self.seen.is_stacked else 1
+        share = block_diagonal([CSR(device, matrix)] * count)
+        return BySharing(steps, clip, share.bind(drive, self.direct), exceeded)
 
     def _bind_peaks(self) -> Launch:
         """The launch of the peaks, after the light of the background itself is found."""
@@ -678,13 +693,11 @@ class PreparedFrames:
         if bounded is None:
             return
         if self.direct_steps is None:
-            if self._share is None:
-                vectors.fill(bounded.start, 0.0)
-            else:
-                self._share.queue()
+            vectors.fill(bounded.start, 0.0)
             bounded.solve(deadline)
             return
-        if self._count_exceeded():
+        # What several projectors share is not exact.
+        if self._count_exceeded() or isinstance(self.direct_steps, BySharing):
             bounded.solve(deadline)
         else:
             bounded.keep_start()
@@ -706,6 +719,10 @@ class PreparedFrames:
             judge.target.copy_from(self.target)
             clipped = self._count_exceeded()
             judge.keep_start()
+            if isinstance(self.direct_steps, BySharing):
+                share = self.direct_steps.count_clipped() / (self.seen.pixels * self.colours)
+                lit_values = self.colours * np.count_nonzero(~self._request.T.masked)
+                clipped = share * lit_values
         elif judge.errors is not None:
             clipped = judge.saturated()
         errors = judge.errors

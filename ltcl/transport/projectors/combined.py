@@ -120,7 +120,7 @@ class CombinedTransport(Transport):
         else:
             check_scene(scene, first)
             directs = [_sparse_member(number, T) for number, T in enumerate(self.transports)]
-        ramps = find_ramps(directs, self.montage.grids, blend)
+        ramps = find_ramps(directs, self.montage.grids, first.camera_grid, blend)
         self.shares: tuple[ProjectorShare, ...] = share_out(directs, ramps, self.balance)
         self.divisors = drive_divisors(self.shares)
         mixings = [T.mixing for T in self.transports]
@@ -383,8 +383,9 @@ def combine(
         grey or in colour. Projectors may differ in resolution, brightness and mixing, and may miss
         parts of the scene.
     blend : "smooth", "linear" or a sequence of arrays (h, w)
-        Weights of the pixels of each projector: the square of the distance to the border of what
-        the camera sees of it, in its own pixels, or the distance itself; or your own.
+        Weights of the pixels of each projector: the square of the distance to its border, in its
+        own pixels, or the distance itself; or your own. Borders count where another projector
+        lights the scene beyond.
     balance : float
         From 0, all light of all projectors counts where they overlap, to 1, as soft as possible
         near borders: a projector gives its full light where its weight is at least this part of the

@@ -55,7 +55,7 @@ def direct_parts(
         pixels.append(window)
         for channel, block in enumerate(blocks):
             light = np.take_along_axis(block, np.maximum(window, 0), axis=1)
-            light = np.maximum(light - _level(block, ring)[:, None], 0.0)
+            light = np.maximum(light - _levels(block, ring, radius), 0.0)
             values[channel].append(np.where(is_direct[:, None] & (window >= 0), light, 0.0))
     columns = np.concatenate(pixels)
     shape = (len(columns), grid[0] * grid[1])
@@ -133,6 +133,35 @@ def _ring(pixels: np.ndarray, radius: int, grid: tuple[int, int]) -> np.ndarray:
     offsets = _offsets(radius)
     is_border = np.abs(offsets).max(axis=1) == radius
     return _neighbours(pixels, offsets[is_border], grid)
+
+
+def _levels(block: np.ndarray, ring: np.ndarray, radius: int) -> np.ndarray:
+    """Indirect light in the window, (rows, pixels): that of the ring in the same direction.
+
+    Beside a crease it is brighter on the side of the other wall.
+    """
+    light = np.take_along_axis(block, np.maximum(ring, 0), axis=1)
+    light = np.where(ring >= 0, light, np.nan)
+    median = _level(block, ring)
+    light = np.where(np.isnan(light), median[:, None], light)
+    levels = light @ _directions(radius)
+    # In the middle all directions count.
+    levels[:, levels.shape[1] // 2] = median
+    return np.maximum(levels, 0.0)
+
+
+def _directions(radius: int) -> np.ndarray:
+    """Means (ring, window) over the three pixels of the ring that are nearest in direction."""
+    ring = _offsets(radius + 1)
+    ring = ring[np.abs(ring).max(axis=1) == radius + 1]
+    window = _offsets(radius)
+    ring_unit = ring / np.linalg.norm(ring, axis=1, keepdims=True)
+    lengths = np.maximum(np.linalg.norm(window, axis=1, keepdims=True), 1.0)
+    cosines = ring_unit @ (window / lengths).T
+    nearest = np.argsort(-cosines, axis=0)[:3]
+    means = np.zeros(cosines.shape)
+    np.put_along_axis(means, nearest, 1.0 / 3.0, axis=0)
+    return means
 
 
 def _level(block: np.ndarray, ring: np.ndarray) -> np.ndarray:

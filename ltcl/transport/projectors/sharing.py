@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How light is shared out between projectors: smooth weights that fall to zero at their borders.
 
-With the distance of each projector pixel to the border of what the camera sees of its projector, in
-its own pixels, rho_k = distance^2 is as smooth where it ends as in between. Camera pixel i sees
+With the distance of each projector pixel to the border beyond which other projectors light the
+scene alone, in its own pixels, rho_k = distance^2 is as smooth where it ends as in between. Camera
+pixel i sees
 
     a_k = (F_k rho_k) / (F_k 1),    sigma_k = a_k / max_j a_j
 
@@ -33,8 +34,16 @@ from ltcl.errors import InputError
 
 # Powers of the distance to the border.
 BLENDS = {"smooth": 2.0, "linear": 1.0}
-# Times the mean light of lit projector pixels: others are not seen by the camera.
+# Times the mean direct light of a projector: dimmer camera pixels are not lit by it.
 MIN_SEEN_SHARE = 0.02
+# Share of a projector pixel's light that falls beside what others light alone, at a border.
+BORDER_SHARE = 0.3
+# Camera pixels at the border of a projector in which its light falls off.
+BORDER_REACH = 2
+# Weights of B_k below this part of the largest in a row are left out.
+MIN_BACK_SHARE = 0.1
+# A pixel and its eight neighbours.
+EIGHT = np.ones((3, 3), int)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,27 +78,61 @@ class ProjectorShare:
         return np.asarray(self.direct[channel].sum(axis=1)).ravel()
 
 
-def border_distance(is_seen: np.ndarray) -> np.ndarray:
-    """Distance (h, w) of each pixel to the border of what is seen; single holes are closed."""
-    closed = scipy.ndimage.binary_closing(is_seen, np.ones((3, 3)))
-    padded = np.pad(is_seen | closed, 1)
-    distance = scipy.ndimage.distance_transform_edt(padded)[1:-1, 1:-1]
-    # From the middle of a pixel to the border of its neighbour.
-    return np.maximum(distance - 0.5, 0.0)
+def border_distance(is_border: np.ndarray) -> np.ndarray:
+    """Distance (h, w) of each pixel to the outer side of the border pixels, (h, w) bool.
+
+    Without a border all pixels are alike.
+    """
+    if not is_border.any():
+        return np.ones(is_border.shape)
+    return scipy.ndimage.distance_transform_edt(~is_border) + 0.5
+
+
+def find_borders(
+    directs: Sequence[Sequence[scipy.sparse.csr_array]],
+    grids: Sequence[tuple[int, int]],
+    camera_grid: tuple[int, int],
+) -> list[np.ndarray]:
+    """Pixels (h, w) of each projector at which others take over, and it has to fade out.
+
+    They light camera pixels beside those that other projectors light alone. Its border where no
+    other one lights the scene, and the border of the camera's picture, are none.
+    """
+    totals = [_total(direct) for direct in directs]
+    are_lit = []
+    for total in totals:
+        white = _row_sums(total)
+        mean = float(white.sum()) / max(np.count_nonzero(white), 1)
+        is_lit = white > MIN_SEEN_SHARE * mean
+        closed = scipy.ndimage.binary_closing(is_lit.reshape(camera_grid), EIGHT)
+        are_lit.append(closed | is_lit.reshape(camera_grid))
+    borders = []
+    for number, (total, grid) in enumerate(zip(totals, grids, strict=True)):
+        others = [is_lit for other, is_lit in enumerate(are_lit) if other != number]
+        is_taken_over = np.logical_or.reduce(others) & ~are_lit[number]
+        neighbours = scipy.ndimage.convolve(is_taken_over.astype(int), EIGHT, mode="constant")
+        # A single pixel is noise.
+        is_taken_over &= neighbours > 1
+        is_beside = scipy.ndimage.binary_dilation(is_taken_over, EIGHT, BORDER_REACH).ravel()
+        light = _row_sums(scipy.sparse.csr_array(total.T))
+        beside = np.asarray(total.T @ is_beside.astype(np.float64))
+        is_border = (light > 0.0) & (beside > BORDER_SHARE * light)
+        borders.append(is_border.reshape(grid))
+    return borders
 
 
 def find_ramps(
     directs: Sequence[Sequence[scipy.sparse.csr_array]],
     grids: Sequence[tuple[int, int]],
+    camera_grid: tuple[int, int],
     blend: object,
 ) -> list[np.ndarray]:
     """The weights of the pixels of each projector: by name, or the checked arrays of the caller."""
     ramps = []
     if isinstance(blend, str):
         power = BLENDS[checks.one_of("blend", blend, BLENDS)]
-        for direct, grid in zip(directs, grids, strict=True):
-            is_seen = _seen_pixels(direct).reshape(grid)
-            ramps.append(border_distance(is_seen).ravel() ** power)
+        for is_border in find_borders(directs, grids, camera_grid):
+            ramps.append(border_distance(is_border).ravel() ** power)
         return ramps
     if not isinstance(blend, (list, tuple)) or len(blend) != len(grids):
         raise InputError(
@@ -106,13 +149,16 @@ def find_ramps(
     return ramps
 
 
-def _seen_pixels(direct: Sequence[scipy.sparse.csr_array]) -> np.ndarray:
-    """Projector pixels (N_k,) whose direct light the camera sees."""
-    light = np.sum([np.asarray(part.sum(axis=0)).ravel() for part in direct], axis=0)
-    is_lit = light > 0.0
-    if not is_lit.any():
-        return is_lit
-    return light > MIN_SEEN_SHARE * float(light[is_lit].mean())
+def _total(direct: Sequence[scipy.sparse.csr_array]) -> scipy.sparse.csr_array:
+    """The sum of all channels."""
+    total = direct[0]
+    for part in direct[1:]:
+        total = total + part
+    return scipy.sparse.csr_array(total)
+
+
+def _row_sums(matrix: scipy.sparse.csr_array) -> np.ndarray:
+    return np.asarray(matrix.sum(axis=1)).ravel()
 
 
 def share_out(
@@ -124,11 +170,8 @@ def share_out(
     weights = []
     backs = []
     for direct, ramp in zip(directs, ramps, strict=True):
-        total = direct[0]
-        for part in direct[1:]:
-            total = total + part
-        total = scipy.sparse.csr_array(total)
-        white = np.asarray(total.sum(axis=1)).ravel()
+        total = _total(direct)
+        white = _row_sums(total)
         seen = total @ ramp
         weights.append(np.divide(seen, white, out=np.zeros_like(seen), where=white > 0.0))
         backs.append(_rows_of_one(scipy.sparse.csr_array(total.T)))
@@ -153,7 +196,13 @@ def share_out(
 
 
 def _rows_of_one(matrix: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
-    """The matrix with rows that sum up to 1, or 0."""
+    """The matrix without small weights, and with rows that sum up to 1, or 0."""
+    largest = matrix.max(axis=1).toarray().ravel()
+    counts = np.diff(matrix.indptr)
+    is_small = matrix.data < MIN_BACK_SHARE * np.repeat(largest, counts)
+    matrix = matrix.copy()
+    matrix.data[is_small] = 0.0
+    matrix.eliminate_zeros()
     sums = np.asarray(matrix.sum(axis=1)).ravel()
     inverses = np.divide(1.0, sums, out=np.zeros_like(sums), where=sums > 0.0)
     return scipy.sparse.csr_array(scipy.sparse.diags_array(inverses) @ matrix)
