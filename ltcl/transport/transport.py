@@ -49,6 +49,7 @@ from ltcl.transport.noise import Noise, estimate
 logger = logging.getLogger(__name__)
 # Share of diag(S) = 1 + diag(R) that is diag(T) / F: from here on, I + R has all digits of T F^-1.
 MIN_DIAGONAL_SHARE = 0.5
+NOT_SHARED = "T is of one projector, which shares its light with no other one"
 # Attributes that do not leave this process.
 NOT_PICKLED = ("device", "systems", "operators", "checked_inverses", "reload")
 
@@ -576,13 +577,13 @@ class Transport:
         """The pattern of each projector: that of the only one."""
         return (np.asarray(pattern),)
 
-    def share_light(self, direct: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-        """Patterns of several projectors that make direct light; None for one without S."""
-        return None
+    def share_light(self, direct: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Patterns of several projectors that make direct light."""
+        raise InputError(NOT_SHARED)
 
     def sharing_matrix(self) -> scipy.sparse.csr_array:
         """Patterns (N, M) of several projectors from the light that drives all of them."""
-        raise InputError("T is of one projector, which shares its light with no other one")
+        raise InputError(NOT_SHARED)
 
     def __matmul__(self, pattern: Any) -> np.ndarray:
         """Relight: the picture (float32) under `pattern`, as in `ltcl.relight`."""

@@ -27,6 +27,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Product, as_operator
+from ltcl.solvers import solve_each
 from ltcl.transport import frames as layout
 from ltcl.transport.projectors.direct_parts import direct_parts
 from ltcl.transport.projectors.gamut import Gamut, common_gamut
@@ -42,6 +43,8 @@ from ltcl.transport.transport import Transport, check_transport
 MAX_PROJECTORS = 8
 # Side of the median filter that takes the noise of single pixels out of the brightest black.
 BLACK_FILTER = 3
+# Tolerance of the solve that finds the level of black.
+BLACK_RTOL = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +96,6 @@ class CombinedTransport(Transport):
         Light that compensation counts as there already: the blacks, less `black_level`.
     blacks : list of (M, 1), or None
         The sum of the blacks of all projectors, for each channel.
-    black_level : (channels,)
-        The level to which ``black="uniform"`` lifts black; 0 without.
     """
 
     def __init__(
@@ -136,7 +137,6 @@ class CombinedTransport(Transport):
         self.masked = self.montage.is_empty
         self.ceilings: np.ndarray | None = self.montage.vector([s.ceiling for s in self.shares])
         self.blacks = self._check_blacks(blacks)
-        self.black_level = self._find_black_level()
 
     def __reduce__(self) -> Any:
         """Combine the same transports again, in another process."""
@@ -224,22 +224,15 @@ class CombinedTransport(Transport):
         total = shape.pack(self.blacks, self.camera_grid)
         return [total, *[np.zeros_like(total)] * (len(self.transports) - 1)]
 
-    def _find_black_level(self) -> np.ndarray:
-        """The brightest black of each channel, but for single pixels."""
-        level = np.zeros(self.channels)
-        if self.blacks is None or self.black != "uniform":
-            return level
-        is_lit = (self.divisors > 0.0).reshape(self.channels, *self.camera_grid)
-        for channel, total in enumerate(self.blacks):
-            picture = total.reshape(self.camera_grid)
-            filtered = scipy.ndimage.median_filter(picture, BLACK_FILTER, mode="nearest")
-            level[channel] = float(np.max(filtered, where=is_lit[channel], initial=0.0))
-        return level
-
     @property
     def is_square(self) -> bool:
         """False: S is that of `scene`."""
         return False
+
+    @cached_property
+    def unlit(self) -> np.ndarray:
+        """Camera pixels (M,) without direct light of any projector."""
+        return ~np.any(self.divisors > 0.0, axis=0)
 
     # Light.
 
@@ -255,6 +248,27 @@ class CombinedTransport(Transport):
             weighted = scipy.sparse.diags_array(share.own) @ share.back
             rows.append(scipy.sparse.csr_array(weighted.T))
         return scipy.sparse.csr_array(self.montage.columns(rows).T)
+
+    @cached_property
+    def black_level(self) -> np.ndarray:
+        """The level to which ``black="uniform"`` lifts black, (channels,); 0 without.
+
+        The light that lifts the darkest places bounces to the brightest one, too: the level L is
+        the least with S^-1 (L - black) of at least 0, but for single pixels.
+        """
+        level = np.zeros(self.channels)
+        if self.blacks is None or self.black != "uniform":
+            return level
+        sides = [np.hstack([np.ones_like(total), total]) for total in self.blacks]
+        solutions = solve_each(self.scene.systems, sides, rtol=BLACK_RTOL)
+        for channel, solution in enumerate(solutions):
+            even, black = solution.x.T
+            is_lit = (self.divisors[channel] > 0.0) & (even > 0.0)
+            ratio = np.divide(black, even, out=np.zeros_like(black), where=is_lit)
+            picture = ratio.reshape(self.camera_grid)
+            filtered = scipy.ndimage.median_filter(picture, BLACK_FILTER, mode="nearest")
+            level[channel] = float(np.max(filtered, where=is_lit.reshape(picture.shape), initial=0))
+        return level
 
     @property
     def background(self) -> list[np.ndarray] | None:
@@ -291,11 +305,15 @@ class CombinedTransport(Transport):
             whites.append(np.stack([share.white(channel) for channel in range(self.channels)]))
         return common_gamut(whites, self.mixings)
 
-    @cached_property
+    @property
     def scene(self) -> Transport:
         """S between camera pixels, on the device at its first use."""
         if self.given_scene is not None:
             return self.given_scene
+        return self._found_scene
+
+    @cached_property
+    def _found_scene(self) -> Transport:
         M = self.shape[0]
         is_lit = (self.divisors > 0.0).all(axis=0)
         checks.fits_host("S between camera pixels", 8 * self.channels * M**2)
@@ -322,7 +340,7 @@ class CombinedTransport(Transport):
         Q = scipy.sparse.diags_array(share.own) @ share.back @ scipy.sparse.diags_array(inverses)
         Q = scipy.sparse.csr_array(Q)
         matrix = _in_memory(T.matrices[channel])
-        direct = share.direct[channel] @ Q
+        direct: Any = share.direct[channel] @ Q
         if scipy.sparse.issparse(matrix):
             return scipy.sparse.csr_array(matrix) @ Q - direct
         product = (scipy.sparse.csr_array(Q.T).astype(np.float32) @ matrix.T).T

@@ -85,7 +85,8 @@ def border_distance(is_border: np.ndarray) -> np.ndarray:
     """
     if not is_border.any():
         return np.ones(is_border.shape)
-    return scipy.ndimage.distance_transform_edt(~is_border) + 0.5
+    distance = np.asarray(scipy.ndimage.distance_transform_edt(~is_border), np.float64)
+    return distance + 0.5
 
 
 def find_borders(
@@ -104,8 +105,8 @@ def find_borders(
         white = _row_sums(total)
         mean = float(white.sum()) / max(np.count_nonzero(white), 1)
         is_lit = white > MIN_SEEN_SHARE * mean
-        closed = scipy.ndimage.binary_closing(is_lit.reshape(camera_grid), EIGHT)
-        are_lit.append(closed | is_lit.reshape(camera_grid))
+        is_lit = is_lit.reshape(camera_grid)
+        are_lit.append(is_lit | np.asarray(scipy.ndimage.binary_closing(is_lit, EIGHT), bool))
     borders = []
     for number, (total, grid) in enumerate(zip(totals, grids, strict=True)):
         others = [is_lit for other, is_lit in enumerate(are_lit) if other != number]
