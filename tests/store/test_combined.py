@@ -29,7 +29,10 @@ def members(device, S, form, channels=1):
     return made
 
 
-def is_alike(T: ltcl.CombinedTransport, twin: ltcl.CombinedTransport) -> None:
+def is_alike(T: ltcl.CombinedTransport, twin: ltcl.Transport) -> None:
+    assert isinstance(twin, ltcl.CombinedTransport)
+    assert twin.ceilings is not None
+    assert T.ceilings is not None
     pattern = random.random(T.grid)
     np.testing.assert_allclose(twin @ pattern, T @ pattern, rtol=1e-6)
     np.testing.assert_allclose(twin.ceilings, T.ceilings)

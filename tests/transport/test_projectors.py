@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,11 +102,10 @@ def test_balance_is_a_ceiling(members, balance):
 
 
 def test_shared_light_is_direct(T):
-    wanted = 0.2 + 0.1 * random.random((np.prod(CAMERA), 1))
-    smooth = np.full_like(wanted, wanted.mean())
+    smooth = np.full((CAMERA[0] * CAMERA[1], 1), 0.25)
     (pattern,) = T.share_light([smooth])
     patterns = T.split(pattern.reshape(T.grid))
-    seen = sum(p.direct() @ q.ravel() for p, q in zip((LEFT, RIGHT), patterns, strict=True))
+    seen = LEFT.direct() @ patterns[0].ravel() + RIGHT.direct() @ patterns[1].ravel()
     inner = np.zeros(CAMERA, bool)
     inner[2:-2, 2:5] = True
     inner[2:-2, -5:-2] = True
@@ -165,7 +165,7 @@ def test_refusals(device, members, T):
     blocks = [[one.matrices[0]] * 3] * 3
     coupled = ltcl.Transport(blocks, one.grid, camera_grid=CAMERA, device=device)
     black = np.zeros(CAMERA)
-    for match, transports, options in (
+    cases: tuple[tuple[str, Any, dict[str, Any]], ...] = (
         ("1 members.*2 to 8", [one], {}),
         ("9 members", [one] * 9, {}),
         (r"transports\[1\].*camera_grid \(1, 4\)", [one, other_camera], {}),
@@ -181,13 +181,14 @@ def test_refusals(device, members, T):
         ("blacks is None", members, {"black": "uniform"}),
         ("blacks has 1 pictures", members, {"blacks": [black]}),
         ("scene has grid", members, {"scene": ltcl.Transport(np.eye(4), (2, 2), device=device)}),
-    ):
+    )
+    for match, transports, options in cases:
         with pytest.raises(InputError, match=match):
             ltcl.combine(transports, **options)
     with pytest.raises(InputTypeError, match="list of"):
         ltcl.combine(one)
     with pytest.raises(InputTypeError, match=r"transports\[1\] is a int"):
-        ltcl.combine([one, 3])
+        ltcl.combine([one, 3])  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"3 patterns.*2 projectors"):
         T.join([np.ones(one.grid)] * 3)
     with pytest.raises(InputError, match=r"pattern\[1\] has shape"):

@@ -68,6 +68,7 @@ def test_the_best_within_the_bounds(members, balance):
     T = ltcl.combine(members, balance=balance)
     target = 3.0 * DESIRED
     c = ltcl.compensate(T, target, rtol=1e-3)
+    assert T.ceilings is not None
     upper = np.maximum(T.ceilings, 1e-9)
     best = lsq_linear(T.to_numpy(), target.ravel(), (0.0, upper), method="bvls", tol=1e-12)
     least = np.sqrt(2.0 * best.cost) / np.linalg.norm(target)
@@ -157,6 +158,7 @@ def test_uniform_black(device, members):
     c = ltcl.compensate(T, np.zeros(CAMERA), rtol=1e-3)
     seen = T @ c.pattern + sum(blacks)
     np.testing.assert_allclose(seen, T.black_level[0], rtol=0.02)
+    assert T.contrast is not None
     assert T.contrast.uniform < T.contrast.measured
     assert "uniform black" in str(T.contrast)
     kept = ltcl.combine(members, blacks=blacks)
