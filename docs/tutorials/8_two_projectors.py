@@ -12,9 +12,9 @@ and with the light undone that bounces between the walls.
 # Two scans with one camera
 # -------------------------
 #
-# Each projector was scanned while the other one was off, and the camera did not move. Here the scans
-# are computed: S, the light between the walls, is the same for both, and F says what a projector
-# lights. The right one is brighter and has other pixels.
+# Each projector was scanned while the other one was off, and the camera did not move. Here the
+# scans are computed: S, the light between the walls, is the same for both, and F says what a
+# projector lights. The right one is brighter and has other pixels.
 
 import numpy as np
 

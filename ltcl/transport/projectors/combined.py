@@ -96,6 +96,17 @@ class CombinedTransport(Transport):
         Light that compensation counts as there already: the blacks, less `black_level`.
     blacks : list of (M, 1), or None
         The sum of the blacks of all projectors, for each channel.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> one = ltcl.Transport(numpy.eye(4), grid=(2, 2), camera_grid=(2, 2))
+    >>> T = ltcl.combine([one, one])
+    >>> isinstance(T, ltcl.CombinedTransport), T.grid
+    (True, (2, 4))
+    >>> print(T @ [numpy.full((2, 2), 0.5), numpy.full((2, 2), 0.25)])
+    [[0.75 0.75]
+     [0.75 0.75]]
     """
 
     def __init__(
