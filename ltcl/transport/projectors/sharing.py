@@ -37,7 +37,9 @@ BLENDS = {"smooth": 2.0, "linear": 1.0}
 # Times the mean direct light of a projector: dimmer camera pixels are not lit by it.
 MIN_SEEN_SHARE = 0.02
 # Share of a projector pixel's light that falls beside what others light alone, at a border.
-BORDER_SHARE = 0.3
+BORDER_SHARE = 0.2
+# Side of the window of camera pixels in which the light of a projector falls to nothing.
+LIT_REACH = 5
 # Camera pixels at the border of a projector in which its light falls off.
 BORDER_REACH = 2
 # Weights of B_k below this part of the largest in a row are left out.
@@ -104,8 +106,10 @@ def find_borders(
     for total in totals:
         white = _row_sums(total)
         mean = float(white.sum()) / max(np.count_nonzero(white), 1)
-        is_lit = white > MIN_SEEN_SHARE * mean
-        is_lit = is_lit.reshape(camera_grid)
+        picture = white.reshape(camera_grid)
+        # At half of the light beside it, a projector ends.
+        beside = scipy.ndimage.maximum_filter(picture, LIT_REACH, mode="nearest")
+        is_lit = (picture > MIN_SEEN_SHARE * mean) & (picture > 0.5 * beside)
         are_lit.append(is_lit | np.asarray(scipy.ndimage.binary_closing(is_lit, EIGHT), bool))
     borders = []
     for number, (total, grid) in enumerate(zip(totals, grids, strict=True)):
