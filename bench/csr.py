@@ -25,6 +25,8 @@ PEERS = {"scipy": "scipy.sparse", "sparse_dot_mkl": "MKL", "cupy": "cuSPARSE (Cu
 # Least ratio to SciPy by right-hand sides, and to cuSPARSE, on a GPU.
 SCIPY_TARGET = {1: 2.0, 8: 3.5}
 CUSPARSE_TARGET = 0.95
+# Least ratio to MKL with one right-hand side.
+MKL_TARGET = 1.0
 # Ratio of the time of one side alone to the time a side.
 SIDE_TARGET = {4: 1 / 0.4, 8: 1 / 0.25}
 # Share of the triad's bytes a second, if a row is made of runs.
@@ -85,6 +87,8 @@ def product_actions(options: Options, name: str, A: Any) -> dict[str, Callable[[
 def peer_rows(question: str, k: int, ms: dict[str, float]) -> list[Row]:
     """Compare with all peers that are installed."""
     targets = {"scipy": SCIPY_TARGET.get(k), "cupy": CUSPARSE_TARGET}
+    if k == 1:
+        targets["sparse_dot_mkl"] = MKL_TARGET
     ours = ms[f"ours {k}"]
     rows = []
     for peer, competitor in PEERS.items():

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Product of a matrix in compressed sparse rows with K right-hand sides, and steps of an iteration
-// along one. The two kernels (a work-item or a work-group a row), their defines and
+// along one. The two kernels (a work-item a row, or a work-group for some), their defines and
 // PRODUCT_ARGUMENTS: common/product.h.
 //
 // Layout: a slab of rows.
@@ -25,7 +25,9 @@ kernel void csr_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 
 kernel void csr_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    const int begin = pointers[get_group_id(0)] + get_local_id(0);
-    const int end = pointers[get_group_id(0) + 1];
-    BY_GROUP(row_add(true, sum.item, columns, values, x + offset, stride, begin, end, items));
+    global const real *from = x + offset;
+    BY_GROUP(
+        row_add(
+            true, sum.item, columns, values, from, stride, pointers[row] + me, pointers[row + 1],
+            items));
 }

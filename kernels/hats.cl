@@ -5,12 +5,11 @@
 // out = a (W x) + b y, where W is
 //
 //   hats_gather  sums of the pixels under each hat, a level from those of the level before
-//   hats_spread  the transpose: to each pixel, the sum of the hats above it
+//   hats_spread  the transpose: to each pixel, the sum of the hats above it, a level from the one above
 //
 // A hat is the sum of those of the level before: of its own node, and half of its neighbours.
 // Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A
-// launch of hats_gather of several levels takes one group a piece, which waits for itself between
-// them.
+// launch of several levels takes one group a piece, which waits for itself between them.
 //
 // Required define: K, see common/lanes.h. Layout: nodes level by level, the finest first, each
 // row-major, right-hand sides side by side.
@@ -69,39 +68,62 @@ kernel void hats_gather(
     }
 }
 
+// A level: its sides, and where its nodes begin.
+typedef struct {
+    int h, w, at;
+} hats_level;
+
+INLINE hats_level hats_level_at(int height, int width, int level)
+{
+    hats_level v = {height, width, 0};
+    for (; level > 0; --level) {
+        v.at += v.h * v.w;
+        v.h = v.h / 2 + 1;
+        v.w = v.w / 2 + 1;
+    }
+    return v;
+}
+
 kernel void hats_spread(
     int height,            // rows of the picture
     int width,             // columns of the picture
+    int first_level,       // levels end_level - 1 .. first_level are made,
+    int end_level,         // those above are in `sums` already
     int levels,            // of the hats
     int k,                 // right-hand sides
     real a,                // factor of W^T x
     real b,                // factor of y
     global const real *x,  // (nodes, k)
+    global real *sums,     // of a level and all above, with a spare one between levels
     global const real *y,  // like out; not read where b is 0
-    global real *out)      // the picture, (height width, k)
+    global real *out)      // the picture, (height width, k); written where first_level is 0
 {
     const piece p = piece_of(get_global_id(0), k);
-    for (int row = get_global_id(2); row < height; row += get_global_size(2))
-        for (int column = get_global_id(1); column < width; column += get_global_size(1)) {
-            lanes sum = 0;
-            for (int level = 0, h = height, w = width, at = 0; level < levels; ++level) {
-                const int top = row >> level, left = column >> level;
-                // Distances from the node above and to the left, in those of two nodes.
-                const real down = ldexp((real)(row - (top << level)), -level);
-                const real across = ldexp((real)(column - (left << level)), -level);
-                // A pixel on a node has no node behind it that counts, and at the rim none at all.
-                const int rows = down > 0 ? 2 : 1, columns = across > 0 ? 2 : 1;
-                for (int i = 0; i < rows; ++i)
-                    for (int j = 0; j < columns; ++j) {
-                        const real vertical = i ? down : 1 - down;
-                        const real horizontal = j ? across : 1 - across;
-                        const int node = at + (top + i) * w + left + j;
-                        sum += vertical * horizontal * LOAD(x + node * k + p.at);
-                    }
-                at += h * w;
-                h = h / 2 + 1;
-                w = w / 2 + 1;
+    for (int level = end_level - 1; level >= first_level; --level) {
+        const hats_level here = hats_level_at(height, width, level);
+        const hats_level next = hats_level_at(height, width, level + 1);
+        const bool is_top = level + 1 == levels;
+        global const real *above = sums + (next.at + level + 1) * k + p.at;
+        global real *to = sums + (here.at + level) * k + p.at;
+        for (int row = get_global_id(2); row < here.h; row += get_global_size(2))
+            for (int column = get_global_id(1); column < here.w; column += get_global_size(1)) {
+                const int node = row * here.w + column;
+                lanes sum = LOAD(x + (here.at + node) * k + p.at);
+                if (!is_top) {
+                    // A node between two of the level above is half of each.
+                    const int top = row >> 1, left = column >> 1;
+                    const int rows = 1 + (row & 1), columns = 1 + (column & 1);
+                    lanes around = 0;
+                    for (int i = 0; i < rows; ++i)
+                        for (int j = 0; j < columns; ++j)
+                            around += LOAD(above + ((top + i) * next.w + left + j) * k);
+                    sum += around / (rows * columns);
+                }
+                if (level > 0)
+                    put(to, node * k, sum, p.skip, 1, 0, x);
+                else
+                    put(out, node * k + p.at, sum, p.skip, a, b, y);
             }
-            put(out, (row * width + column) * k + p.at, sum, p.skip, a, b, y);
-        }
+        barrier(CLK_GLOBAL_MEM_FENCE);
+    }
 }

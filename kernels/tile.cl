@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Product of a sparse matrix of tiles with K right-hand sides, and steps of an iteration along one.
-// The two kernels (a work-item or a work-group a row) and PRODUCT_ARGUMENTS: common/product.h.
+// The two kernels (a work-item a row, or a work-group for some) and PRODUCT_ARGUMENTS: common/product.h.
 //
 // A tile is WIDTH neighbouring columns of one row: one column index for WIDTH numbers, and x is
 // read in wide loads. Columns that no nonzero claims hold zeros, and no tile reaches beyond the end
@@ -49,8 +49,9 @@ typedef real narrow;
 // lower. No stored number is subnormal. PoCL compiles vload_half() to a call.
 typedef ushort narrow;
 #define WIDEN(p) (as_float(((int)((uint) * (p) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
-#define WIDEN8(p) \
-    (as_float8((as_int8(convert_uint8(LOAD8_USHORT(p)) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
+#define FROM_HALVES(v) \
+    (as_float8((as_int8(convert_uint8(v) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
+#define WIDEN8(p) FROM_HALVES(LOAD8_USHORT(p))
 #elif VALUES == 2
 typedef char narrow;
 #define WIDEN(p) ((real) * (p))
@@ -68,16 +69,36 @@ typedef char narrow;
 #define SCALE8(j)
 #endif
 
-// Add every `step`-th number from number `n` of the tiles on.
+// Tile j of eight numbers, which begins at a multiple of its size.
+#define TILE(j) (WIDEN8(values + (j) * 8) SCALE(j))
+#if VALUES == 0
+#define ALIGNED_TILE(j) (*(global const real8 *)(values + (j) * 8))
+#elif VALUES == 1
+#define ALIGNED_TILE(j) FROM_HALVES(*(global const ushort8 *)(values + (j) * 8))
+#else
+#define ALIGNED_TILE(j) (convert_float8(*(global const char8 *)(values + (j) * 8)) SCALE(j))
+#endif
+
+// Add every `step`-th tile from j on: an item takes a tile, whose numbers are one load.
 INLINE void tile_add(
     real *sum, global const PLACE *columns, global const narrow *values, global const uchar *scales,
-    global const real *x, int stride, int n, int end, int step)
+    global const real *x, int stride, int j, int end, int step)
 {
-    for (; n < end; n += step) {
-        const real v = WIDEN(values + n) SCALE(n / WIDTH);
-        const int i = (columns[n / WIDTH] + n % WIDTH) * stride;
-        for (int c = 0; c < K; ++c)
-            sum[c] = v * x[i + c] + sum[c];
+    for (; j < end; j += step) {
+#if WIDTH == 1
+        add_pixel(sum, WIDEN(values + j) SCALE(j), X(j));
+#else
+        const real8 v = ALIGNED_TILE(j);
+        global const real *y = X(j);
+        add_pixel(sum, v.s0, y);
+        add_pixel(sum, v.s1, y + stride);
+        add_pixel(sum, v.s2, y + 2 * stride);
+        add_pixel(sum, v.s3, y + 3 * stride);
+        add_pixel(sum, v.s4, y + 4 * stride);
+        add_pixel(sum, v.s5, y + 5 * stride);
+        add_pixel(sum, v.s6, y + 6 * stride);
+        add_pixel(sum, v.s7, y + 7 * stride);
+#endif
     }
 }
 
@@ -106,7 +127,6 @@ INLINE lanes tile_sum(
     for (; j < end; ++j)
         s0 = TILE_PRODUCT(j) + s0;
 #else
-#define TILE(j) (WIDEN8(values + (j) * 8) SCALE(j))
 #if K == 1
     if (stride == 1) {
         real8 t0 = 0, t1 = 0, t2 = 0, t3 = 0;
@@ -152,8 +172,9 @@ kernel void tile_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 
 kernel void tile_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    const int begin = pointers[get_group_id(0)] * WIDTH;
-    const int end = pointers[get_group_id(0) + 1] * WIDTH;
+    global const real *from = x + offset;
     BY_GROUP(
-        tile_add(sum.item, columns, values, scales, x + offset, stride, begin + me, end, items));
+        tile_add(
+            sum.item, columns, values, scales, from, stride, pointers[row] + me, pointers[row + 1],
+            items));
 }

@@ -258,6 +258,10 @@ INLINE void split_rows(level_arrays l, int i)
     constant real *taps = l.taps;
     real near[2 * CHUNK + TAPS + 8], detail[2 * CHUNK + TAPS + 8];
     const bool at_below = a.pairs + i < a.n;
+    // Outside the loop over columns: they divide.
+    term rows[TAPS];
+    for (int s = 0; s < TAPS; ++s)
+        rows[s] = split_term(a, i, s, false, taps);
     int done = 0;
     for (int start = 0; start + 8 <= b.regular; start = done) {
         const int pairs = min(CHUNK, b.regular - start) / 8 * 8;
@@ -269,7 +273,7 @@ INLINE void split_rows(level_arrays l, int i)
             global const real *p = l.low + (wide ? column : WRAPPED(column, 2 * b.regular));
             real8 u = 0, v = 0;
             for (int s = 0; s < TAPS; ++s) {
-                const term r = split_term(a, i, s, false, taps);
+                const term r = rows[s];
                 const real8 x = wide ? LOAD8(p + r.low * b.n) : (real8)(p[r.low * b.n]);
                 u = r.w[0] * x + u;
                 v = r.w[1] * x + v;
@@ -318,6 +322,10 @@ INLINE void join_rows(level_arrays l, int i)
     const bool at_below = lower < a.n * b.n;
     // The last pair of columns may stand at both ends of a row.
     const int whole = b.regular - FIRST;
+    // Outside the loop over columns: they divide.
+    term rows[HALF];
+    for (int s = 0; s < HALF; ++s)
+        rows[s] = join_term(a, i, s, false, taps);
     int done = 0;
     for (int start = 0; start + 8 <= whole; start = done) {
         const int pairs = min(CHUNK, whole - start) / 8 * 8;
@@ -330,7 +338,7 @@ INLINE void join_rows(level_arrays l, int i)
             global const real *near = l.low + at, *x = l.x + at;
             real8 l0 = 0, l1 = 0, h0 = 0, h1 = 0;
             for (int s = 0; s < HALF; ++s) {
-                const term r = join_term(a, i, s, false, taps);
+                const term r = rows[s];
                 const int row = r.low * l.width + b.pairs, below = r.high * l.width;
                 global const real *ll = near + r.low * l.pitch, *lh = x + row;
                 global const real *hl = x + below, *hh = hl + b.pairs;

@@ -7,25 +7,19 @@ launch may ask for more than its kernel and device allow.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ltcl
-from ltcl.device import Device, sources
+from ltcl.device import Device
 from ltcl.solvers import METHODS, matrix_series
 
 SCENE = ltcl.scenes.dihedral(4, albedo=0.6)
 DESIRED = np.linspace(0.1, 0.3, 32, dtype=np.float32).reshape(SCENE.grid)
-
-# Programs that offline compilers of GPUs take; see bench/gpu_static.py.
-RECORD = Path(__file__).parents[1] / "bench" / "results" / "gpu_static.json"
-
 
 # A call, and the error that it may have at most.
 CALLS: dict[str, tuple[Callable[[Device], float], float]] = {}
@@ -149,21 +143,3 @@ def test_calls_work_in_the_launch_shape_of_a_gpu(
     monkeypatch.setenv("LTCL_TUNE", "0")
     function, largest_error = CALLS[name]
     assert function(shaped) <= largest_error
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shaped", ["gpu"], indirect=True)
-def test_programs_are_in_the_record(shaped: Device) -> None:
-    """Offline compilers of GPUs know the files and defines that the calls above have used.
-
-    Values of defines may be others: they depend on the device.
-    """
-    recorded = set()
-    for program in json.loads(RECORD.read_text(encoding="utf-8"))["programs"]:
-        recorded.add((program["file"], *sorted(program["defines"])))
-    missing = []
-    for file, *defines in shaped.session.programs:
-        names = [name for name, _ in defines]
-        if (sources.folder() / f"{file}.cl").is_file() and (file, *names) not in recorded:
-            missing.append((file, *names))
-    assert not missing, "bench/gpu_static.py says how they get into its record"

@@ -98,6 +98,10 @@ for record in done.records[::4]:
 #    ltcl show patterns --every 0.0417
 #    # or compensated while it plays, in a window for the projector (extra view)
 #    ltcl play film.mp4 T.npz
+#    # or between other programs, as raw video
+#    ffmpeg -i film.mp4 -f rawvideo -pix_fmt rgb24 -s 640x480 - |
+#        ltcl play --pipe --video-size 640x480 --gain 0.4 - T.npz |
+#        ffplay -f rawvideo -pixel_format rgb24 -video_size 48x24 -framerate 25 -
 #
 # A pattern has as many pixels as the projector's grid in T. ``ltcl show`` and ``ltcl play`` make
 # each pixel a square, where the scan had it. ``--video patterns.mkv`` writes a film for other
@@ -108,6 +112,7 @@ for record in done.records[::4]:
 #
 # ``ltcl play`` drops frames that would be late, and tells how many frames a second it reached. For
 # a large T make it fast first: ``ltcl compress``, then ``ltcl invert`` (:doc:`6_large`). Films over
-# several machines: :doc:`../guide/cluster`.
+# several machines: :doc:`../guide/cluster`; pipes, control by OSC and files for other software:
+# :doc:`../guide/shows`.
 
 # sphinx_gallery_thumbnail_number = 10

@@ -34,11 +34,41 @@ typedef OF(real, K) lanes;
 #define STORE(v, x) OF(STORE, K)(v, x)
 #endif
 
+// Where K = stride, the values of a pixel begin at a multiple of so many lanes: a GPU loads them at
+// once. Buffers begin at multiples of 128 bytes.
+#if defined(PACKED) && (K == 2 || K == 4 || K == 8)
+#if K == 2
+#define ALIGNED_LANES 2
+#else
+#define ALIGNED_LANES 4
+#endif
+typedef OF(real, ALIGNED_LANES) aligned_lanes;
+typedef union {
+    aligned_lanes part[K / ALIGNED_LANES];
+    real item[K];
+} aligned_pixel;
+#endif
+
 // The sums of a row, one for each right-hand side.
 typedef union {
     lanes vector;
     real item[sizeof(lanes) / sizeof(real)];
 } lane_sums;
+
+// Add v times the K values of a pixel, which lie at p.
+INLINE void add_pixel(real *sum, real v, global const real *p)
+{
+#ifdef ALIGNED_LANES
+    aligned_pixel pixel;
+    for (int part = 0; part < K / ALIGNED_LANES; ++part)
+        pixel.part[part] = ((global const aligned_lanes *)p)[part];
+    for (int c = 0; c < K; ++c)
+        sum[c] = v * pixel.item[c] + sum[c];
+#else
+    for (int c = 0; c < K; ++c)
+        sum[c] = v * p[c] + sum[c];
+#endif
+}
 
 // Right-hand sides at .. at + K - 1, of which the first `skip` are those of the piece before.
 typedef struct {

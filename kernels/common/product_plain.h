@@ -20,6 +20,7 @@
         global const real *y, global real *out
 #define PRODUCT_NAMES rows, first, stride, offset, a, b, c, x, y, out
 #define SUM_SQUARES
+#define SUM_ROWS(is_first)
 #define KEEP_SQUARES
 
 INLINE void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)

@@ -31,6 +31,16 @@
 #define PRODUCT_NAMES \
     rows, first, stride, offset, a, c, keep, gain, first_group, x, iterate, r, next_x, partials
 #define SUM_SQUARES group_sums(sum.item, scratch)
+// The squares of the rows of a group, which their first items have.
+#if ROWS > 1
+#define SUM_ROWS(is_first) \
+    for (int k = 0; k < K; ++k) \
+        sum.item[k] = is_first ? sum.item[k] : 0; \
+    barrier(CLK_LOCAL_MEM_FENCE); \
+    group_sums(sum.item, scratch)
+#else
+#define SUM_ROWS(is_first)
+#endif
 #define KEEP_SQUARES \
     for (int k = 0; k < K && get_local_id(0) == 0; ++k) \
     partials[(first_group + (int)get_group_id(0)) * stride + offset + k] = sum.item[k]

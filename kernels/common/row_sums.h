@@ -17,14 +17,24 @@
 // 16 columns side by side: most light comes so.
 #define RUN(j) ((j) + 16 <= end && COLUMN((j) + 15) == COLUMN(j) + 15)
 
-// Add every `step`-th entry from j on.
+// Add every `step`-th entry from j on. Four entries are on their way at once: each is a column, and
+// then the numbers at it.
 INLINE void row_add(
     bool sparse, real *sum, global const int *columns, global const real *values,
     global const real *x, int stride, int j, int end, int step)
 {
+    for (; j < end - 3 * step; j += 4 * step) {
+        int at[4];
+        real v[4];
+        for (int u = 0; u < 4; ++u) {
+            at[u] = COLUMN(j + u * step) * stride;
+            v[u] = values[j + u * step];
+        }
+        for (int u = 0; u < 4; ++u)
+            add_pixel(sum, v[u], x + at[u]);
+    }
     for (; j < end; j += step)
-        for (int c = 0; c < K; ++c)
-            sum[c] = values[j] * x[COLUMN(j) * stride + c] + sum[c];
+        add_pixel(sum, values[j], x + COLUMN(j) * stride);
 }
 
 // A run of 8 neighbouring columns times x, whose 8 K values lie side by side, needs K wide loads
@@ -64,6 +74,19 @@ INLINE lanes row_sum(
     lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
     run_sums even = {{0}}, odd = {{0}};
     bool has_runs = false;
+    if (!sparse && K == 1 && RUNS) {
+        // A dense row of one right-hand side comes so fast that two sums would be waited for.
+        run_sums third = {{0}}, fourth = {{0}};
+        for (; j + 32 <= end; j += 32) {
+            has_runs = true;
+            add_run(&even, LOAD8(values + j), x + j);
+            add_run(&odd, LOAD8(values + j + 8), x + j + 8);
+            add_run(&third, LOAD8(values + j + 16), x + j + 16);
+            add_run(&fourth, LOAD8(values + j + 24), x + j + 24);
+        }
+        even.part[0] += third.part[0];
+        odd.part[0] += fourth.part[0];
+    }
     while (j + 4 <= end) {
         if (RUNS && RUN(j)) {
             has_runs = true;

@@ -8,6 +8,7 @@
                   camera's full resolution wait in a file (`scratch`, `radiance`)
     scanning/     patterns in order, and T from the pictures; a plan before, a report after
     estimation/   T from any pairs of pictures and photographs
+    captures/     photographs of Gray code that other programs took
     updating/     a finished scan carried over by 12 photographs, after a nudge
     agreement     photographs that deviate from the others are refused by number; `anchor`: did
                   anything move?
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 from ltcl.acquisition.alignment import Alignment, align
 from ltcl.acquisition.calibration import Calibration, Setup
+from ltcl.acquisition.captures import Capture, PhotographOrder, import_gray_code
 from ltcl.acquisition.estimation.fit import Fit, fit
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.project import Project
@@ -42,6 +44,7 @@ from ltcl.acquisition.updating.task import Update, update
 __all__ = [
     "Alignment",
     "Calibration",
+    "Capture",
     "Correspondence",
     "Display",
     "Fit",
@@ -50,6 +53,7 @@ __all__ = [
     "LiveRig",
     "MitsubaRig",
     "OpenCVCamera",
+    "PhotographOrder",
     "Project",
     "Report",
     "Rig",
@@ -63,5 +67,6 @@ __all__ = [
     "camera_map",
     "finalize",
     "fit",
+    "import_gray_code",
     "update",
 ]

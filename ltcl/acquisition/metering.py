@@ -208,7 +208,7 @@ def find_white_exposure(session: CaptureSession) -> float:
             break
         if level == previous_level:
             _check_bits(shots, level)
-        following = nearest(shots.exposures, seconds * _exposure_factor(level))
+        following = nearest(shots.exposures, seconds * exposure_factor(level))
         if following == seconds:
             _check_not_saturated(photograph)
             break
@@ -217,7 +217,7 @@ def find_white_exposure(session: CaptureSession) -> float:
     return seconds
 
 
-def _exposure_factor(level: float) -> float:
+def exposure_factor(level: float) -> float:
     """Factor for the exposure when the brightest pixels have this code."""
     if level >= SATURATED_CODE:
         return 1 / 4

@@ -41,7 +41,7 @@ class RadiancePicture(Protocol):
 
     @property
     def valid(self) -> np.ndarray:
-        """Whether the pixel is known."""
+        """True where the pixel is known."""
         ...
 
     def rows(self, rows: slice) -> Radiance:
@@ -107,7 +107,7 @@ class StoredRadiance:
 
     @property
     def valid(self) -> np.ndarray:
-        """Whether a pixel is known, read as a whole."""
+        """True where a pixel is known, read as a whole."""
         return self.validity.read()
 
     def rows(self, rows: slice) -> Radiance:

@@ -140,7 +140,7 @@ class BatchSolver:
         )
 
     def _compensator(self) -> Compensator | None:
-        """What frames go through, made at the first one; None if the options ask for more."""
+        """The compensator of all frames, made at the first one; None if options ask for more."""
         if self._is_prepared or not PREPARED_OPTIONS.issuperset(self._given_options()):
             return self._prepared
         self._is_prepared = True

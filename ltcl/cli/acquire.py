@@ -14,8 +14,10 @@ import typer
 
 from ltcl import checks, store
 from ltcl.cli import options
+from ltcl.cli.aim import aim
 from ltcl.cli.command import WAITING, Answer, Context, command
 from ltcl.cli.fit import fit
+from ltcl.cli.importing import import_photographs
 from ltcl.cli.options import file_option, option
 from ltcl.cli.reports.acquisition import (
     NextPhotograph,
@@ -147,7 +149,7 @@ def _plan_lines(report: PlanReport) -> list[str]:
 
 
 def _computing_line(report: PlanReport) -> str:
-    """How long the computer works besides, by the pace that was measured."""
+    """The time that the computer works besides, by the pace that was measured."""
     if report.megapixels is None:
         return (
             "time: exposures and overhead; computing adds about "
@@ -359,7 +361,9 @@ def _channels(result: Any) -> Channels:
     return result.transport.channels
 
 
+app.command("aim")(aim)
 app.command("fit")(fit)
+app.command("import")(import_photographs)
 
 
 @app.command("report")

@@ -50,11 +50,12 @@ UsageError: Any = typer.BadParameter.__base__
 
 @dataclass(frozen=True, kw_only=True)
 class Context:
-    """A running command: its name, its options by name, and its progress."""
+    """A running command: its name, its options by name, its progress, and if it prints JSON."""
 
     name: str
     options: dict[str, Any]
     progress: Progress
+    json: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,10 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
                 try:
                     with interrupt.raised(), Progress(quiet) as progress:
                         context = Context(
-                            name=function.__name__, options=options, progress=progress
+                            name=function.__name__,
+                            options=options,
+                            progress=progress,
+                            json=json,
                         )
                         answer = function(context, **own_values)
                     _print_answer(answer, json)

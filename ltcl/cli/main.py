@@ -19,6 +19,7 @@ from ltcl.cli import (
     convert,
     demo,
     doctor,
+    export,
     film,
     info,
     ranks,
@@ -60,7 +61,7 @@ PANELS: dict[str, list[Any]] = {
         transform.invert,
         transform.denoise,
     ],
-    "Display": [view.view, show.play, show.show],
+    "Display": [view.view, show.play, show.show, export.export],
     "Measurement": [simulate.simulate],
 }
 for _panel, _commands in PANELS.items():

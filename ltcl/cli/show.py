@@ -8,7 +8,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ltcl.cli import compensation, loading, options
+from ltcl.cli import compensation, control, loading, options, pipe
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option, picture_option
 from ltcl.cli.reports.program import PlayReport, ShowReport
@@ -17,11 +17,20 @@ from ltcl.cli.view import address, address_options
 from ltcl.errors import InputError
 
 
-@command(*options.READ_OPTIONS, options.frame_options, address_options)
+@command(
+    *options.READ_OPTIONS,
+    options.frame_options,
+    address_options,
+    pipe.pipe_options,
+    control.control_options,
+)
 def play(
     context: Context,
     film: Annotated[
-        Path, argument("FILM", "A video, whose sound is left out, or a folder of pictures.")
+        Path,
+        argument(
+            "FILM", "A video, whose sound is left out, a folder of pictures, or - with --pipe."
+        ),
     ],
     transport: options.TransportFile,
     gain: compensation.FilmGain = None,
@@ -38,13 +47,28 @@ def play(
     A film of other proportions lies between black bars, unless --resize says otherwise. Ctrl-C ends
     it. Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT, makes it
     fast.
+
+    With --pipe frames come as raw video from stdin, and their codes go to stdout, for other
+    programs: ffmpeg ... -f rawvideo - | ltcl play --pipe ... - TRANSPORT | ffplay ...
+    With --osc other programs control the show.
     """
-    from ltcl.images.frames import open_frames
-    from ltcl.show.player import play as run_film
-    from ltcl.show.window import Window
+    is_stdin = str(film) == "-"
+    if context.options["pipe"] != is_stdin:
+        given = "given" if context.options["pipe"] else "not given"
+        raise InputError(f"FILM is {film}, but --pipe is {given}; raw video on stdin takes both")
+    if is_stdin:
+        pipe.check(context, gain)
+    with control.controlled(context) as asked:
+        if is_stdin:
+            scene, settings = _load_scene(context, transport)
+            return pipe.run(context, scene, gain, resize, {**settings, "control": asked})
+        return _play_in_window(context, film, transport, gain, resize, asked)
+
+
+def _load_scene(context: Context, transport: Path) -> tuple[Any, dict[str, Any]]:
+    """Load the transport and its set-up, and the settings of frames."""
     from ltcl.viewer.answers import ViewerScene
 
-    source = open_frames(film)
     T = loading.load(context, transport)
     setup = loading.load_setup(transport)
     settings: dict[str, Any] = {
@@ -52,7 +76,19 @@ def play(
         "inverse": loading.load_inverse(context, T),
         "background": None if setup is None else setup.ambient,
     }
-    scene = ViewerScene(T, transport.name, {}, setup)
+    return ViewerScene(T, transport.name, {}, setup), settings
+
+
+def _play_in_window(
+    context: Context, film: Path, transport: Path, gain: Any, resize: str, control: Any
+) -> Answer:
+    """Play a film in a projector window."""
+    from ltcl.images.frames import open_frames
+    from ltcl.show.player import play as run_film
+    from ltcl.show.window import Window
+
+    source = open_frames(film)
+    scene, settings = _load_scene(context, transport)
     report = PlayReport(film=film)
     with Window(film.name, **address(context)) as window:
         print_line(f"{window.url} plays {film}; Ctrl-C ends it")
@@ -61,9 +97,10 @@ def play(
                 scene,
                 source,
                 window,
-                compensation.resolve_gain(gain, setup),
+                compensation.resolve_gain(gain, scene.setup),
                 context.progress,
                 resize,
+                control=control,
                 **settings,
             )
             report = PlayReport(film=film, **dataclasses.asdict(pace))

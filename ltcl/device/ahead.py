@@ -2,7 +2,8 @@
 """Programs that are built beside an upload, by a thread, before a first product or solve asks.
 
 A compiler takes 20 to 500 ms for a program, also for one that it finds in its own cache. Who needs
-a program sooner builds it, or waits for the thread.
+a program sooner builds it, or waits for the thread. Other drivers than PoCL keep what they
+compiled.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ if TYPE_CHECKING:
 
 # Name of the threads.
 THREAD = "ltcl builds"
-# Programs (file, defines) of vectors and solvers, which a first solve runs.
-_of_solves: list[tuple[str, Mapping[str, Any]]] = [("vector", {})]
+# Programs (file, defines) of vectors, which every use of a device runs, and of first solves.
+_of_vectors: list[tuple[str, Mapping[str, Any]]] = [("vector", {})]
+_of_solves = list(_of_vectors)
 
 
 def announce(file: str, defines: Mapping[str, Any]) -> None:
@@ -30,15 +32,22 @@ def announce(file: str, defines: Mapping[str, Any]) -> None:
 
 
 def begin(device: Device, file: str, defines: Mapping[str, Any], *, solves: bool = False) -> None:
-    """Begin to build a program of products; with `solves` those of solves, too.
-
-    Other drivers than PoCL compile faster, or keep what they compiled.
-    """
-    if pocl_cache.DRIVER not in device.driver:
-        return
+    """Begin to build a program of products; with `solves` those of solves, too."""
     programs = [(file, defines)]
     if solves:
         programs += _of_solves
+    _start(device, programs)
+
+
+def begin_with_vectors(device: Device) -> None:
+    """Begin to build what every use of a new device runs; a compiler also has to start itself."""
+    _start(device, _of_vectors)
+
+
+def _start(device: Device, programs: list[tuple[str, Mapping[str, Any]]]) -> None:
+    """Start a thread where some programs are not built."""
+    if pocl_cache.DRIVER not in device.driver:
+        return
     waiting = [program for program in programs if not device.has_program(*program)]
     if waiting:
         threading.Thread(target=_build, args=(device, waiting), name=THREAD).start()

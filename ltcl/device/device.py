@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import driver_errors, sources
+from ltcl.device import driver_errors, huge_pages, sources
 from ltcl.device.arrays import Array, rounded
 from ltcl.device.kernels import Kernel
 from ltcl.errors import MemoryLimitError
@@ -174,12 +174,16 @@ class Device:
         if size > self._largest_pooled:
             self.allocations += 1
             pool.free_held()
-            return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)
+            buffer = self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)
+            huge_pages.ask(self, buffer, size)
+            return buffer
         unused_blocks = pool.held_blocks
         # The pool frees unused blocks and tries again by itself.
         buffer = pool.allocate(size)
         is_new = pool.held_blocks >= unused_blocks
         self.allocations += is_new
+        if is_new:
+            huge_pages.ask(self, buffer, size)
         return buffer
 
     def upload(self, values: Any, dtype: Any = np.float32) -> Array:

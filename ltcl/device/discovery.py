@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ltcl.device import driver_errors, pocl_processor
+from ltcl.device import ahead, driver_errors, pocl_processor
 from ltcl.device import pocl_linker as linker
 from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
@@ -182,6 +182,7 @@ def _open(description: Description, others: tuple[Device, ...] = ()) -> Device:
         if device is None:
             device = Device(description)
             _opened[description.index] = device
+            ahead.begin_with_vectors(device)
         device.others = others
         return device
 

@@ -128,7 +128,7 @@ class Kernel:
 
 
 def in_order(launches: Sequence[Queued]) -> Queued:
-    """One function that queues all of these, one after the other."""
+    """Make a function that queues all of these, one after the other."""
     if len(launches) == 1:
         return launches[0]
     kept = tuple(launches)

@@ -300,7 +300,7 @@ def _list_pictures(folder: Path) -> list[Path]:
         entries = list(folder.iterdir())
     except OSError as error:
         raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
-    files = sorted(filter(_is_picture, entries), key=_natural_order)
+    files = sorted(filter(_is_picture, entries), key=natural_order)
     if not files:
         raise FileError(f"{folder}: holds no pictures; frames are {', '.join(BITS)}")
     for file, next_file in itertools.pairwise(files):
@@ -316,7 +316,7 @@ def _is_picture(file: Path) -> bool:
     return not is_hidden and file.suffix.lower() in BITS and file.is_file()
 
 
-def _natural_order(file: Path) -> tuple[list[str | int], str]:
+def natural_order(file: Path) -> tuple[list[str | int], str]:
     """Key to sort by: numbers in names compare as numbers."""
     key: list[str | int] = []
     for place, piece in enumerate(re.split(r"(\d+)", file.stem.lower())):

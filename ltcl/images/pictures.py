@@ -98,7 +98,7 @@ def read_srgb(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> n
     Parameters
     ----------
     path, encoding
-        Those of `read`.
+        As in `read`.
 
     Returns
     -------
@@ -108,7 +108,7 @@ def read_srgb(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> n
     Raises
     ------
     FileError, MemoryLimitError
-        Those of `read`.
+        As in `read`.
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     stored = _read_stored(as_path(path), encoding, upright=True, memory=NO_LIMIT)

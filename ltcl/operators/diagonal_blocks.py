@@ -25,12 +25,15 @@ from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.knowledge import NormBound
 from ltcl.operators.rows import RowOperator
+from ltcl.operators.scaled_columns import ScaledColumns
 from ltcl.operators.tile_packing import Packed, joined_diagonally
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
 # Bytes up to which matrices are joined, which takes as many once more.
 MAX_JOINED_BYTES = 1 << 26
+# Bytes of all operators up to which launches count more.
+MAX_SMALL_BYTES = 1 << 24
 
 
 class Place(NamedTuple):
@@ -121,11 +124,25 @@ def block_diagonal(blocks: Sequence[Operator]) -> Operator:
     first = check_blocks(blocks)
     if len(blocks) == 1:
         return first
-    for join in (_join_systems, _join_compressed, _join_csr, _join_tiles):
+    for join in (_join_systems, _join_scaled, _join_compressed, _join_csr, _join_tiles):
         joined = join(blocks)
         if joined is not None:
             return joined
     return BlockDiagonal(blocks)
+
+
+def joined_once(blocks: Sequence[Operator]) -> Operator:
+    """`block_diagonal` of these operators, made once in the life of the first."""
+    known = blocks[0].known
+    names = tuple(map(id, blocks))
+    if known.joined is None or known.joined[0] != names:
+        known.joined = (names, block_diagonal(blocks))
+    return known.joined[1]
+
+
+def are_small(blocks: Sequence[Operator]) -> bool:
+    """True if their launches take longer than what they multiply with, so that one is better."""
+    return sum(block.nbytes for block in blocks) <= MAX_SMALL_BYTES
 
 
 def check_blocks(blocks: Sequence[Operator]) -> Operator:
@@ -150,6 +167,14 @@ class Planes(Basis):
         W of one picture.
     count : int
         Number of pictures.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Planes, Wavelet
+    >>> W = Planes(Wavelet(ltcl.open_device(), (1, 2), "haar"), 2)
+    >>> print((W @ numpy.array([1.0, 1.0, 3.0, 3.0])).round(3) + 0)
+    [1.414 0.    4.243 0.   ]
     """
 
     def __init__(self, of: Basis, count: int) -> None:
@@ -230,6 +255,21 @@ def _join_systems(blocks: Sequence[Operator]) -> Operator | None:
     return joined
 
 
+def _join_scaled(blocks: Sequence[Operator]) -> Operator | None:
+    """diag(A_1, ...) diag(d), where all are A diag(d) - diag(shift)."""
+    scaled = [block for block in blocks if isinstance(block, ScaledColumns)]
+    if len(scaled) != len(blocks):
+        return None
+    A = block_diagonal([block.A for block in scaled])
+    shifts = []
+    for block in scaled:
+        shifts.append(np.broadcast_to(block.shift, block.shape[:1]))
+    shift: Any = np.concatenate(shifts)
+    if not shift.any():
+        shift = 0.0
+    return ScaledColumns(A, np.concatenate([block.d for block in scaled]), shift)
+
+
 def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
     """W_out^T diag(C_1, ...) W_in, where all have the same bases."""
     compressed = [block for block in blocks if isinstance(block, Compressed)]
@@ -254,7 +294,7 @@ def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
 
 
 def _join_csr(blocks: Sequence[Operator]) -> Operator | None:
-    """One matrix in compressed sparse rows, where it is small."""
+    """Join matrices in compressed sparse rows, where they are small."""
     if any(type(block) is not CSR for block in blocks) or _are_large(blocks):
         return None
     matrices: list[Any] = []
@@ -266,7 +306,7 @@ def _join_csr(blocks: Sequence[Operator]) -> Operator | None:
 
 
 def _join_tiles(blocks: Sequence[Operator]) -> Operator | None:
-    """One matrix of tiles, where it is small."""
+    """Join matrices of tiles, where they are small."""
     packed: list[Packed] = [block.packed for block in blocks if isinstance(block, Tiles)]
     if len(packed) != len(blocks) or _are_large(blocks):
         return None
@@ -310,7 +350,9 @@ def _bind_copies(
     part = block.device.empty((width, *x.shape[1:]))
     product = block.device.empty((height, *x.shape[1:]))
     a, b, y, c = epilogue
-    bound = block._bind_product(part, product, Epilogue(a, b, product, c), transpose)
+    # What is not added must not be read: it may be no number.
+    added = product if b else None
+    bound = block._bind_product(part, product, Epilogue(a, b, added, c), transpose)
 
     def multiply() -> None:
         x.copy_rows(place.of_x, part)

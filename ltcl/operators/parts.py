@@ -54,6 +54,7 @@ def upload_part(device: Device, matrix: Any, pattern: Pattern | None = None) -> 
     if not is_filled(matrix.shape, matrix.nnz):
         return CSR(device, matrix, pattern)
     rows = checks.csr("matrix", matrix)
-    A = Filled(device, rows.shape, lambda: iter([(0, rows)]))
+    height, width = matrix.shape
+    A = Filled(device, (height, width), lambda: iter([(0, rows)]))
     A.exact_form = Float64Form(matrix=rows)
     return A

@@ -7,11 +7,11 @@ Kernels: `kernels/pyramid.cl`, `kernels/hats.cl`, which take the same arguments.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.device.kernels import Launch, Queued, in_order
+from ltcl.device.kernels import Queued, in_order
 from ltcl.operators.bases import Basis, bind_grid, bind_group
 
 PYRAMID = "pyramid"
@@ -45,35 +45,15 @@ class MultiscaleSums(Basis):
     def _bind_transform(
         self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
     ) -> Queued:
-        if transpose:
-            return self._bind_spread(x, out, a, b, y)
-        return self._bind_gather(x, out, a, b, y)
+        """The launches of all levels: large ones one by one, the others in one.
 
-    def _bind_spread(self, x: Array, out: Array, a: float, b: float, y: Array) -> Launch:
-        """The launch of the transpose: at each pixel, the functions of all levels added up."""
-        kernel, pieces = self._kernel(self.file, "spread", x.columns)
-        height, width = self.grid
-        return bind_grid(
-            kernel,
-            pieces,
-            self.grid,
-            height=height,
-            width=width,
-            levels=len(self.levels),
-            k=x.columns,
-            a=a,
-            b=b,
-            x=x,
-            y=y,
-            out=out,
-        )
-
-    def _bind_gather(self, x: Array, out: Array, a: float, b: float, y: Array) -> Queued:
-        """The launches of the sums: large levels one by one, then the others in one."""
-        kernel, pieces = self._kernel(self.file, "gather", x.columns)
+        Sums are gathered from the finest level on, and spread from the coarsest on.
+        """
+        name = "spread" if transpose else "gather"
+        kernel, pieces = self._kernel(self.file, name, x.columns)
         height, width = self.grid
         count = len(self.levels)
-        arguments = {
+        arguments: dict[str, Any] = {
             "height": height,
             "width": width,
             "k": x.columns,
@@ -81,17 +61,23 @@ class MultiscaleSums(Basis):
             "b": b,
             "x": x,
             # Wide loads reach a spare sum behind each level.
-            "sums": self.device.empty((self.shape[0] + count) * x.columns),
+            "sums": self.device.empty((sum(self._sizes) + count) * x.columns),
             "y": y,
             "out": out,
         }
+        if transpose:
+            arguments["levels"] = count
         large = sum(size > SMALL_LEVEL_PIXELS for size in self._sizes)
         launches: list[Queued] = []
         for level in range(large):
             levels = {"first_level": level, "end_level": level + 1}
             launches.append(bind_grid(kernel, pieces, self.levels[level], **levels, **arguments))
-        rest = bind_group(kernel, pieces, first_level=large, end_level=count, **arguments)
-        return in_order([*launches, rest])
+        if large < count:
+            rest = {"first_level": large, "end_level": count}
+            launches.append(bind_group(kernel, pieces, **rest, **arguments))
+        if transpose:
+            launches.reverse()
+        return in_order(launches)
 
 
 class Pyramid(MultiscaleSums):

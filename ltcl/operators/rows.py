@@ -33,6 +33,9 @@ MAX_SQUARED_NORM = 1e18
 MIN_SQUARED_ENTRY = 2.0**-63
 # Rounding of that sum.
 NORM_MARGIN = 1.01
+# Rows of a work-group on a GPU, and items of each: short rows leave no item idle, and fewer groups
+# start and leave fewer partial sums.
+GROUPS_OF_ROWS = ((4, 32), (8, 16))
 # Kernels count the elements of a slab in 32 bits, also a work-group beyond the end of a row.
 MAX_SLAB_ELEMENTS = (1 << 31) - 4096
 # Bytes of a matrix beside whose upload programs are built.
@@ -65,16 +68,27 @@ class Slab:
 
 @dataclass(frozen=True)
 class Variant:
-    """A kernel over rows: work-groups of `group` items, which share a row or have one each."""
+    """A kernel over rows: work-groups of `group` items, which share rows or have one each.
+
+    A group that shares has `rows` rows, of which each gets the same number of items.
+    """
 
     suffix: str
     group: int
     shared: bool
+    rows: int = 1
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """Defines of the program."""
+        return {"ROWS": self.rows} if self.rows > 1 else {}
 
     def shape(self, kernel: Kernel, rows: int, width: int) -> tuple[int, int, Any]:
         """Work-items, work-group and local memory of a launch with `width` right-hand sides."""
         group = kernel.group(self.group)
-        items = rows * group if self.shared else rows
+        items = rows
+        if self.shared:
+            items = -(-rows // self.rows) * group
         return items, group, kernel.device.local(width * group)
 
 
@@ -247,6 +261,9 @@ class RowOperator(ReadableRows):
         if self.device.is_cpu:
             return {"item": Variant("", 16, shared=False)}
         variants = {}
+        for rows, items in GROUPS_OF_ROWS:
+            if rows * items <= self.device.max_group:
+                variants[f"{rows} rows by {items}"] = Variant("_group", rows * items, True, rows)
         for group in (32, 64, 128, 256):
             if group <= self.device.max_group:
                 variants[f"group{group}"] = Variant("_group", group, shared=True)
@@ -292,7 +309,8 @@ class RowOperator(ReadableRows):
     ) -> Launch:
         """The launch for one slab and one piece (offset, width) of right-hand sides."""
         offset, width = piece
-        kernel = self.kernel(f"{self.file}_matvec{variant.suffix}", width, x.columns)
+        name = f"{self.file}_matvec{variant.suffix}"
+        kernel = self.kernel(name, width, x.columns, **variant.defines)
         items, group, local = variant.shape(kernel, slab.rows, width)
         return kernel.bind(
             items,
@@ -405,7 +423,8 @@ class RowStepper(Stepper):
         pieces = []
         for offset, width in widths(columns):
             variant = A.fastest(self.x, width)
-            kernel = A.kernel(f"{A.file}_matvec{variant.suffix}", width, columns, STEP=1)
+            name = f"{A.file}_matvec{variant.suffix}"
+            kernel = A.kernel(name, width, columns, STEP=1, **variant.defines)
             first_group = 0
             for slab in A.slabs:
                 items, group, local = variant.shape(kernel, slab.rows, width)

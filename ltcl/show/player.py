@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import images
-from ltcl.errors import InputError
-from ltcl.images.frames import Frame, Source
+from ltcl.images.frames import Source
+from ltcl.show.projection import Projection
 from ltcl.show.window import Window
-from ltcl.tasks.compensation import Compensator, FrameStatistics
+from ltcl.tasks.compensation import FrameStatistics
 from ltcl.viewer.answers import ViewerScene
 
 # Seconds without a window after which a film waits, instead of dropping frames.
@@ -31,8 +30,6 @@ TIMED_FRAMES = 5
 # Frames that decide on the gain.
 SAMPLE_FRAMES = 8
 DEFAULT_FPS = 25.0
-# Of the time from frame to frame: what projected steps may take, where light cannot be undone.
-STEPS_SHARE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +41,7 @@ class Pace:
     shown, dropped : int
     gain : float
     frames_per_second : float
-        Of shown frames.
+        Shown frames a second.
     latency : float
         The median of the seconds between the due time of a frame and the end of its drawing.
     computing_p50, computing_p99 : float
@@ -81,82 +78,33 @@ def play(
     those of `ltcl.Compensator`; a `gain` "auto" is the largest for frames from all parts of the
     film, "follow" one that goes after it.
     """
-    period = 1.0 / (film.fps or DEFAULT_FPS)
-    compensator = _FrameCompensator(scene, gain, resize, period, settings)
-    compensator.prepare(film)
-    timing = _Timing(period=period)
+    fps = film.fps or DEFAULT_FPS
+    sample: list[np.ndarray] = []
+    if gain == "auto":
+        sample = sample_film(film)
+    projection = Projection(scene, gain, film=sample, fps=fps, resize=resize, **settings)
+    timing = _Timing(period=1.0 / fps)
     title = window.title
     for frame in film:
         begun_at = time.monotonic()
         if timing.is_too_late(frame.number, begun_at):
             continue
-        codes = compensator.codes(frame)
+        codes = projection.codes(frame.srgb())
         timing.wait_until_due(frame.number, begun_at)
         asked_at = time.monotonic()
         drawn_at = window.show(codes)
         timing.record(frame.number, asked_at, drawn_at)
-        pace = timing.pace(compensator.statistics)
+        pace = timing.pace(projection.statistics)
         window.title = f"{title}: {pace}"
         progress("playing", frame.number, film.count, detail=f": {pace}")
     window.wait(PAUSE_SECONDS)
-    return timing.pace(compensator.statistics)
+    return timing.pace(projection.statistics)
 
 
-class _FrameCompensator:
-    """The codes of the projector for each frame of a film."""
-
-    def __init__(
-        self,
-        scene: ViewerScene,
-        gain: float | str,
-        resize: str,
-        period: float,
-        settings: dict[str, Any],
-    ) -> None:
-        self._T = scene.T
-        self._setup = scene.setup
-        self._resize = resize
-        self._period = period
-        self._gain = gain
-        self._settings = settings
-
-    @property
-    def statistics(self) -> FrameStatistics:
-        """Numbers of the frames so far."""
-        return self._compensator.statistics
-
-    def prepare(self, film: Source) -> None:
-        """Make the compensator, with the gain of frames from all parts of the film."""
-        settings = {**self._settings, "gain": self._gain}
-        if self._setup is not None:
-            settings["encode"] = self._setup.calibration.projector
-        if self._gain == "auto":
-            step = max((film.count or SAMPLE_FRAMES) // SAMPLE_FRAMES, 1)
-            frames = islice(film, 0, SAMPLE_FRAMES * step, step)
-            settings["film"] = [self._picture(frame) for frame in frames]
-        fps = 1.0 / self._period
-        try:
-            # For a camera of other pixels light is found only within the bounds.
-            self._compensator = Compensator(self._T, clamp=self._T.is_square, fps=fps, **settings)
-        except InputError:
-            # Bad settings are refused once more; light that fixed steps do not undo is no reason.
-            deadline = 1e3 * STEPS_SHARE * self._period
-            self._compensator = Compensator(self._T, deadline_ms=deadline, fps=fps, **settings)
-
-    def codes(self, frame: Frame) -> np.ndarray:
-        """Return uint8 codes on the pixels of the projector for a frame."""
-        codes = self._compensator(self._picture(frame))
-        if self._setup is not None:
-            return self._setup.blocks.enlarged(codes)
-        return codes
-
-    def _picture(self, frame: Frame) -> np.ndarray:
-        """Return sRGB codes or the light of a frame, on the camera's grid."""
-        grid = self._T.camera_grid
-        codes = frame.srgb()
-        if codes.shape[:2] == grid:
-            return codes
-        return images.resize(frame.picture(), grid, self._resize)
+def sample_film(film: Source) -> list[np.ndarray]:
+    """Take frames from all parts of a film."""
+    step = max((film.count or SAMPLE_FRAMES) // SAMPLE_FRAMES, 1)
+    return [frame.srgb() for frame in islice(film, 0, SAMPLE_FRAMES * step, step)]
 
 
 @dataclass(kw_only=True)

@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.operators import Operator, block_diagonal
+from ltcl.operators import Operator
+from ltcl.operators.diagonal_blocks import are_small, joined_once
 from ltcl.solvers.auto import SMALL, solve_automatically
 from ltcl.solvers.problem import LinearProblem, SolveSettings
 from ltcl.solvers.result import Solution
 
-# Bytes of all systems up to which they are joined.
-MAX_JOINED_BYTES = 1 << 24
 # Below, a solve may be refined in float64, channel by channel.
 MIN_JOINED_RTOL = 1e-4
 
@@ -41,14 +40,14 @@ def may_join(
         is_small = not isinstance(S, Operator) or S.shape[0] <= SMALL
         if is_small or S.coefficient_basis is None or S.device is not systems[0].device:
             return False
-    return sum(S.nbytes for S in systems) <= MAX_JOINED_BYTES
+    return are_small(systems)
 
 
 def solve_joined(
     systems: Sequence[Operator], sides: Sequence[np.ndarray], settings: SolveSettings
 ) -> tuple[Solution, ...] | None:
     """The solution of each channel; None if the joined solve did not converge."""
-    S = _joined_system(systems)
+    S = joined_once(systems)
     sizes = [float(np.linalg.norm(side)) for side in sides]
     lit_count = sum(size > 0.0 for size in sizes)
     if not lit_count or not np.all(np.isfinite(sizes)):
@@ -79,11 +78,3 @@ def solve_joined(
             )
         )
     return tuple(solutions)
-
-
-def _joined_system(systems: Sequence[Operator]) -> Operator:
-    """The system of all channels, made once in the life of the first."""
-    known = systems[0].known
-    if known.joined is None or known.joined[0] != tuple(map(id, systems)):
-        known.joined = (tuple(map(id, systems)), block_diagonal(systems))
-    return known.joined[1]

@@ -211,7 +211,7 @@ class Scan(ViewerScene):
         except LtclError as error:
             self._warnings[name] = _one_line(error)
             return
-        facts = {"histogram": _histogram(codes), "seconds": None}
+        facts = {"histogram": histogram(codes), "seconds": None}
         if file.shot is not None:
             self._check(name, file.shot, codes)
             facts["seconds"] = file.shot.seconds
@@ -231,14 +231,11 @@ class Scan(ViewerScene):
     def _add_preview(
         self, name: str, file: ScanFile, codes: np.ndarray, facts: dict[str, Any]
     ) -> None:
-        # Ceiling of the quotient.
-        step = -(-max(codes.shape[:2]) // PREVIEW_SIDE)
-        picture = np.rint(255 * codes[::step, ::step].clip(0, 1)).astype(np.uint8)
         self._preview_count += 1
         self._previews[name] = Preview(
             number=self._preview_count,
             facts={"name": name, "time": file.time, **facts},
-            picture=picture,
+            picture=thumbnail(codes),
         )
         if len(self._previews) > MAX_PREVIEWS:
             oldest = min(self._previews, key=self._time_of)
@@ -308,7 +305,14 @@ def _seconds_left(files: list[ScanFile], done: int, total: int) -> float | None:
     return seconds_of_unit * (total - done)
 
 
-def _histogram(codes: np.ndarray) -> np.ndarray:
+def thumbnail(codes: np.ndarray) -> np.ndarray:
+    """Return a small picture, uint8, of codes in [0, 1]."""
+    # Ceiling of the quotient.
+    step = -(-max(codes.shape[:2]) // PREVIEW_SIDE)
+    return np.rint(255 * codes[::step, ::step].clip(0, 1)).astype(np.uint8)
+
+
+def histogram(codes: np.ndarray) -> np.ndarray:
     """Return shares of pixels, by code."""
     step = 1 + codes.shape[0] // HISTOGRAM_ROWS
     counts, _ = np.histogram(codes[::step], HISTOGRAM_BINS, (0.0, 1.0))

@@ -71,6 +71,10 @@ OTHERS = [
     ("simulate {nan} --grid 3x3 --out {out}", ["--grid is 3 x 3"]),
     ("film {transport} {picture} --out {out}", ["FILM is ", "sky.exr", "ltcl compensate"]),
     ("film {transport} {film} --workers 2 --out {out}", ["--workers is 2", "--cluster"]),
+    ("play {film} {transport} --pipe", ["FILM is ", "--pipe is given"]),
+    ("play - {transport}", ["FILM is -", "--pipe is not given"]),
+    ("play --pipe - {transport} --gain auto", ["--gain is auto", "follow"]),
+    ("play --pipe - {transport} --video-size 4", ["video_size is '4'", "1280x720"]),
     ("acquire run {empty}", ["acquisition.toml: ", "ltcl simulate"]),
     (
         "compensate {store} {picture} --resize stretch --high 2 --out {out}",

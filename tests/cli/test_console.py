@@ -48,9 +48,12 @@ COMMANDS = [
     "view",
     "play",
     "show",
+    "export",
     "acquire plan",
     "acquire run",
+    "acquire aim",
     "acquire fit",
+    "acquire import",
     "acquire report",
 ]
 CODES = [

@@ -18,6 +18,7 @@ from ltcl.operators import (
     Hats,
     IdentityPlus,
     Planes,
+    ScaledColumns,
     SubsetBasis,
     Tiles,
     Wavelet,
@@ -90,6 +91,22 @@ def test_products_of_blocks(shaped, kind):
     assert joined.shape == matrix.shape
     helpers.meets_twin(joined, matrix)
     helpers.meets_twin(joined, matrix, transpose=True)
+
+
+@pytest.mark.parametrize("transpose", [False, True])
+def test_memory_of_others_does_not_matter(device, transpose):
+    """Buffers that held NaN come back from the pool; what is not added is not read."""
+    blocks = [ScaledColumns(Dense(device, np.eye(5, 9)), np.full(9, 2.0)) for _ in range(3)]
+    joined = block_diagonal(blocks)
+    rows, columns = joined.shape
+    if transpose:
+        rows, columns = columns, rows
+    x = device.upload(np.ones(columns))
+    for size in (5, 9, rows, columns):
+        garbage = [device.upload(np.full(size, np.nan)) for _ in range(4)]
+        del garbage
+    found = joined.apply_transpose(x) if transpose else joined.apply(x)
+    assert np.isfinite(found.get()).all()
 
 
 @pytest.mark.parametrize("kind", ["csr", "float16", "wavelets"])

@@ -17,10 +17,12 @@ import pytest
 
 import ltcl
 from ltcl.acquisition import FolderRig
+from ltcl.acquisition.aiming import read_white
 from ltcl.images import to_srgb
 from ltcl.images.encoding import to_linear
 from ltcl.show.window import Window
 from ltcl.viewer import server
+from ltcl.viewer.aim import AimScene
 from ltcl.viewer.answers import ViewerScene
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.server import Viewer
@@ -671,6 +673,23 @@ def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
         assert page.locator("#scan-warnings li").count() == 0
         second.write_bytes(b"no picture")
         page.locator("#scan-warnings li").get_by_text("photograph 2").wait_for()
+        page.goto("about:blank")
+
+
+def test_aiming_shows_readings_as_they_come(page: Page) -> None:
+    scene = AimScene("corner")
+    white = np.zeros((40, 60), np.float32)
+    white[5:35, 5:55] = 1.0
+    with Viewer(scene, open_browser=False) as viewer:
+        visit(page, viewer, "scan")
+        page.get_by_text("no photograph yet").first.wait_for()
+        scene.add_reading("look 1", read_white(white, 0.5))
+        page.locator("#scan-warnings li").get_by_text("expose shorter").wait_for()
+        scene.add_reading("look 2", read_white(0.5 * white, 0.25))
+        page.get_by_text("look 2, 0.250 s").first.wait_for()
+        page.get_by_text("brightness 50%").first.wait_for()
+        assert page.locator("#scan-warnings li").count() == 0
+        assert page.locator(".photograph").count() == 2
         page.goto("about:blank")
 
 

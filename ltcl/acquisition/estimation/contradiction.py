@@ -58,7 +58,7 @@ class Comparison:
     pixels: int
 
     def contradiction(self) -> np.ndarray:
-        """How much each picture contradicts all others, (pictures,): it may be wrong above 1."""
+        """Contradiction of each picture by all others, (pictures,): it may be wrong above 1."""
         is_light = (self.strength > MIN_STRENGTH) & (self.pixels >= MIN_PIXELS)
         by_light = np.where(is_light, self.share * self.surprise, 0.0)
         return np.maximum(by_light / MAX_SHARED_SURPRISE, self.surprise / MAX_SURPRISE)

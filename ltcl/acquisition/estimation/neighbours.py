@@ -140,7 +140,7 @@ def _lit_beside(patterns: Sequence[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Part:
-    """What was found for some pixels: D and g (n, 10), variances, surprise (n, frames), misfit."""
+    """The findings for some pixels: D and g (n, 10), variances, surprise (n, frames), misfit."""
 
     values: np.ndarray
     variance: np.ndarray

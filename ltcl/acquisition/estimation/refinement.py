@@ -345,7 +345,7 @@ class RefinedEstimator:
     def _far_answers(
         self, patterns: np.ndarray, factors: list[float], channels: list[int]
     ) -> list[list[np.ndarray]]:
-        """What the rows of each stage say of patterns, (nodes, frames) of each channel.
+        """The answers of the rows of each stage to patterns, (nodes, frames) of each channel.
 
         Channels answer to the patterns times their factors.
         """

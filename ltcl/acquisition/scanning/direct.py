@@ -87,7 +87,7 @@ def judges(grid: tuple[int, int]) -> list[np.ndarray]:
 
 
 def _different(shown: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Those that are neither black nor white nor like an earlier one."""
+    """The patterns that are neither black nor white nor like an earlier one."""
     chosen: dict[bytes, np.ndarray] = {}
     for pattern in shown:
         if pattern.any() and not pattern.all():

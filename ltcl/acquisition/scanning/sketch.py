@@ -222,7 +222,7 @@ def most_rounds(photographs: int | None, rtol: float | None, first: int, exposur
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """How long a sketch goes on after its first patterns.
+    """The rounds by which a sketch goes on after its first patterns.
 
     Attributes
     ----------
@@ -236,7 +236,7 @@ class Rounds:
     rtol: float | None = None
 
     def go_on(self, errors: list[float]) -> bool:
-        """Whether another round follows, given the errors after the first patterns and each round.
+        """True if another round follows, given the errors after the first patterns and each round.
 
         >>> Rounds(most=3, rtol=0.01).go_on([0.03, 0.02]), Rounds(most=3, rtol=0.01).go_on([0.009])
         (True, False)

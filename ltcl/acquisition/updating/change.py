@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a moved transport leaves of the fitted pictures, as a change of its rows.
+"""The rest that a moved transport leaves of the fitted pictures, as a change of its rows.
 
 With pictures y_m of patterns p_m, and the moved transport T, the rows of the change dT are those of
 `estimation.regression` for y_m - T p_m: their prior, how much of which scale has changed where, is

@@ -209,7 +209,7 @@ class Update:
 
     @property
     def judgement(self) -> str:
-        """Whether the update holds, and what must be measured again, in one line."""
+        """A line that says if the update holds, and what must be measured again."""
         place = _place(self.failing)
         if self.holds:
             return f"the update holds; but {place}" if place else "the update holds"
@@ -641,7 +641,7 @@ class _RowCounter:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Judgement:
-    """What the judges say, as `Update` has it."""
+    """The verdict of the judges, as `Update` has it."""
 
     errors: np.ndarray
     previous_errors: np.ndarray

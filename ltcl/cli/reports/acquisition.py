@@ -204,3 +204,41 @@ class FitReport(FolderReport):
     worst: Annotated[float, "The largest of their errors."]
     drift: Annotated[float, "Change of brightness over all pairs, which was corrected."]
     noise: Annotated[float, "What T leaves of a photograph, relative to the light of a pixel."]
+
+
+@dataclass(kw_only=True)
+class ImportReport(FolderReport):
+    """`ltcl acquire import`."""
+
+    photographs: Annotated[int, "Number of photographs."]
+    grid: ProjectorGrid
+    camera_grid: Annotated[tuple[int, int], "Height and width of the photographs."]
+    decoded: Annotated[float, "Share of the camera's pixels in the map."]
+    seen: Annotated[float, "Share of the projector's pixels that the camera sees."]
+    saturated: Annotated[
+        float | None, "Share of the lit camera pixels that are saturated; null without white."
+    ]
+    indirect: Annotated[
+        float | None,
+        "Share of the light of white that is not direct, at the median pixel; null without white.",
+    ]
+    files: Files
+
+
+@dataclass(kw_only=True)
+class AimReport(Report):
+    """`ltcl acquire aim`: the last look; without one only `folder` and `looks`."""
+
+    folder: Annotated[Path, "Folder of the acquisition."]
+    looks: Annotated[int, "Number of looks."] = 0
+    seconds: Annotated[float | None, "Exposure; left out if it is not known."] = None
+    brightness: Annotated[float | None, "Code of the brightest lit pixels, of full scale."] = None
+    saturated: Annotated[float | None, "Share of the lit area that is saturated."] = None
+    lit: Annotated[float | None, "Share of the photograph that the projector lights."] = None
+    focus: Annotated[
+        float | None, "Contrast of stripes of 2 projector pixels; left out of a single photograph."
+    ] = None
+    sharpness: Annotated[
+        float | None, "Mean difference of lit pixels from their neighbours, relative."
+    ] = None
+    advice: Annotated[list[str], "What should be better."] = field(default_factory=list)

@@ -14,7 +14,7 @@ import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from ltcl.cli.reports import acquisition, parts, pictures, program, transports
+from ltcl.cli.reports import acquisition, export, parts, pictures, program, transports
 from ltcl.cli.reports.report import Report
 
 DESCRIPTION = (
@@ -49,12 +49,15 @@ COMMANDS: dict[str, Any] = {
     "view": program.ViewReport,
     "play": program.PlayReport,
     "show": program.ShowReport,
+    "export": export.ExportReport,
     "acquire-plan": acquisition.PlanReport,
     "acquire-run": Annotated[
         acquisition.ScanReport | acquisition.PhotographMissing,
         "`ltcl acquire run`: the report of the finished scan, or the next photograph.",
     ],
+    "acquire-aim": acquisition.AimReport,
     "acquire-fit": acquisition.FitReport,
+    "acquire-import": acquisition.ImportReport,
     "acquire-update": Annotated[
         acquisition.UpdateReport | acquisition.PhotographMissing,
         "`ltcl acquire update`: the new transport and its error, or the next photograph.",

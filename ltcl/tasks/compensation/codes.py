@@ -41,7 +41,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CodeTable:
-    """How light becomes codes; arrays are float32 and int32, as the device takes them.
+    """A table by which light becomes codes; arrays are float32 and int32, as the device takes them.
 
     Attributes
     ----------

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ import numpy as np
 
 from ltcl.device import Array
 from ltcl.errors import ConvergenceError
+from ltcl.operators import Operator
+from ltcl.operators.diagonal_blocks import are_small, joined_once
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.tasks.compensation.gain import exact_gain, gain_within_loss
 from ltcl.tasks.compensation.inputs import CompensationRequest, check_inputs
@@ -393,8 +396,7 @@ def _gather_evidence(
     residuals = _residuals_of_solves(request, start, bounded)
     queued: list[Array] = []
     if residuals is None:
-        for A, light in zip(reference.operators, bounded.light, strict=True):
-            queued.append(A.apply(A.device.upload(light)))
+        queued = _queue_pictures(reference.operators, bounded.light)
     # While the device works:
     pattern = request.shape.pack(bounded.light, reference.grid)
     target_norms = problem.norms(target)
@@ -423,6 +425,18 @@ def _gather_evidence(
     return pattern, evidence, target_norms
 
 
+def _queue_pictures(operators: Sequence[Operator], lights: Columns) -> list[Array]:
+    """Queue T p of each system, or of all of them in one product."""
+    are_single = all(light.shape[1] == 1 for light in lights)
+    if len(operators) > 1 and are_single and are_small(operators):
+        joined = joined_once(operators)
+        return [joined.apply(joined.device.upload(np.concatenate(lights)))]
+    queued = []
+    for A, light in zip(operators, lights, strict=True):
+        queued.append(A.apply(A.device.upload(light)))
+    return queued
+
+
 def _least_error(problem: CompensationProblem, bounded: BoundedLight) -> float:
     """No light within the bounds has a smaller error, as far as the solves have proved it."""
     least = []
@@ -446,6 +460,8 @@ def _residuals_of_solves(
 def _read_appearance(problem: CompensationProblem, queued: list[Array]) -> Columns:
     """T p + background of each system, (M, k)."""
     pictures = [picture.get() for picture in queued]
+    if len(pictures) < len(problem.systems):
+        pictures = np.split(pictures[0], len(problem.systems))
     if not problem.has_background:
         return pictures
     return [picture + dark for picture, dark in zip(pictures, problem.background, strict=True)]

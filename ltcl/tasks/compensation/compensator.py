@@ -58,7 +58,7 @@ class FrameStatistics:
         Seconds from a frame to its codes: the median, and what 99 % are below; NaN before the
         first frame.
     gain : float
-        That of the last frame.
+        Gain of the last frame.
     products : int
         Products with R that each frame takes at least.
     """
@@ -78,7 +78,7 @@ class FrameStatistics:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameError:
-    """How near the last frame comes to its target, as in `Compensation`.
+    """The distance of the last frame from its target, as in `Compensation`.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Compensator:
         `ltcl.compensate`. "follow" goes after the content: the gain at which the brightest light
         is at the upper bound, but for the brightest half percent of strips of 256 pixels.
     bounds, background, weights, inverse, rtol
-        Those of `ltcl.compensate`; background and weights are one picture, in linear light.
+        As in `ltcl.compensate`; background and weights are one picture, in linear light.
     clamp : bool
         Clamp the light to the bounds, and leave it at that.
     deadline_ms : float, optional
@@ -115,7 +115,7 @@ class Compensator:
         Begin the projected steps with the pattern of the frame before, where that is nearer than
         the clamped one. False gives each frame the same pattern whatever came before.
     decode : "auto", "srgb" or "linear"
-        What the codes of frames mean; "auto" takes whole numbers as sRGB and floats as linear
+        Meaning of the codes of frames; "auto" takes whole numbers as sRGB and floats as linear
         light. Whole numbers have white at the largest code, floats at 1.
     encode : "srgb", "linear" or a response
         Codes of the projector: with white at the upper bound, or those of a measured response, such
@@ -129,13 +129,13 @@ class Compensator:
     depth : int
         Frames that may be on their way at once after `submit`.
     late : "wait" or "drop"
-        What becomes of a frame that is submitted when `depth` frames are on their way: it waits, or
+        Fate of a frame that is submitted when `depth` frames are on their way: it waits, or
         its result is None.
 
     Attributes
     ----------
     gain : float
-        That of the next frame.
+        Gain of the next frame.
     rtol : float
         Tolerance, as given, or what was chosen.
     statistics : FrameStatistics
@@ -143,7 +143,7 @@ class Compensator:
     Raises
     ------
     InputError, InputTypeError
-        Those of `ltcl.compensate`; another name of a curve or type, gain="auto" without a film, or
+        As in `ltcl.compensate`; another name of a curve or type, gain="auto" without a film, or
         a T whose light cannot be undone in a fixed number of steps, with ``clamp=True``.
 
     Notes
@@ -279,7 +279,7 @@ class Compensator:
         return light
 
     def _frames_of(self, colours: int, dtype: np.dtype) -> PreparedFrames:
-        """What is prepared for frames of so many colours and one type; made at the first one."""
+        """The prepared steps for frames of so many colours and one type; made at the first one."""
         key = (colours, dtype.name)
         if key not in self._prepared:
             self._prepared[key] = self._prepare(colours, dtype)

@@ -46,7 +46,7 @@ MAX_CONDITION = 1e5
 
 @dataclass(frozen=True, kw_only=True)
 class LightLayout:
-    """Where the light of each pixel and channel stands: (rows, columns) on the device."""
+    """The place of the light of each pixel and channel: (rows, columns) on the device."""
 
     pixels: int
     channels: int
@@ -224,7 +224,7 @@ class WithinBounds:
     errors : (k,), optional
         ||w (A x - b)|| of the last frame, if steps were taken.
     steps : int
-        Of the last frame.
+        Number of steps that the last frame took.
     """
 
     def __init__(
@@ -313,7 +313,7 @@ class PreparedFrames:
     Parameters
     ----------
     request : CompensationRequest
-        Of a picture of the same colours, as `check_inputs` made it.
+        The checked inputs of a picture of the same colours.
     frame_colours : 1 or 3
     frame_dtype, dtype : numpy type, str
         Types of the codes of frames and of the projector.

@@ -9,10 +9,11 @@ export function scan({ $, ask, press, hello }) {
   const list = $("scan-photographs"), most = 24; // as many as the server keeps
   let seen = 0, timer = null;
 
-  function facts({ state, done, total, what, left, coverage, saturated }) {
+  function facts({ state, done, total, what, left, coverage, saturated, notes = [] }) {
     Object.assign($("scan-progress"), { max: total || 1, value: done });
     const minutes = Math.round(left / 60), calibrated = coverage !== undefined;
     $("scan-facts").textContent = [
+      ...notes,
       state === "final" ? "finished" : `${done} of about ${total} ${what}`,
       left !== null && (minutes ? `about ${minutes} min left` : "less than a minute left"),
       calibrated && `camera sees ${percent(coverage)} of the projector`,
