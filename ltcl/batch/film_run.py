@@ -130,6 +130,8 @@ class BatchSolver:
             appearance = self.T @ light
             background = self.options.get("background")
             if background is not None:
+                if np.ndim(background) == 2 and appearance.ndim == 3:
+                    background = np.asarray(background)[..., None]
                 appearance = appearance + background
             appearance = appearance[None].astype(np.float32)
         return SolvedBatch(

@@ -234,9 +234,11 @@ def compensate_frames(
     with locked(folder, wait=False):
         run.records |= manifest.read(folder, head, resume)
         with _finished_frames_named(run):
-            for done in run.solve(gain, loss):
-                if progress is not None:
-                    progress("frames", done, run.count)
+            # Closed at once where Ctrl-C ends it: a batch that is solved is written.
+            with contextlib.closing(run.solve(gain, loss)) as batches:
+                for done in batches:
+                    if progress is not None:
+                        progress("frames", done, run.count)
             if video is not None:
                 rate = fps or source_frames.fps or DEFAULT_FPS
                 video = as_path(video)

@@ -66,6 +66,15 @@ def write(folder: Path, head: dict[str, Any], records: dict[int, FrameRecord]) -
         temporary.write_text(text, encoding="utf-8")
 
 
+def count(folder: Path) -> int:
+    """The number of finished frames of a folder."""
+    path = folder / NAME
+    if not path.exists():
+        return 0
+    with about(path, reading=True):
+        return len(json.loads(input_file(path).read_text(encoding="utf-8"))["frames"])
+
+
 def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, FrameRecord]:
     """Records of the run to go on with; its gain goes into `head`.
 

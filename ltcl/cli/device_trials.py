@@ -40,6 +40,7 @@ from ltcl.operators.pyramid import hat_levels
 from ltcl.scenes.visibility import visibility
 from ltcl.solvers.bounded import minimise
 from ltcl.solvers.solve import METHODS, SAMPLED, solve
+from ltcl.tasks.compensation import Compensator
 
 # Relative errors; solves are to 1 %.
 LIMITS = {"product": 1e-4, "solve": 0.02}
@@ -91,7 +92,18 @@ def trials(device: Device) -> Iterator[Trial]:
     yield Trial(
         kind="product", name="visibility", call=partial(_visibility, device), truth=np.eye(2)
     )
+    some = SubsetBasis(device, scene.grid, [5, 0, 2], W)
+    picked = (W @ x)[[5, 0, 2]]
+    kept = np.zeros(x.shape)
+    kept[[5, 0, 2]] = picked
+    yield Trial(
+        kind="product",
+        name="subset of wavelets",
+        call=lambda: some.T @ (some @ x),
+        truth=W.T @ kept,
+    )
     yield from _solves(device, S, x[:, 0])
+    yield _frame(scene, device)
 
 
 def _operators(device: Device, scene: Any, S: np.ndarray) -> dict[str, tuple[Operator, np.ndarray]]:
@@ -114,6 +126,19 @@ def _operators(device: Device, scene: Any, S: np.ndarray) -> dict[str, tuple[Ope
         tiles = Tiles(device, R, width, precision)
         operators[f"tiles of {width}, {precision}"] = (tiles, tiles.to_dense())
     return operators
+
+
+def _frame(scene: Any, device: Device) -> Trial:
+    """A frame of a prepared compensation, whose brightest light is at the bound."""
+    T = scene.transport(device=device)
+    pattern = np.linspace(0.1, 0.4, T.shape[1]).reshape(T.grid).astype(np.float32)
+    compensator = Compensator(T, gain="follow", encode="linear", dtype="float32")
+    return Trial(
+        kind="solve",
+        name="prepared frame",
+        call=lambda: compensator(T @ pattern),
+        truth=pattern / pattern.max(),
+    )
 
 
 def _cells(height: int, width: int) -> np.ndarray:

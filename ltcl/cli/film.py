@@ -120,7 +120,7 @@ def _compensate_frames(
     context: Context, job: compensation.CompensationJob, film: Path, out: Path
 ) -> Any:
     """Write the patterns of all frames."""
-    from ltcl.batch import compensate_frames
+    from ltcl.batch import compensate_frames, manifest
 
     settings = {**job.settings}
     del settings["callback"]
@@ -136,7 +136,8 @@ def _compensate_frames(
                 job.T, film, out, progress=context.progress, client=client, **arguments
             )
     except KeyboardInterrupt:
-        count = f"{context.progress.completed:.0f} frame(s) are done and stay in {out}"
+        # More than progress has told, if a batch was being written.
+        count = f"{manifest.count(out)} frame(s) are done and stay in {out}"
         raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
 
 

@@ -81,7 +81,8 @@ def run(context: Context, scene: Any, gain: Any, resize: str, settings: dict[str
 
     source = _source(context, scene.T.camera_grid)
     if gain is None:
-        gain = 1.0 if scene.setup is None else "follow"
+        can_follow = scene.setup is not None and scene.T.is_square
+        gain = "follow" if can_follow else 1.0
     encoding = context.options["encoding"]
     if encoding == "auto":
         encoding = "linear" if source.dtype.kind == "f" else "srgb"

@@ -77,8 +77,8 @@ class Projection:
         except InputError:
             # Bad settings are refused once more; light that fixed steps do not undo is no reason.
             del settings["clamp"]
-            deadline = 1e3 * STEPS_SHARE / self._fps
-            return Compensator(self._T, deadline_ms=deadline, **settings)
+            settings.setdefault("deadline_ms", 1e3 * STEPS_SHARE / self._fps)
+            return Compensator(self._T, **settings)
 
     @property
     def grid(self) -> tuple[int, int]:

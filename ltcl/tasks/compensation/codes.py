@@ -190,8 +190,23 @@ def _curves_of_response(response: Any, channels: int) -> list[Curve]:
         def light(codes: np.ndarray) -> np.ndarray:
             if count == 1:
                 return response.linear(codes)
-            return response.linear(np.repeat(codes[:, None], count, axis=1))[:, channel]
+            table = np.asarray(response.linear(np.repeat(codes[:, None], count, axis=1)))
+            return table[..., channel] if table.ndim else table
 
         return light
 
-    return [curve_of(channel) for channel in range(channels)]
+    curves = [curve_of(channel) for channel in range(channels)]
+    codes = np.linspace(0.0, 1.0, LISTED_CODES)
+    for curve in curves:
+        _check_rising(np.asarray(curve(codes)), codes)
+    return curves
+
+
+def _check_rising(light: np.ndarray, codes: np.ndarray) -> None:
+    """Refuse a response whose light is not finite, falls, or never rises."""
+    is_curve = light.shape == codes.shape and np.all(np.isfinite(light))
+    if not is_curve or np.any(np.diff(light) < 0.0) or light[-1] <= light[0]:
+        raise InputError(
+            "encode is a response whose light is not finite, falls with the codes, or stays the "
+            "same; it must give light of each code, and rise"
+        )

@@ -284,7 +284,7 @@ def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
 
 def _has_undone_light(solutions: tuple[Solution, ...]) -> bool:
     """False if some solve with ``throw=False`` came no nearer than no light."""
-    return all(s.status is Status.CONVERGED or s.residual < 1.0 for s in solutions)
+    return all(s.converged or s.residual < 1.0 for s in solutions)
 
 
 def _solve_channels(request: CompensationRequest, targets: Columns) -> tuple[Solution, ...]:

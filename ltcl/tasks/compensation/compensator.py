@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +44,10 @@ BRIGHT_SHARE = 0.005
 # Latencies that are kept.
 MAX_LATENCIES = 10_000
 LATE = ("wait", "drop")
+MAX_DEPTH = 64
+# Beyond, squares of light leave float32.
+MAX_LIGHT = 1e15
+MAX_GAIN = 1e15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +139,7 @@ class Compensator:
     Attributes
     ----------
     gain : float
-        Gain of the next frame.
+        Gain of the next frame, which may be set.
     rtol : float
         Tolerance, as given, or what was chosen.
     statistics : FrameStatistics
@@ -152,8 +156,8 @@ class Compensator:
     the light of white, of a random pattern and a random picture are within half of `rtol`. What a
     frame has reached is told by `judge`, when it is asked.
 
-    One thread at a time calls a compensator. A frame may be an array of the device of T, and so may
-    `out`.
+    Threads that call a compensator wait for each other. A frame may be an array of the device of T,
+    and so may `out`.
 
     Examples
     --------
@@ -190,10 +194,8 @@ class Compensator:
         late: str = "wait",
     ) -> None:
         self._decode = checks.one_of("decode", decode, DECODES)
-        if dtype not in CODE_TYPES:
-            raise InputError(f"dtype is {checks.shown(dtype)}; it must be one of {CODE_NAMES}")
-        self._dtype = dtype
-        self._depth = checks.count("depth", depth)
+        self._dtype = _check_dtype(dtype)
+        self._depth = checks.count("depth", depth, most=MAX_DEPTH)
         self._drops = checks.one_of("late", late, LATE) == "drop"
         self._seconds = math.inf
         if deadline_ms is not None:
@@ -215,22 +217,30 @@ class Compensator:
             "loss": None,
             "options": {},
         }
-        self.follows_gain = gain == "follow"
+        self.follows_gain = isinstance(gain, str) and gain == "follow"
         self._has_gain = not self.follows_gain
-        self.gain = 1.0
+        self._is_closed = False
+        self._gain = 1.0
+        # A background or weights in colour make grey frames colour, too.
+        self._is_coloured = getattr(T, "channels", 3) == 3
+        for value in (background, weights):
+            self._is_coloured |= np.ndim(value) > 2
         # Checks all arguments, before anything is uploaded.
-        request = self._request(3 if getattr(T, "channels", 3) == 3 else 1)
+        request = self._request(1)
         self.rtol = request.problem.settings.rtol
         if self.follows_gain and not T.is_square:
             raise InputError(
                 "gain is 'follow', but this T has no S, whose light it follows; give a number"
             )
         self._encode = encode
-        white = float(request.problem.limits.high)
-        self._table = code_table(encode, dtype, 3 if T.channels == 3 else 1, white)
+        high = float(request.problem.limits.high)
+        self._white = high if high > 0.0 else 1.0
+        code_table(encode, self._dtype, self._channels(1), self._white)
         self._prepared: dict[tuple[int, str], PreparedFrames] = {}
         # Of the last frame.
         self._last: tuple[PreparedFrames, float] | None = None
+        if self.follows_gain and film is not None:
+            raise InputError("film is given, but gain is 'follow'; a film belongs to 'auto'")
         if not self.follows_gain:
             self.gain = self._find_gain(gain, film)
 
@@ -242,22 +252,35 @@ class Compensator:
         self._turn = 0
         self._collector = ThreadPoolExecutor(1, thread_name_prefix="ltcl-frames")
         # The kind of frame that is most likely, so that the first one does not wait for it.
-        self._frames_of(3 if T.channels == 3 else 1, np.dtype(np.uint8))
+        self._frames_of(self._channels(1), np.dtype(np.uint8))
+
+    @property
+    def gain(self) -> float:
+        """The gain of the next frame, which may be set; InputError if it is not above 0."""
+        return self._gain
+
+    @gain.setter
+    def gain(self, value: float) -> None:
+        self._gain = checks.number("gain", value, above=0.0, most=MAX_GAIN)
 
     # Preparation.
 
+    def _channels(self, colours: int) -> int:
+        """Channels of the light of frames of so many colours."""
+        return 3 if self._is_coloured else colours
+
     def _request(self, colours: int) -> Any:
-        """Checked inputs for black pictures of so many colours."""
+        """Checked inputs for black pictures of so many colours, or of three if it must be."""
         grid = getattr(self.T, "camera_grid", (1, 1))
-        shape = (*grid, 3) if colours == 3 else grid
+        shape = (*grid, 3) if self._channels(colours) == 3 else grid
         return check_inputs(self.T, np.zeros(shape, np.float32), gain=1.0, **self._options)
 
     def _find_gain(self, gain: Any, film: Iterable[Any] | None) -> float:
         """The gain of all frames."""
-        if gain == "auto":
+        if isinstance(gain, str) and gain == "auto":
             if film is None:
                 raise InputError("gain is 'auto', but film is None; give the frames it is for")
-            light = np.stack([self._light_of_frame(np.asarray(frame)) for frame in film])
+            light = self._light_of_film(film)
             options = {**self._options}
             extra = options.pop("options")
             return compensate(self.T, light, gain="auto", **options, **extra).gain
@@ -265,38 +288,52 @@ class Compensator:
             raise InputError(f"film is given, but gain is {gain!r}; a film belongs to 'auto'")
         if isinstance(gain, str):
             raise InputError(f"gain is {gain!r}; it must be 'auto', 'follow' or a number above 0")
-        return checks.number("gain", gain, above=0.0)
+        return checks.number("gain", gain, above=0.0, most=MAX_GAIN)
+
+    def _light_of_film(self, film: Iterable[Any]) -> np.ndarray:
+        """Linear light of all frames, (k, h, w) or (k, h, w, 3)."""
+        if not isinstance(film, Iterable):
+            raise InputTypeError(f"film is {checks.shown(film)}; it must be frames")
+        light = []
+        for number, frame in enumerate(film, start=1):
+            try:
+                light.append(self._light_of_frame(np.asarray(frame)))
+            except (InputError, InputTypeError) as error:
+                raise type(error)(f"film, frame {number}: {error}") from None
+        if not light:
+            raise InputError("film has no frames; give the frames that decide on gain='auto'")
+        if len({frame.ndim for frame in light}) > 1:
+            light = [np.broadcast_to(np.atleast_3d(f), (*f.shape[:2], 3)) for f in light]
+        return np.stack(light)
 
     def _light_of_frame(self, frame: np.ndarray) -> np.ndarray:
         """Linear light of codes; (h, w, 3) where T is in colour."""
-        self._check_frame(frame)
-        if frame.dtype.kind == "f":
-            light = srgb_light(frame) if self._decode == SRGB else frame
-        else:
-            light = light_of_codes(self._decode, frame.dtype)[frame]
+        codes = self._codes_of(frame)
+        assert not isinstance(codes, Array)  # noqa: S101 - an array of the host stays one
+        light = codes
+        if codes.dtype.kind != "f":
+            light = light_of_codes(self._decode, codes.dtype)[codes]
         if light.ndim == 2 and self.T.channels == 3:
             light = np.repeat(light[..., None], 3, axis=-1)
         return light
 
     def _frames_of(self, colours: int, dtype: np.dtype) -> PreparedFrames:
         """The prepared steps for frames of so many colours and one type; made at the first one."""
+        # The device has its own order of bytes.
+        dtype = dtype.newbyteorder("=")
         key = (colours, dtype.name)
         if key not in self._prepared:
             self._prepared[key] = self._prepare(colours, dtype)
         return self._prepared[key]
 
     def _prepare(self, colours: int, dtype: np.dtype) -> PreparedFrames:
-        channels = 3 if self.T.channels == 3 else colours
+        channels = self._channels(colours)
         for known in self._prepared.values():
             if known.colours == channels:
                 return known.for_codes(colours, dtype, self._decode)
-        table = self._table
-        request = self._request(channels)
-        if len(table.starts) != channels:
-            white = float(request.problem.limits.high)
-            table = code_table(self._encode, self._dtype, channels, white)
+        table = code_table(self._encode, self._dtype, channels, self._white)
         return PreparedFrames(
-            request,
+            self._request(channels),
             frame_colours=colours,
             frame_dtype=dtype,
             decode=self._decode,
@@ -325,13 +362,12 @@ class Compensator:
         array
             (h, w) on the projector's grid, or (h, w, 3) where T or the frame is in colour.
         """
+        begun_at = time.perf_counter()
         with self._lock:
-            for future in self._on_the_way:
-                future.result()
-            self._on_the_way.clear()
-            prepared, slot = self._begin(frame)
-            if not self._has_gain:
-                self._first_gain(prepared, slot, frame)
+            self._wait_for_all()
+            codes = self._codes_of(frame)
+            self._check_out(out, codes)
+            prepared, slot = self._begin(codes, begun_at)
             return self._end(prepared, slot, out)
 
     def submit(self, frame: Any) -> Future[np.ndarray | None]:
@@ -339,20 +375,20 @@ class Compensator:
 
         Copies and launches of neighbouring frames overlap. The result is None if the frame was
         dropped. Where light is brought within the bounds by projected steps, this returns when they
-        are done.
+        are done. A callback of a future must not call the compensator: its thread collects frames.
         """
+        begun_at = time.perf_counter()
         with self._lock:
             self._forget_done()
+            codes = self._codes_of(frame)
             if len(self._on_the_way) >= self._depth:
                 if self._drops:
                     self._dropped += 1
                     dropped: Future[np.ndarray | None] = Future()
                     dropped.set_result(None)
                     return dropped
-                self._on_the_way.popleft().result()
-            prepared, slot = self._begin(frame)
-            if not self._has_gain:
-                self._first_gain(prepared, slot, frame)
+                wait([self._on_the_way.popleft()])
+            prepared, slot = self._begin(codes, begun_at)
             prepared.keep_within_bounds(slot.begun_at + self._seconds)
             prepared.end(slot)
             future: Future[Any] = self._collector.submit(self._collect, prepared, slot)
@@ -363,21 +399,33 @@ class Compensator:
         while self._on_the_way and self._on_the_way[0].done():
             self._on_the_way.popleft()
 
-    def _begin(self, frame: Any) -> tuple[PreparedFrames, Slot]:
+    def _wait_for_all(self) -> None:
+        """Wait for the frames on their way, whatever became of them."""
+        wait(self._on_the_way)
+        self._on_the_way.clear()
+
+    def _begin(self, codes: np.ndarray | Array, begun_at: float) -> tuple[PreparedFrames, Slot]:
         """Queue a frame in the next slot."""
-        codes = self._codes_of(frame)
         colours = 3 if len(codes.shape) == 3 else 1
         prepared = self._frames_of(colours, codes.dtype)
         slot = prepared.slots[self._turn % self._depth]
         self._turn += 1
-        prepared.begin(slot, codes, self.gain)
+        prepared.begin(slot, codes, self.gain, begun_at)
         self._last = (prepared, self.gain)
+        if not self._has_gain:
+            self._first_gain(prepared, slot, codes)
         return prepared, slot
 
     def _codes_of(self, frame: Any) -> np.ndarray | Array:
         """The frame as the device takes it: uint8, uint16, or linear float32."""
+        if self._is_closed:
+            raise InputError("the compensator is closed; make another one for further frames")
         if isinstance(frame, Array):
             self._check_frame(frame)
+            if frame.dtype.name not in CODE_TYPES:
+                raise InputTypeError(
+                    f"frame holds {frame.dtype} on the device; it must be one of {CODE_NAMES}"
+                )
             if frame.dtype.kind == "f" and self._decode == SRGB:
                 raise InputError(
                     "frame is a device array of floats, but decode is 'srgb'; give codes of whole "
@@ -391,10 +439,33 @@ class Compensator:
         if codes.dtype.kind != "f":
             return codes
         light = srgb_light(codes) if self._decode == SRGB else codes
-        return checks.finite("frame", light).astype(np.float32, copy=False)
+        light = checks.finite("frame", light)
+        brightest = float(np.max(np.abs(light)))
+        if brightest * self.gain > MAX_LIGHT:
+            raise InputError(
+                f"frame reaches {brightest:.3g} at a gain of {self.gain:.3g}; light must be at "
+                f"most {MAX_LIGHT:g}"
+            )
+        return light.astype(np.float32, copy=False)
+
+    def _check_out(self, out: Any, codes: np.ndarray | Array) -> None:
+        """Refuse a place that does not take the codes of this frame as they are."""
+        if out is None:
+            return
+        colours = self._channels(3 if len(codes.shape) == 3 else 1)
+        shape = (*self.T.grid, 3) if colours == 3 else self.T.grid
+        is_place = isinstance(out, (np.ndarray, Array))
+        if not is_place or out.shape != shape or out.dtype.name != self._dtype:
+            raise InputError(
+                f"out is {checks.shown(out)}; it must be an array {shape} of {self._dtype}"
+            )
+        if isinstance(out, np.ndarray) and not out.flags.writeable:
+            raise InputError("out is read-only; it must be an array that can be written")
 
     def _check_frame(self, frame: Any) -> None:
         grid = self.T.camera_grid
+        if frame.dtype.kind not in "biufc":
+            raise InputTypeError(f"frame is {checks.shown(frame)}; it must be a picture")
         if frame.shape not in (grid, (*grid, 3)):
             raise InputError(f"frame has shape {frame.shape}; it must be {grid} or {(*grid, 3)}")
         if frame.dtype.name not in ("uint8", "uint16", "float32", "float64", "float16"):
@@ -407,7 +478,7 @@ class Compensator:
         if out is None:
             return codes
         if isinstance(out, Array):
-            return out.set(codes.reshape(out.shape))
+            return out.set(codes)
         np.copyto(out, codes)
         return out
 
@@ -422,7 +493,7 @@ class Compensator:
 
     # The gain that follows.
 
-    def _first_gain(self, prepared: PreparedFrames, slot: Slot, frame: Any) -> None:
+    def _first_gain(self, prepared: PreparedFrames, slot: Slot, codes: np.ndarray | Array) -> None:
         """Begin at the gain of the first frame, which is then computed again."""
         prepared.end(slot)
         prepared.take(slot)
@@ -430,9 +501,8 @@ class Compensator:
         self._has_gain = True
         if wanted is None:
             return
-        self.gain = wanted
-        codes = self._codes_of(frame)
-        prepared.begin(slot, codes, self.gain)
+        self.gain = min(wanted, MAX_GAIN)
+        prepared.begin(slot, codes, self.gain, slot.begun_at)
         self._last = (prepared, self.gain)
 
     def _follow(self, slot: Slot) -> None:
@@ -441,7 +511,7 @@ class Compensator:
         if wanted is not None:
             lowest = self.gain / self._frame_change
             highest = self.gain * self._frame_change
-            self.gain = min(max(wanted, lowest), highest)
+            self.gain = min(max(wanted, lowest), highest, MAX_GAIN)
 
     # Facts.
 
@@ -486,15 +556,15 @@ class Compensator:
         InputError before the first frame.
         """
         with self._lock:
-            for future in self._on_the_way:
-                future.result()
+            self._wait_for_all()
             if self._last is None:
                 raise InputError("no frame was given yet, which could be judged")
             error, clipped = self._last[0].judge()
         return FrameError(error=error, clipped=clipped)
 
     def close(self) -> None:
-        """Wait for the frames on their way, and end the thread that waits for the device."""
+        """Wait for the frames on their way, and take no more; facts of the last one stay."""
+        self._is_closed = True
         self._collector.shutdown(wait=True)
 
     def __enter__(self) -> Compensator:
@@ -502,6 +572,17 @@ class Compensator:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _check_dtype(dtype: Any) -> str:
+    """The name of a type of codes."""
+    try:
+        name = np.dtype(dtype).name
+    except TypeError:
+        name = ""
+    if name not in CODE_TYPES:
+        raise InputError(f"dtype is {dtype!r}; it must be one of {CODE_NAMES}")
+    return name
 
 
 def _gain_of_peaks(slot: Slot) -> float | None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -287,7 +286,9 @@ class WithinBounds:
     def saturated(self) -> int:
         """The number of values at a bound, beyond which a step would go."""
         x = self.x.get()
-        is_at_bound = (x <= self._lower) | (x >= self._upper)
+        # The device rounds light at a bound to a neighbour of it.
+        slack = BOUNDS_SLACK * (self._upper - self._lower)
+        is_at_bound = (x <= self._lower + slack) | (x >= self._upper - slack)
         return int(np.count_nonzero(self.descent.saturated(x) & is_at_bound))
 
 
@@ -444,7 +445,11 @@ class PreparedFrames:
             self.direct_steps = self._sharing_steps()
         self._exceeded = device.upload(np.zeros(1), np.int32)
         self._no_excess = np.zeros(1, np.int32)
-        self._unknown_scales = device.upload(self._scales())
+        scales = self._scales()
+        self._unknown_scales = device.upload(scales)
+        limits = request.problem.limits
+        # Unknowns of the darkest light that is allowed nearest to none.
+        self._darkest = device.upload(scales * np.clip(0.0, limits.low, limits.high))
         self._judge: WithinBounds | None = self.bounded
         self._make_final()
         if self.bounded is not None and self.direct_steps is not None:
@@ -452,7 +457,12 @@ class PreparedFrames:
         strips = -(-self.shown.pixels // STRIP_PIXELS)
         self._peaks = device.empty(strips)
         self._find_peaks: Launch | None = None
-        if has_peaks and self.direct_steps is not None:
+        if has_peaks:
+            if self.direct_steps is None:
+                raise InputError(
+                    f"gain is 'follow', but {MAX_FIXED_STEPS} steps do not undo the light of this "
+                    "T, whose brightness it follows; give inverse=ltcl.invert(T), or a number"
+                )
             self._find_peaks = self._bind_peaks()
 
     def _bounded_steps(self) -> WithinBounds:
@@ -673,9 +683,9 @@ class PreparedFrames:
 
     # Frames.
 
-    def begin(self, slot: Slot, frame: np.ndarray | Array, gain: float) -> None:
+    def begin(self, slot: Slot, frame: np.ndarray | Array, gain: float, begun_at: float) -> None:
         """Queue the upload of a frame, and all launches up to direct light."""
-        slot.begun_at = time.perf_counter()
+        slot.begun_at = begun_at
         slot.gain = gain
         if isinstance(frame, Array):
             self.device.copy(slot.frame.buffer, frame.buffer, byte_count=slot.frame.nbytes)
@@ -693,11 +703,13 @@ class PreparedFrames:
         if bounded is None:
             return
         if self.direct_steps is None:
-            vectors.fill(bounded.start, 0.0)
+            bounded.start.copy_from(self._darkest)
             bounded.solve(deadline)
             return
+        is_exceeded = self._count_exceeded() > 0
         # What several projectors share is not exact.
-        if self._count_exceeded() or isinstance(self.direct_steps, BySharing):
+        is_inexact = isinstance(self.direct_steps, BySharing)
+        if is_exceeded or is_inexact or self._request.problem.counts_masked_pixels:
             bounded.solve(deadline)
         else:
             bounded.keep_start()
@@ -736,7 +748,7 @@ class PreparedFrames:
         else:
             # Errors of a black target are not relative.
             error *= self.unit * self._request.problem.weight_unit
-        return error, clipped / lit_values
+        return error, float(clipped / max(lit_values, 1))
 
     def _size_of_target(self, judge: WithinBounds) -> float:
         """||w gain desired|| of the last frame, in units of light."""

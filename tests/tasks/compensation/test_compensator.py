@@ -277,7 +277,7 @@ def test_kernels_meet_their_twins(shaped, kind, monkeypatch):
     # The unknowns become codes.
     frames.bounded.x.copy_from(frames.bounded.start)
     slot.encode()
-    row = compensator._table.thresholds[0, :-1]
+    row = frames._table.thresholds[0, :-1]
     expected = reference.frames_encode(light, 0.1, 0.8, row)
     difference = slot.codes.get().astype(int) - expected
     is_lit = scales > 0
@@ -463,12 +463,145 @@ def test_results_stay_theirs():
     np.testing.assert_array_equal(first, kept)
 
 
+@pytest.mark.parametrize("kind", ["other camera", "blocks", "colour"])
+@pytest.mark.parametrize("bounds", [(0.5, 1.0), (-0.3, 0.7), (0.1, 0.15)])
+def test_bounds_of_any_place(kind, bounds):
+    """Also without 0, where the darkest light is no start, and with ends that float32 rounds."""
+    T = transport(kind)
+    desired = picture(T, 2.0)
+    compensator = light(T, bounds=bounds, rtol=1e-3)
+    pattern = compensator(desired)
+    expected = ltcl.compensate(T, desired, bounds=bounds, rtol=1e-3)
+    error = np.linalg.norm(T @ pattern - desired) / np.linalg.norm(desired)
+    facts = compensator.judge()
+    assert facts.error == pytest.approx(error, abs=1e-4)
+    assert error <= expected.error + 2e-3
+    assert facts.clipped == pytest.approx(expected.clipped, abs=0.3)
+
+
+@pytest.mark.parametrize("bounds", [(-1.0, 0.0), (-1.0, -0.1)])
+def test_bounds_below_light(bounds):
+    """White of codes is 1 then, as for films."""
+    T = transport("grey")
+    codes = ltcl.Compensator(T, bounds=bounds)(np.full(GRID, 90, np.uint8))
+    assert not codes.any()
+
+
+def test_masked_pixels_that_count(caplog):
+    """Light that is undone is not the best where weights count pixels that it cannot reach."""
+    M = np.array([[0.8, 0, 0.1, 0], [0.3, 0, 0.2, 0.1], [0.1, 0, 0.7, 0.1], [0, 0, 0.1, 0.9]])
+    T = ltcl.Transport(M, (2, 2))
+    weights = np.array([[1.0, 10.0], [1.0, 1.0]])
+    desired = np.array([[0.3, 0.5], [0.3, 0.3]])
+    compensator = light(T, weights=weights, rtol=1e-4)
+    compensator(desired)
+    expected = ltcl.compensate(T, desired, weights=weights, rtol=1e-4)
+    assert compensator.judge().error == pytest.approx(expected.error, abs=1e-3)
+
+
+@pytest.mark.parametrize("order", [">u2", "<u2"])
+def test_bytes_of_any_order(order):
+    T = transport("grey")
+    codes = rng.integers(0, 20000, GRID, dtype=np.uint16)
+    expected = light(T)(codes)
+    np.testing.assert_array_equal(light(T)(codes.astype(order)), expected)
+
+
+def test_grey_frames_before_a_coloured_background():
+    T = transport("grey")
+    background = rng.uniform(0.0, 0.1, (*GRID, 3)).astype(np.float32)
+    frame = rng.uniform(0.2, 0.3, GRID).astype(np.float32)
+    pattern = light(T, background=background, rtol=1e-4)(frame)
+    coloured = np.repeat(frame[..., None], 3, axis=-1)
+    expected = ltcl.compensate(T, coloured, background=background, rtol=1e-4).pattern
+    np.testing.assert_allclose(pattern, expected, rtol=0, atol=1e-3)
+
+
+def test_a_cancelled_frame_spoils_nothing():
+    T = transport("colour")
+    frame = picture(T, 0.3)
+    with light(T, clamp=True, depth=8) as compensator:
+        expected = compensator(frame)
+        futures = [compensator.submit(frame) for _ in range(8)]
+        for future in futures:
+            future.cancel()
+        np.testing.assert_array_equal(compensator(frame), expected)
+        assert compensator.judge().error < 0.02
+    with pytest.raises(InputError, match="closed"):
+        compensator.submit(frame)
+    with pytest.raises(InputError, match="closed"):
+        compensator(frame)
+
+
+@pytest.mark.parametrize(
+    "out",
+    [np.zeros(GRID, np.uint8), np.zeros((6, 4), np.float32), [[0.0]], np.zeros((2, *GRID), "f4")],
+    ids=["type", "shape", "list", "frames"],
+)
+def test_places_that_do_not_fit(out):
+    T = transport("grey")
+    compensator = light(T)
+    with pytest.raises(InputError, match="out is"):
+        compensator(np.full(GRID, 0.2), out=out)
+    assert compensator.statistics.frames == 0
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, 1e30, "a", None])
+def test_a_gain_that_is_set(gain):
+    compensator = light(transport("grey"))
+    with pytest.raises((InputError, InputTypeError), match="gain"):
+        compensator.gain = gain
+    assert compensator.gain == 1.0
+
+
+FILMS: dict[str, tuple[Any, str]] = {
+    "none": ([], "film has no frames"),
+    "number": (3, "film is 3"),
+    "one picture": (np.zeros(GRID), "film, frame 1: frame has shape"),
+    "sizes": ([np.ones(GRID), np.ones((2, 2))], "film, frame 2"),
+    "NaN": ([np.full(GRID, np.nan)], "film, frame 1"),
+}
+
+
+@pytest.mark.parametrize("case", FILMS)
+def test_bad_films(case):
+    film, message = FILMS[case]
+    with pytest.raises((InputError, InputTypeError), match=message):
+        light(transport("grey"), gain="auto", film=film)
+
+
+def test_film_grey_and_coloured():
+    T = transport("grey")
+    film = [np.full(GRID, 0.3), np.full((*GRID, 3), 0.2)]
+    assert light(T, gain="auto", film=film).gain > 1.0
+
+
+class Curve:
+    """A response by any function."""
+
+    def __init__(self, linear):
+        self.linear = linear
+
+
+@pytest.mark.parametrize(
+    "linear",
+    [np.ones_like, lambda codes: 1.0 - codes, lambda codes: codes * np.nan, lambda codes: 1.0],
+    ids=["constant", "falling", "NaN", "a number"],
+)
+def test_bad_responses(linear):
+    with pytest.raises(InputError, match="encode is a response"):
+        light(transport("grey"), encode=Curve(linear))
+
+
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "decode": ({"decode": "gamma"}, "decode is 'gamma'"),
     "encode": ({"encode": "gamma"}, "encode is 'gamma'"),
     "encode object": ({"encode": 3.0}, "encode is a float"),
     "response": ({"encode": Response(np.ones((3, 1)) * [0.0, 1.0])}, "response of 3 channels"),
     "dtype": ({"dtype": "int8"}, "dtype is 'int8'"),
+    "dtypes": ({"dtype": ["uint8"]}, "dtype is"),
+    "gains": ({"gain": np.array([1.0, 2.0])}, "gain"),
+    "film of follow": ({"gain": "follow", "film": [np.zeros(GRID)]}, "gain is 'follow'"),
     "gain": ({"gain": "loud"}, "gain is 'loud'"),
     "gain below 0": ({"gain": -1.0}, "gain"),
     "no film": ({"gain": "auto"}, "film is None"),
@@ -504,6 +637,13 @@ def test_bad_frames():
         compensator(np.full(GRID, np.nan))
     with pytest.raises(InputError, match="whole numbers"):
         ltcl.Compensator(T, decode="srgb")(T.device.upload(np.zeros(GRID)))
+    for value in (None, "abc"):
+        with pytest.raises(InputTypeError, match="frame is"):
+            compensator(value)
+    with pytest.raises(InputError, match="frame reaches 1e"):
+        compensator(np.full(GRID, 1e30))
+    with pytest.raises(InputTypeError, match="on the device"):
+        compensator(T.device.upload(np.zeros(GRID), np.float64))
     with pytest.raises(InputTypeError, match="T is a"):
         ltcl.Compensator(np.eye(3))  # pyright: ignore[reportArgumentType]
 
@@ -522,6 +662,8 @@ def test_clamp_needs_light_that_is_undone():
     strong = ltcl.Transport(T, grid)
     with pytest.raises(InputError, match="clamp is True"):
         light(strong, clamp=True)
+    with pytest.raises(InputError, match="gain is 'follow'"):
+        light(strong, gain="follow")
     desired = strong @ np.full(grid, 0.5)
     compensator = light(strong, rtol=1e-3)
     compensator(desired)
