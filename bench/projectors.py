@@ -92,7 +92,8 @@ def alpha_ramps(
     weights = []
     for projector in projectors:
         padded = np.pad(np.ones(projector.grid, bool), 1)
-        ramp = scipy.ndimage.distance_transform_edt(padded)[1:-1, 1:-1].ravel() - 0.5
+        distance = np.asarray(scipy.ndimage.distance_transform_edt(padded), np.float64)
+        ramp = distance[1:-1, 1:-1].ravel() - 0.5
         F = projector.direct(grid)
         white = np.asarray(F.sum(axis=1)).ravel()
         weights.append(np.divide(F @ ramp, white, out=np.zeros_like(white), where=white > 0.0))
@@ -192,6 +193,7 @@ def measure_optimality(options: Options) -> list[dict[str, float]]:
         for gain in (0.8, 1.5):
             c = ltcl.compensate(T, picture, gain=gain, rtol=1e-3)
             matrix = T.to_numpy().astype(np.float64)
+            assert T.ceilings is not None
             upper = np.maximum(T.ceilings, 1e-9)
             target = gain * picture.ravel()
             best = lsq_linear(matrix, target, (0.0, upper), method="bvls", tol=1e-12)
@@ -291,6 +293,7 @@ def measure_large(rows: int, options: Options) -> dict[str, Any]:
     first = ltcl.compensate(T, desired)
     prepared = time.perf_counter()
     seconds = []
+    c = first
     for _ in range(3):
         begin = time.perf_counter()
         c = ltcl.compensate(T, desired)
@@ -299,8 +302,8 @@ def measure_large(rows: int, options: Options) -> dict[str, Any]:
         np.rint(255.0 * np.roll(desired, 8 * step, axis=1)).astype(np.uint8) for step in range(8)
     ]
     rates = {}
-    for name, settings in (("clamped", {"clamp": True}), ("bounded", {})):
-        with ltcl.Compensator(T, decode="linear", **settings) as compensator:
+    for name in ("clamped", "bounded"):
+        with ltcl.Compensator(T, decode="linear", clamp=name == "clamped") as compensator:
             compensator(codes[0])
             begin = time.perf_counter()
             for frame in codes:
