@@ -28,6 +28,7 @@ from ltcl.scenes import dihedral, landscape
 ALBEDO = 0.6
 ROWS = 40
 SMALL_ROWS = 8
+GAIN_ROWS = 24
 # Rows and columns of projectors, and the pixels of each.
 LAYOUTS = {2: (1, 2, (40, 56)), 4: (2, 2, (26, 56)), 8: (2, 4, (26, 34))}
 OVERLAP = 0.35
@@ -193,8 +194,7 @@ def measure_optimality(options: Options) -> list[dict[str, float]]:
         for gain in (0.8, 1.5):
             c = ltcl.compensate(T, picture, gain=gain, rtol=1e-3)
             matrix = T.to_numpy().astype(np.float64)
-            assert T.ceilings is not None
-            upper = np.maximum(T.ceilings, 1e-9)
+            upper = np.maximum(np.asarray(T.ceilings, np.float64), 1e-9)
             target = gain * picture.ravel()
             best = lsq_linear(matrix, target, (0.0, upper), method="bvls", tol=1e-12)
             least = float(np.sqrt(2.0 * best.cost) / np.linalg.norm(target))
@@ -349,7 +349,7 @@ def main() -> None:
         seams = found["seams"]
         beside = ", ".join(f"{name} {value:.2%}" for name, value in seams.items())
         add(f"{count}: seam", seams["after"], beside, MAX_SEAM, seams["after"] <= MAX_SEAM)
-    gains = measure_gain(18 if options.smoke else 24, options)
+    gains = measure_gain(GAIN_ROWS, options)
     for name, ratio in gains.items():
         add(f"gain, {name}", ratio, "", MIN_GAIN_RATIO, ratio >= MIN_GAIN_RATIO)
     cases = measure_optimality(options)
