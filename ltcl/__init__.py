@@ -38,6 +38,7 @@ from ltcl.tasks.denoising import denoise
 from ltcl.tasks.relighting import relight
 from ltcl.tasks.separation import Separation, separate
 from ltcl.transport import noise
+from ltcl.transport.projectors import CombinedTransport, Gamut, combine
 from ltcl.transport.transport import Transport
 
 if TYPE_CHECKING:
@@ -48,10 +49,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "Analysis",
+    "CombinedTransport",
     "Compensation",
     "Compensator",
     "Compression",
     "Device",
+    "Gamut",
     "Inverse",
     "Separation",
     "Solution",
@@ -62,6 +65,7 @@ __all__ = [
     "align",
     "analyze",
     "batch",
+    "combine",
     "compensate",
     "compress",
     "denoise",

@@ -39,7 +39,7 @@ from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.settings import ScanSettings
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
-from ltcl.store import BlockStore, CompressedRecord, formats, load
+from ltcl.store import BlockStore, StoreRecord, formats, load
 
 FILE = "acquisition.toml"
 STORE = "transport.zarr"
@@ -387,9 +387,9 @@ def _make_virtual_rig(folder: Path, options: dict[str, Any]) -> rigs.VirtualRig:
         options.setdefault("camera_grid", T.camera_grid)
     else:
         record = formats.read(folder / str(camera_map))
-        if isinstance(record, CompressedRecord):
+        if not isinstance(record, StoreRecord):
             raise InputError(
-                f"camera_map is {camera_map}, a compressed transport; it must be a matrix"
+                f"camera_map is {camera_map}, a transport of operators; it must be a matrix"
             )
         options["camera_map"] = record.in_memory().matrices
     return rigs.VirtualRig(T, T.grid, **options)

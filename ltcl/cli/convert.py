@@ -13,7 +13,7 @@ from ltcl.cli.command import Answer, Context, command, note
 from ltcl.cli.options import argument, check_writable_file
 from ltcl.cli.reports.transports import ConvertReport
 from ltcl.errors import InputError
-from ltcl.store import CompressedRecord, StoreRecord, formats
+from ltcl.store import CombinedRecord, CompressedRecord, StoreRecord, formats
 from ltcl.store.guards import about
 
 
@@ -42,8 +42,8 @@ def convert(
 
 
 def _set_grids(
-    context: Context, record: StoreRecord | CompressedRecord
-) -> StoreRecord | CompressedRecord:
+    context: Context, record: StoreRecord | CompressedRecord | CombinedRecord
+) -> StoreRecord | CompressedRecord | CombinedRecord:
     """Set the grids of the options; a compressed transport cannot have another one."""
     sizes = {}
     for name in ("grid", "camera_grid"):
@@ -58,7 +58,7 @@ def _set_grids(
     return record
 
 
-def _note_lost_grids(target: Path, record: StoreRecord | CompressedRecord) -> None:
+def _note_lost_grids(target: Path, record: StoreRecord | CompressedRecord | CombinedRecord) -> None:
     rows, columns = record.shape
     if target.suffix.lower() == ".npy" or record.grid is None:
         grid = "HxW"

@@ -11,7 +11,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.cli.reports.transports import FileFacts
 from ltcl.errors import InputError
-from ltcl.store import CompressedRecord, StoreRecord
+from ltcl.store import CombinedRecord, CompressedRecord, StoreRecord
 from ltcl.store.record import CSR
 from ltcl.transport import first_bounce
 from ltcl.transport.noise import estimate
@@ -23,11 +23,13 @@ MAX_JUDGED_BYTES = 1 << 28
 
 
 def describe(
-    file: Path, record: StoreRecord | CompressedRecord
+    file: Path, record: StoreRecord | CompressedRecord | CombinedRecord
 ) -> tuple[FileFacts, np.ndarray | None]:
     """Return facts of a transport, and F (channels, N); refuse what could not be loaded again."""
     if isinstance(record, CompressedRecord):
         return _describe_compressed(file, record)
+    if isinstance(record, CombinedRecord):
+        return _describe_combined(file, record), None
     F = _first_bounce(record)
     matrices: list[Any] = list(record.matrices)
     stored = "sparse"
@@ -70,9 +72,29 @@ def _describe_compressed(file: Path, record: CompressedRecord) -> tuple[FileFact
     return facts, F
 
 
+def _describe_combined(file: Path, record: CombinedRecord) -> FileFacts:
+    """Describe several projectors: the sizes of all their matrices together."""
+    matrices: list[Any] = []
+    for member in record.members:
+        _check_record(member)
+        matrices.extend(member.matrices)
+    return _facts(
+        file,
+        record,
+        None,
+        channels=len(record.members[0].matrices),
+        stored="combined",
+        dtype=str(matrices[0].dtype),
+        entries=sum(map(_count_entries, matrices)),
+        nbytes=sum(map(_count_bytes, matrices)),
+        first_bounce_from="diagonal",
+        solution_error=0.0,
+    )
+
+
 def _facts(
     file: Path,
-    record: StoreRecord | CompressedRecord,
+    record: StoreRecord | CompressedRecord | CombinedRecord,
     F: np.ndarray | None,
     **facts_of_form: Any,
 ) -> FileFacts:
@@ -152,8 +174,11 @@ def _check_record(record: StoreRecord) -> None:
         checks.finite("T", matrix if record.dense else matrix.data)
 
 
-def judge(record: StoreRecord | CompressedRecord, facts: FileFacts) -> Verdict:
+def judge(record: StoreRecord | CompressedRecord | CombinedRecord, facts: FileFacts) -> Verdict:
     """Judge a transport as far as this is cheap; else tell which command can."""
+    if isinstance(record, CombinedRecord):
+        count = len(record.members)
+        return Verdict(f"Unknown: {count} projectors: run 'ltcl analyze {facts.file}'.")
     if isinstance(record, CompressedRecord):
         advice = "run 'ltcl analyze' on what it was made of"
         return Verdict(f"Unknown: stored as {facts.stored}: {advice}.")

@@ -42,7 +42,8 @@ def load(context: Context, path: Path, notes_dark: bool = True) -> Transport:
     T = store.load(path, device=device, **settings)
     dark_pixels = int(T.masked.sum())
     # Loading has logged the note on pixels that are below a threshold.
-    if dark_pixels and notes_dark and not T.dark_note:
+    has_note = notes_dark and T.scene is T
+    if dark_pixels and has_note and not T.dark_note:
         pixels = f"{dark_pixels} of {T.shape[1]} projector pixels"
         note(f"{path}: {pixels} give no direct light; they stay unlit")
     return T

@@ -20,7 +20,7 @@ from ltcl.cli.reports.acquisition import SimulateReport
 from ltcl.cli.reports.parts import Versions
 from ltcl.cli.tables import size_text
 from ltcl.errors import InputError
-from ltcl.store import StoreRecord, formats
+from ltcl.store import CombinedRecord, StoreRecord, formats
 from ltcl.tasks.report import versions
 
 SCENES = ("dihedral", "trihedral", "box")
@@ -261,6 +261,8 @@ def _scene_of_file(scene: str, asked: dict[str, Any]) -> Any:
         known = f"{', '.join(SCENES)}, mitsuba:NAME or a transport file"
         raise InputError(f"SCENE is {scene!r}; it must be {known}")
     record = formats.read(path)
+    if isinstance(record, CombinedRecord):
+        raise InputError(f"{scene}: is of several projectors; give the transport of one of them")
     if record.grid is None and asked["grid"] is None:
         raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
     if isinstance(record, StoreRecord) and asked["grid"] is not None:

@@ -3,12 +3,14 @@
 
 from ltcl.store.array_log import ArrayLog
 from ltcl.store.block_store import BlockStore
+from ltcl.store.combined import CombinedRecord
 from ltcl.store.formats import load, load_inverse, save, save_inverse
 from ltcl.store.record import CompressedRecord, StoredRows, StoreRecord
 
 __all__ = [
     "ArrayLog",
     "BlockStore",
+    "CombinedRecord",
     "CompressedRecord",
     "StoreRecord",
     "StoredRows",

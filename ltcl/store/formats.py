@@ -19,9 +19,11 @@ from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path, check_mapped_file, input_file, replace_file, unknown_extension
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, hdf5, matlab, matrix_market, npz
+from ltcl.store.combined import CombinedRecord, combined_record, combined_transport
 from ltcl.store.guards import about, floats
 from ltcl.store.record import INVERSE_FORMAT, CompressedRecord, Matrix, StoreRecord
 from ltcl.transport.first_bounce import DARK_THRESHOLD
+from ltcl.transport.projectors import CombinedTransport
 from ltcl.transport.transport import Transport, check_transport
 
 logger = logging.getLogger(__name__)
@@ -88,7 +90,9 @@ def load(
     }
     record = read(path, variable=variable)
     with about(path):
-        if isinstance(record, CompressedRecord):
+        if isinstance(record, CombinedRecord):
+            T: Transport = _combined(record, grid, camera_grid, options)
+        elif isinstance(record, CompressedRecord):
             if record.format == INVERSE_FORMAT:
                 raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
             T = Transport.from_arrays(record.arrays, grid=grid or camera_grid, **options)
@@ -96,6 +100,20 @@ def load(
             T = _transport(record, grid, camera_grid, options)
     T.reload = functools.partial(load, os.path.abspath(path), **reload_options)
     return T
+
+
+def _combined(
+    record: CombinedRecord, grid: Any, camera_grid: Any, options: dict[str, Any]
+) -> Transport:
+    """The transport of several projectors, which has all but its device in the file."""
+    for name, value in (("grid", grid), ("camera_grid", camera_grid)):
+        known = getattr(record, name)
+        if value is not None and checks.grid(name, value) != known:
+            raise FileError(f"is of several projectors; {name} is {value!r}, its own is {known}")
+    for name in ("first_bounce", "noise"):
+        if options[name] is not None:
+            raise FileError(f"is of several projectors; {name} belongs to the T of each of them")
+    return combined_transport(record, options["device"])
 
 
 def _transport(
@@ -136,6 +154,8 @@ def _grid(name: str, grid: Any, pixels: int, device: str) -> tuple[int, int]:
 def save(path: str | os.PathLike[str], T: Transport) -> None:
     """Save a transport; an earlier file at `path` is replaced whole or not at all.
 
+    A transport of several projectors (`ltcl.combine`) is an .npz.
+
     .npz and .zarr keep everything, and they alone compressed operators; .h5 all else, and .mat
     (version 5, less than 4 GiB a variable), but for noise; .npy (dense only) the matrix; .mtx (one
     channel) matrix and grids. An estimate of noise is not saved, and of pixels dropped by
@@ -152,7 +172,11 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     >>> ltcl.load(path).grid
     (2, 3)
     """
-    if check_transport(T, square=False).blocks is not None:
+    check_transport(T, square=False)
+    if isinstance(T, CombinedTransport):
+        write(path, combined_record(T))
+        return
+    if T.blocks is not None:
         raise InputTypeError(
             "T has 3 x 3 blocks between colours; only one matrix or three can be saved"
         )
@@ -205,7 +229,7 @@ def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse
 
 def read(
     path: str | os.PathLike[str], *, variable: str | Sequence[str] | None = None
-) -> StoreRecord | CompressedRecord:
+) -> StoreRecord | CompressedRecord | CombinedRecord:
     """Read a transport file; errors are those of `load`."""
     path = as_path(path)
     suffix = find(path)
@@ -222,7 +246,9 @@ def read(
         return file_format.read(path)
 
 
-def write(path: str | os.PathLike[str], record: StoreRecord | CompressedRecord) -> None:
+def write(
+    path: str | os.PathLike[str], record: StoreRecord | CompressedRecord | CombinedRecord
+) -> None:
     """Write a transport file whole or not at all; errors are those of `save`."""
     path = as_path(path)
     is_inverse = isinstance(record, CompressedRecord) and record.format == INVERSE_FORMAT
@@ -236,9 +262,15 @@ def write(path: str | os.PathLike[str], record: StoreRecord | CompressedRecord) 
             file_format.write(place, record)
 
 
-def check_losses(path: Path, file_format: Format, record: StoreRecord | CompressedRecord) -> None:
+def check_losses(
+    path: Path, file_format: Format, record: StoreRecord | CompressedRecord | CombinedRecord
+) -> None:
     """Refuse a format that cannot hold `record`; warn if it drops what can be found again."""
     loss = f"{path}: {path.suffix} does not keep"
+    if isinstance(record, CombinedRecord):
+        if path.suffix.lower() != ".npz":
+            raise FileError(f"{loss} several projectors; .npz does")
+        return
     if isinstance(record, CompressedRecord):
         if not file_format.keeps_operators:
             raise FileError(f"{loss} compressed transports; .npz and .zarr do")

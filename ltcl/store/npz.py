@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,6 +19,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import FileError, InputError
+from ltcl.store.combined import COMBINED_FORMAT, CombinedRecord
 from ltcl.store.guards import EXPANSION, check_declared, sparse_floats
 from ltcl.store.record import (
     CHANNELS,
@@ -31,8 +32,11 @@ from ltcl.store.record import (
     Variable,
     assemble,
 )
+from ltcl.transport.projectors.combined import MAX_PROJECTORS
 
 RGB_FORMAT = "ltcl-rgb-csr-1"
+# One sparse channel among the arrays of other matrices.
+GREY_FORMAT = "ltcl-csr-1"
 # Arrays of SciPy's layouts that hold indices begin with these.
 INDEX_ARRAYS = ("indices", "indptr", "row", "col", "coords", "offsets")
 # About the bytes of a stored entry: enough to bound the rows of a sparse matrix by the file's size.
@@ -47,7 +51,9 @@ MAX_DATA_DESCRIPTOR = 24
 Headers = dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
-def read_npz(path: Path, variable: Variable = None) -> StoreRecord | CompressedRecord:
+def read_npz(
+    path: Path, variable: Variable = None
+) -> StoreRecord | CompressedRecord | CombinedRecord:
     """Read an .npz; MemoryLimitError or FileError before any array that does not fit is made."""
     headers = _headers(path)
     with np.load(path, allow_pickle=False) as archive:
@@ -60,33 +66,72 @@ def read_npz(path: Path, variable: Variable = None) -> StoreRecord | CompressedR
             return np.asarray(checks.real(f"array {name!r}", array), native)
 
         layout = str(load("format")) if "format" in headers else None
-        if layout in (COMPRESSED_FORMAT, INVERSE_FORMAT):
-            arrays = {}
-            for name, (_, dtype) in headers.items():
-                if name != "format" and not dtype.hasobject:
-                    arrays[name] = load(name)
-            return CompressedRecord(arrays, layout)
+        if layout == COMBINED_FORMAT:
+            return _read_combined(path, headers, load)
+        return _read_record(path, headers, load, variable)
 
-        shapes = {}
-        unreadable = {}
-        for name, (shape, dtype) in headers.items():
-            kind = _kind(dtype)
-            if not kind or name.startswith("noise_"):
-                shapes[name] = shape
-            else:
-                unreadable[name] = kind
-        matrices: dict[str, Any] = {}
-        if layout is not None and variable is None:
-            matrices = _sparse_matrices(path, layout, headers, load)
-        shapes |= dict.fromkeys(matrices, (1, 1))
 
-        def load_member(name: str) -> Any:
-            if name in matrices:
-                return matrices[name]
-            return load(name)
+def _read_record(
+    path: Path,
+    headers: Headers,
+    load: Callable[[str], np.ndarray],
+    variable: Variable = None,
+) -> StoreRecord | CompressedRecord:
+    """The record of arrays that lie in an .npz."""
+    layout = str(load("format")) if "format" in headers else None
+    if layout in (COMPRESSED_FORMAT, INVERSE_FORMAT):
+        arrays = {}
+        for name, (_, dtype) in headers.items():
+            if name != "format" and not dtype.hasobject:
+                arrays[name] = load(name)
+        return CompressedRecord(arrays, layout)
 
-        contents = FileContents(shapes=shapes, load=load_member, unreadable=unreadable)
-        return assemble(contents, variable)
+    shapes = {}
+    unreadable = {}
+    for name, (shape, dtype) in headers.items():
+        kind = _kind(dtype)
+        if not kind or name.startswith("noise_"):
+            shapes[name] = shape
+        else:
+            unreadable[name] = kind
+    matrices: dict[str, Any] = {}
+    if layout is not None and variable is None:
+        matrices = _sparse_matrices(path, layout, headers, load)
+    shapes |= dict.fromkeys(matrices, (1, 1))
+
+    def load_member(name: str) -> Any:
+        if name in matrices:
+            return matrices[name]
+        return load(name)
+
+    contents = FileContents(shapes=shapes, load=load_member, unreadable=unreadable)
+    return assemble(contents, variable)
+
+
+def _read_combined(
+    path: Path, headers: Headers, load: Callable[[str], np.ndarray]
+) -> CombinedRecord:
+    """The record of several projectors."""
+
+    def part(prefix: str) -> StoreRecord | CompressedRecord | None:
+        own = {}
+        for name, header in headers.items():
+            if name.startswith(prefix):
+                own[name.removeprefix(prefix)] = header
+        if not own:
+            return None
+        return _read_record(path, own, lambda name: load(prefix + name))
+
+    members = []
+    for number in range(MAX_PROJECTORS):
+        member = part(f"projector_{number}.")
+        if isinstance(member, StoreRecord):
+            members.append(member)
+    settings = {name: load(name) for name in headers if "." not in name and name != "format"}
+    for name in ("balance", "black"):
+        if name not in settings:
+            raise FileError(f"array {name!r} is missing")
+    return CombinedRecord(members=tuple(members), scene=part("scene."), settings=settings)
 
 
 def _kind(dtype: np.dtype) -> str:
@@ -110,11 +155,12 @@ def _sparse_matrices(
         if name.startswith(INDEX_ARRAYS) and dtype.kind not in "iu":
             raise FileError(f"array {name!r} holds {dtype}; it must hold integers")
     entries = path.stat().st_size // ENTRY_BYTES
-    if layout != RGB_FORMAT:
+    if layout not in (RGB_FORMAT, GREY_FORMAT):
         return {"T": sparse_floats(lambda: scipy.sparse.load_npz(path), shape, entries)}
 
     matrices = {}
-    for number, channel in enumerate(CHANNELS):
+    names = CHANNELS if layout == RGB_FORMAT else ("T",)
+    for number, channel in enumerate(names):
         csr = tuple(load(f"{name}_{number}") for name in CSR)
 
         def make(csr: Any = csr) -> scipy.sparse.csr_array:
@@ -171,16 +217,38 @@ def _array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def write_npz(path: Path, record: StoreRecord | CompressedRecord) -> None:
+def write_npz(path: Path, record: StoreRecord | CompressedRecord | CombinedRecord) -> None:
     """Write everything in `record`."""
-    arrays: Mapping[str, Any]
+    np.savez(path, **_arrays(record))
+
+
+def _arrays(record: StoreRecord | CompressedRecord | CombinedRecord) -> dict[str, Any]:
+    if isinstance(record, CombinedRecord):
+        return _combined_arrays(record)
     if isinstance(record, CompressedRecord):
-        arrays = {"format": record.format, **record.arrays}
-    elif record.dense:
-        arrays = record.arrays()
-    else:
-        arrays = record.arrays() | _sparse_arrays(record)
-    np.savez(path, **arrays)
+        return {"format": record.format, **record.arrays}
+    if record.dense:
+        return record.arrays()
+    return record.arrays() | _sparse_arrays(record)
+
+
+def _combined_arrays(record: CombinedRecord) -> dict[str, Any]:
+    """Arrays of several projectors, each with the name of its part in front."""
+    parts: dict[str, Any] = {}
+    for number, member in enumerate(record.members):
+        parts[f"projector_{number}."] = member
+    if record.scene is not None:
+        parts["scene."] = record.scene
+    arrays = {"format": COMBINED_FORMAT, **record.settings}
+    for prefix, part in parts.items():
+        own = _arrays(part)
+        if isinstance(part, StoreRecord) and not part.dense and len(part.matrices) == 1:
+            own = part.arrays() | {"format": GREY_FORMAT, "shape": part.shape}
+            for name in CSR:
+                own[f"{name}_0"] = getattr(part.matrices[0], name)
+        for name, value in own.items():
+            arrays[prefix + name] = value
+    return arrays
 
 
 def _sparse_arrays(record: StoreRecord) -> dict[str, Any]:

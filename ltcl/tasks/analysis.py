@@ -113,7 +113,8 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     Parameters
     ----------
     T : Transport
-        Any transport; one without S gets the verdict alone.
+        Any transport; one without S gets the verdict alone. Of several projectors (`ltcl.combine`)
+        the S between camera pixels is analyzed.
     rtol : float
         Tolerance of the forecast, from 1.2e-7 to 1.
 
@@ -136,6 +137,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     check_transport(T, square=False)
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     channels = []
+    T = T.scene
     if T.is_square:
         for matrix, F, S, negative in zip(
             T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True

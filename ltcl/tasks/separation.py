@@ -123,8 +123,8 @@ def separate(
     Parameters
     ----------
     T : Transport
-        A square transport. The bounces are as good as its first bounce: see
-        ``first_bounce="exact"``.
+        A square transport, or one of several projectors (`ltcl.combine`). The bounces are as good
+        as its first bounce: see ``first_bounce="exact"``.
     image : (h, w), (h, w, 3), or frames of these
         Linear light in the units of T.
     bounces : int
@@ -158,6 +158,7 @@ def separate(
     >>> bool(abs(b.direct - 0.5).max() < 1e-3)
     True
     """
+    T = check_transport(T, square=False).scene
     check_transport(T)
     checks.count("bounces", bounces, least=0)
     _check_method(method, options)

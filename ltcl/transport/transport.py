@@ -13,11 +13,12 @@ from __future__ import annotations
 import logging
 import math
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Device, open_device
@@ -48,6 +49,7 @@ from ltcl.transport.noise import Noise, estimate
 logger = logging.getLogger(__name__)
 # Share of diag(S) = 1 + diag(R) that is diag(T) / F: from here on, I + R has all digits of T F^-1.
 MIN_DIAGONAL_SHARE = 0.5
+NOT_SHARED = "T is of one projector, which shares its light with no other one"
 # Attributes that do not leave this process.
 NOT_PICKLED = ("device", "systems", "operators", "checked_inverses", "reload")
 
@@ -110,6 +112,9 @@ class Transport:
         `first_bounce`.
     first_bounce_error : array like first_bounce, or None
         Standard error of an estimate.
+    ceilings : (N,) or None
+        The largest light of each projector pixel over the upper bound, of several projectors that
+        share their light; None where all pixels reach the bound.
 
     Raises
     ------
@@ -123,6 +128,8 @@ class Transport:
     >>> print(T @ numpy.array([[1.0, 0.0]]))
     [[0.5 0.1]]
     """
+
+    ceilings: np.ndarray | None = None
 
     def __init__(
         self,
@@ -392,6 +399,21 @@ class Transport:
         return self.camera_grid == self.grid and self.blocks is None
 
     @property
+    def scene(self) -> Transport:
+        """The transport whose S undoes light: T itself, or that of several projectors' scene."""
+        return self
+
+    @property
+    def background(self) -> list[np.ndarray] | None:
+        """None: the black of one projector is subtracted by its scan, or given by the caller."""
+        return None
+
+    @property
+    def light_of_white(self) -> np.ndarray:
+        """Direct light of all projector pixels, (channels, M), where S undoes light."""
+        return self._require_first_bounce()
+
+    @property
     def couples(self) -> bool:
         """True if the light of one colour is seen in another."""
         return self.blocks is not None or self.mixing is not None
@@ -550,6 +572,18 @@ class Transport:
         return as_operator(T, self.device)
 
     # Use.
+
+    def split(self, pattern: Any) -> tuple[np.ndarray, ...]:
+        """The pattern of each projector: that of the only one."""
+        return (np.asarray(pattern),)
+
+    def share_light(self, direct: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Patterns of several projectors that make direct light."""
+        raise InputError(NOT_SHARED)
+
+    def sharing_matrix(self) -> scipy.sparse.csr_array:
+        """Patterns (N, M) of several projectors from the light that drives all of them."""
+        raise InputError(NOT_SHARED)
 
     def __matmul__(self, pattern: Any) -> np.ndarray:
         """Relight: the picture (float32) under `pattern`, as in `ltcl.relight`."""

@@ -22,6 +22,7 @@ from ltcl.tasks.compensation import Compensator, compensate
 from ltcl.tasks.separation import separate
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import ENTRIES
+from ltcl.transport.projectors import CombinedTransport
 
 # Facts, and pictures by their names.
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -129,6 +130,7 @@ class ViewerScene:
                 "error": T.error,
                 "device": T.device.name,
                 "square": T.is_square,
+                "bounces": T.scene.is_square,
                 "compressed": T.is_compressed,
                 "extensions": [*BITS],
             }
@@ -329,7 +331,7 @@ class ViewerScene:
         for_camera = _resized(picture, self.T.camera_grid)
         for_projector = for_camera
         if self.T.grid != self.T.camera_grid:
-            for_projector = _resized(picture, self.T.grid)
+            for_projector = self._for_projectors(picture)
         self._picture_count += 1
         number = self._picture_count
         self._pictures[number] = KeptPicture(
@@ -338,6 +340,16 @@ class ViewerScene:
         if number > self._first_pictures + MAX_UPLOADS:
             del self._pictures[number - MAX_UPLOADS]
         return number
+
+    def _for_projectors(self, picture: np.ndarray) -> dict[str, np.ndarray]:
+        """The picture on the projector's grid, or on that of each of several, side by side."""
+        if not isinstance(self.T, CombinedTransport):
+            return _resized(picture, self.T.grid)
+        parts = [_resized(picture, grid) for grid in self.T.montage.grids]
+        joined = {}
+        for way in parts[0]:
+            joined[way] = self.T.join([part[way] for part in parts])
+        return joined
 
     def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
         """Keep the picture of a file.

@@ -29,6 +29,7 @@ from ltcl.operators import (
     Host,
     IdentityPlus,
     Operator,
+    Product,
     Pyramid,
     RowBlocks,
     ScaledBasis,
@@ -47,6 +48,8 @@ TALL = gallery.signed(53, 7)
 GRID = (5, 6)
 PIXELS = 30
 EYE = np.eye(53)
+# Some columns of seven, twice.
+CHOICE = 2 * np.eye(7, 5, dtype=np.float32)
 
 Pair = tuple[Operator, np.ndarray]
 
@@ -130,6 +133,7 @@ def coupled_operators(device: Device) -> dict[str, Pair]:
     return {
         "coupled": (Coupled(blocks, mixing), coupled),
         "mixed": (Coupled.mixed([square] * 3, mixing), mixed),
+        "product": (Product(Dense(device, TALL), Dense(device, CHOICE)), TALL @ CHOICE),
     }
 
 
@@ -137,7 +141,7 @@ NAMES = (
     "dense, csr, transposed dense, transposed csr, host, scaled columns, I + R, I - A, shifted, "
     "shifted where lit, I + transposed, I + (A - I), wavelet, order, pyramid, hats, "
     "wavelet and order, both sides, rows, columns, two bases, more than pixels, fewer than pixels, "
-    "scaled, scaled rows, coupled, mixed"
+    "scaled, scaled rows, coupled, mixed, product"
 )
 
 
@@ -239,7 +243,7 @@ def test_facts(pair):
     error = 8 * reference.UNIT * np.abs(matrix).max()
     np.testing.assert_allclose(A.to_dense(), matrix, rtol=0, atol=error)
     # Others do not know it.
-    if not isinstance(A, Host | Basis | Coupled):
+    if not isinstance(A, Host | Basis | Coupled | Product):
         np.testing.assert_allclose(A.diagonal(), matrix.diagonal(), atol=4 * reference.UNIT)
 
 

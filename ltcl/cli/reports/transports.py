@@ -20,7 +20,7 @@ from ltcl.cli.reports.report import Report
 SolutionError = Annotated[float, "Bound on the error of solutions, by `--norm`."]
 ErrorBound = Annotated[float, "Bound on the error of solutions for any light."]
 StoredForm = Annotated[
-    Literal["dense", "sparse", "row blocks", "compressed", "inverse"],
+    Literal["dense", "sparse", "row blocks", "compressed", "inverse", "combined"],
     "Form of storage.",
 ]
 

@@ -193,9 +193,9 @@ class BoundedLight:
 
 def _undo_light(request: CompensationRequest) -> StartingLight:
     """Step 2: the light without bounds, at the gain, or at the largest gain within the loss."""
-    if not request.T.is_square:
-        return _start_without_light(request)
     try:
+        if not request.T.is_square:
+            return _share_light(request)
         if request.gain is None:
             return _undo_light_at_largest_gain(request)
         return _undo_light_at_gain(request, request.gain)
@@ -205,6 +205,33 @@ def _undo_light(request: CompensationRequest) -> StartingLight:
             raise
         # S may be singular, and yet some pattern within the bounds is the best.
         return _start_without_light(request)
+
+
+def _share_light(request: CompensationRequest) -> StartingLight:
+    """Light undone in the camera's pixels and shared out between several projectors."""
+    T = request.T
+    if T.scene is T:
+        return _start_without_light(request)
+    problem = request.problem
+    if request.gain is not None:
+        direct = _solve_in_scene(request, problem.light_to_add(request.gain))
+        return StartingLight(gain=request.gain, light=T.share_light(direct))
+    slopes = T.share_light(_solve_in_scene(request, problem.desired))
+    shifts = [np.zeros_like(slope) for slope in slopes]
+    if problem.has_background:
+        shifts = T.share_light(_solve_in_scene(request, problem.background))
+    gain, light = gain_within_loss(problem, request.loss, (slopes, shifts))
+    return StartingLight(gain=gain, light=light)
+
+
+def _solve_in_scene(request: CompensationRequest, targets: Columns) -> Columns:
+    """The direct light of each channel that makes the targets, without bounds."""
+    T = request.T
+    if len(targets) != T.channels:
+        targets = np.split(targets[0], 3)
+    targets = [np.ascontiguousarray(target) for target in targets]
+    solutions = solve_each(T.scene.systems, targets, rtol=request.problem.settings.rtol)
+    return [solution.x for solution in solutions]
 
 
 def _start_without_light(request: CompensationRequest) -> StartingLight:
@@ -316,7 +343,7 @@ def _bring_within_bounds(request: CompensationRequest, start: StartingLight) -> 
             if problem.settings.throw and solution.status is Status.MAXITER:
                 raise ConvergenceError(str(solution), solution)
             solves.append(solution)
-            is_at_bound = (nearest <= limits.low) | (nearest >= limits.high)
+            is_at_bound = (nearest <= limits.low) | (nearest >= limits.highest)
             is_clipped = solution.saturated & is_at_bound & ~limits.masked[:, None]
         light.append(nearest)
         if is_clipped is not None:

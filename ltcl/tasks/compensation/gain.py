@@ -58,7 +58,7 @@ def exact_gain(u: Columns, v: Columns, limits: Limits) -> float | None:
         if exceeded is not None and (exceeded & is_constant).any():
             return None
         divisor = np.where(is_constant, 1.0, slope)
-        ends = np.stack([limits.low + shift, limits.high + shift]) / divisor
+        ends = np.stack([limits.low + shift, limits.highest + shift]) / divisor
         starts = np.min(ends, axis=0)
         stops = np.max(ends, axis=0)
         lowest = max(lowest, float(np.max(starts, where=~is_constant, initial=0.0)))

@@ -110,23 +110,25 @@ class LightGuess:
             is_used = (problem.systems[index].scale > 0.0) & ~limits.masked
             is_rising = (slope > 0.0) & is_used[:, None]
             if is_rising.any():
-                ends = (limits.high + shift[is_rising]) / slope[is_rising]
+                highest = np.broadcast_to(limits.highest, slope.shape)[is_rising]
+                ends = (highest + shift[is_rising]) / slope[is_rising]
                 self.first_bound = min(self.first_bound, float(np.min(ends)))
             weight = problem.systems[index].scale[:, None]
             if problem.weights is not None and len(problem.weights[index]) == len(slope):
                 weight = weight * problem.weights[index]
             rows = np.flatnonzero(is_used)[::stride]
             sampled = np.broadcast_to(weight, slope.shape)[rows]
-            self.systems.append((slope[rows], shift[rows], sampled))
+            highest = np.broadcast_to(limits.highest, slope.shape)[rows]
+            self.systems.append((slope[rows], shift[rows], highest, sampled))
             self.square += float(np.sum(np.square(sampled * slope[rows])))
         self.limits = limits
 
     def square_error(self, gain: float) -> float:
         """The square of the relative error that clipping costs at this gain."""
         total = 0.0
-        for slope, shift, weight in self.systems:
+        for slope, shift, highest, weight in self.systems:
             light = gain * slope - shift
-            clipped = np.clip(light, self.limits.low, self.limits.high)
+            clipped = np.clip(light, self.limits.low, highest)
             total += float(np.sum(np.square(weight * (clipped - light))))
         return total / (gain * gain * self.square)
 
@@ -172,7 +174,8 @@ class _SystemDescent:
         scale = problem.systems[index].scale
         self.unit = unit
         free_scale = np.where(limits.masked, 0.0, scale)
-        self.box = round_inwards(free_scale * limits.low / unit, free_scale * limits.high / unit)
+        highest = free_scale * limits.highest[:, 0]
+        self.box = round_inwards(free_scale * limits.low / unit, highest / unit)
         self.desired = problem.desired[index] / desired_unit
         self.background = problem.background[index] / unit
         weights = None

@@ -20,7 +20,6 @@ from ltcl.solvers import SolveSettings, Status
 from ltcl.tasks.compensation.problem import (
     Columns,
     CompensationProblem,
-    Limits,
     inner_product,
     multiply,
     subtract,
@@ -140,7 +139,7 @@ class GainTrials:
         ):
             # T^T W^2 d
             use = system.scale[:, None] * (A.T @ wwd)
-            best = limits.clip(np.where(use > 0.0, limits.high, limits.low))
+            best = limits.clip(np.where(use > 0.0, limits.highest, limits.low))
             light.append(best)
             largest_product += float(np.sum(use * best) + np.sum(background * wwd))
         if largest_product <= 0.0:
@@ -212,6 +211,7 @@ class GainTrials:
         is_lit = (scale > 0.0) & ~limits.masked
         T = (self.matrices[index] * scale)[:, is_lit]
         columns = target.shape[1]
+        highest = np.broadcast_to(limits.highest[:, 0], scale.shape)[is_lit]
         light = limits.clip(np.zeros((len(scale), columns)))
         errors = np.zeros(columns)
         least = np.zeros(columns)
@@ -221,8 +221,8 @@ class GainTrials:
                 w = problem.weights[index][:, column]
             weighted_T = w[:, None] * T
             weighted_b = w * b
-            x, least_error = _bounded_least_squares(weighted_T, weighted_b, limits)
-            light[is_lit, column] = np.clip(x.astype(np.float32), limits.low, limits.high)
+            x, least_error = _bounded_least_squares(weighted_T, weighted_b, limits.low, highest)
+            light[is_lit, column] = np.clip(x.astype(np.float32), limits.low, highest)
             rounded = light[is_lit, column]
             errors[column] = np.linalg.norm(weighted_T @ rounded - weighted_b)
             least[column] = least_error
@@ -275,12 +275,13 @@ class GainTrials:
 
 
 def _bounded_least_squares(
-    T: np.ndarray, b: np.ndarray, limits: Limits
+    T: np.ndarray, b: np.ndarray, low: float, high: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """The x within the limits with the least ||T x - b||, and a lower bound on that error."""
+    """The x from low to high, (N,), with the least ||T x - b||, and a lower bound on that error."""
     x = np.zeros(T.shape[1])
     if T.shape[1] > 0:
-        bounds = (limits.low, limits.high)
+        # SciPy wants room between the bounds; light without it is the lower one.
+        bounds = (low, np.maximum(high, np.nextafter(np.float32(low), np.float32(np.inf))))
         x = scipy.optimize.lsq_linear(T, b, bounds, method="bvls", tol=1e-12).x
     residual = T @ x - b
     error = float(np.linalg.norm(residual))
@@ -288,5 +289,5 @@ def _bounded_least_squares(
         return x, 0.0
     # The gap of Frank and Wolfe, as in `ltcl.solvers.bounded`.
     gradient = T.T @ residual
-    gap = np.maximum(gradient * (x - limits.low), gradient * (x - limits.high))
+    gap = np.maximum(gradient * (x - low), gradient * (x - high))
     return x, max(error - float(np.sum(gap)) / error, 0.0)

@@ -112,9 +112,14 @@ def check_inputs(
     checked_gain = check_gain(gain, loss)
     system_count = 1 if T.couples else T.channels
     masked = stack_channels([T.masked] * T.channels, system_count)[0]
-    limits = Limits.in_float32(bounds, masked)
+    ceilings = None
+    if T.ceilings is not None:
+        ceilings = stack_channels([T.ceilings] * T.channels, system_count)[0]
+    limits = Limits.in_float32(bounds, masked, ceilings)
     columns, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
     dark = check_background(background, T, shape, columns)
+    if T.background is not None:
+        dark = [light + black for light, black in zip(dark, T.background, strict=True)]
     channel_weights, weight_unit = check_weights(weights, T, shape, columns)
     if inverse is not None:
         other_method = None if method == "auto" else method
@@ -124,7 +129,7 @@ def check_inputs(
         if T.is_compressed or inverse is not None:
             rtol = default_rtol(RTOL, T, exact, inverse)
     settings = check_settings(T, method, rtol, options)
-    if checks.flag("clamp", clamp) and not T.is_square:
+    if checks.flag("clamp", clamp) and not T.is_square and T.scene is T:
         raise InputError(
             "clamp is True, but this T has no S; its light is found within the bounds only"
         )

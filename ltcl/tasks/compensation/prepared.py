@@ -20,7 +20,7 @@ import numpy as np
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import InputError
-from ltcl.operators import Dense, IdentityPlus, Operator, block_diagonal
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, block_diagonal
 from ltcl.operators.epilogue import Epilogue
 from ltcl.solvers.auto import SMALL
 from ltcl.solvers.bounded import Descent, Search
@@ -181,6 +181,34 @@ class ByFixedSteps:
         for keep, gain in self._numbers[1:]:
             stepper.step(keep, gain)
         self._finish()
+
+
+class BySharing:
+    """Light of several projectors: direct light by `steps`, clipped as their drive, and shared.
+
+    A drive within the bounds gives each projector no more than its ceiling.
+    """
+
+    def __init__(
+        self, steps: ByInverse | ByFixedSteps, clip: Launch, share: Queued, exceeded: Array
+    ) -> None:
+        self.products = steps.products
+        self._steps = steps
+        self._clip = clip
+        self._share = share
+        self._exceeded = exceeded
+
+    def queue(self) -> None:
+        """Queue all launches."""
+        self._steps.queue()
+        self._clip()
+        self._share()
+
+    def count_clipped(self) -> int:
+        """The number of values of the drive that were beyond the bounds; waits."""
+        self._exceeded.set(np.zeros(1, np.int32))
+        self._clip()
+        return int(self._exceeded.get()[0])
 
 
 class WithinBounds:
@@ -405,11 +433,16 @@ class PreparedFrames:
             self.target = self.bounded.target
         else:
             self.target = device.empty(self.seen.shape)
-        self.direct_steps: ByInverse | ByFixedSteps | None = None
+        self.direct_steps: ByInverse | ByFixedSteps | BySharing | None = None
         if request.T.is_square:
             self.direct = device.empty(self.shown.shape)
             self._direct_factors = device.upload(self._factors())
-            self.direct_steps = self._direct_steps()
+            self.direct_steps = self._direct_steps(self.direct)
+        elif request.T.scene is not request.T:
+            self.direct = device.empty(self.shown.shape)
+            lit = np.where(request.T.masked, 0.0, self.unit)[:, None]
+            self._direct_factors = device.upload(self.shown.from_channels([lit] * self.colours))
+            self.direct_steps = self._sharing_steps()
         self._exceeded = device.upload(np.zeros(1), np.int32)
         self._no_excess = np.zeros(1, np.int32)
         scales = self._scales()
@@ -437,7 +470,11 @@ class PreparedFrames:
         A = block_diagonal([system.A for system in problem.systems])
         scales = self._scales()[:, :1]
         lower = (scales * problem.limits.low).astype(np.float32)[:, 0]
-        upper = (scales * problem.limits.high).astype(np.float32)[:, 0]
+        highest = []
+        for _, scale in problem.systems:
+            highest.append(np.broadcast_to(problem.limits.highest, (len(scale), 1)))
+        upper = scales * self.shown.from_channels(highest)[:, :1]
+        upper = upper.astype(np.float32)[:, 0]
         weights = None
         if problem.weights is not None:
             weights = self.seen.from_channels(problem.weights)
@@ -445,20 +482,21 @@ class PreparedFrames:
         rtol = problem.settings.rtol
         return WithinBounds(A, columns, weights, (lower, upper), rtol, self._is_warm)
 
-    def _direct_steps(self) -> ByInverse | ByFixedSteps | None:
+    def _direct_steps(self, direct: Array) -> ByInverse | ByFixedSteps | None:
         """The way from light to add to direct light; None if steps do not converge."""
         request = self._request
         if request.inverse is not None:
             inverse = block_diagonal(request.inverse.systems)
-            return ByInverse(inverse, self.target, self.direct)
-        if request.T.shape[0] <= SMALL:
-            inverses = _dense_inverses(request.T.systems)
+            return ByInverse(inverse, self.target, direct)
+        systems = request.T.scene.systems
+        if systems[0].shape[0] <= SMALL:
+            inverses = _dense_inverses(systems)
             if inverses is not None:
-                return ByInverse(block_diagonal(inverses), self.target, self.direct)
-        S = block_diagonal(request.T.systems)
+                return ByInverse(block_diagonal(inverses), self.target, direct)
+        S = block_diagonal(systems)
         assert isinstance(S, IdentityPlus)  # noqa: S101 - as all systems are
         rtol = request.problem.settings.rtol
-        steps = ByFixedSteps(S, self.target, self.direct, rtol, self._probes(S))
+        steps = ByFixedSteps(S, self.target, direct, rtol, self._probes(S))
         if steps.products:
             return steps
         if self.bounded is None:
@@ -471,11 +509,12 @@ class PreparedFrames:
     def _probes(self, S: Operator) -> np.ndarray:
         """Light of white, of a random pattern, and a random picture, (3, rows, columns)."""
         random = np.random.default_rng(0)
-        white = self.shown.from_channels([f[:, None] for f in self._request.first_bounce])
+        light_of_white = self._request.T.light_of_white
+        white = self.seen.from_channels([f[:, None] for f in light_of_white])
         white = white.astype(np.float32) / np.float32(self.unit)
-        noise = random.random(self.shown.shape, np.float32)
-        probes = [S @ white, S @ (noise * white), random.random(self.shown.shape, np.float32)]
-        return np.stack([np.reshape(probe, self.shown.shape) for probe in probes])
+        noise = random.random(self.seen.shape, np.float32)
+        probes = [S @ white, S @ (noise * white), random.random(self.seen.shape, np.float32)]
+        return np.stack([np.reshape(probe, self.seen.shape) for probe in probes])
 
     def _light_arguments(self, factors: Array, direct: Array) -> dict[str, Any]:
         limits = self._request.problem.limits
@@ -512,6 +551,41 @@ class PreparedFrames:
             exceeded=self._exceeded,
             **self._light_arguments(self._direct_factors, self.direct),
         )
+
+    def _sharing_steps(self) -> BySharing | None:
+        """The way from light to add to the light of several projectors; None for mixed colours."""
+        request = self._request
+        T = request.T
+        if T.couples or request.problem.limits.low > 0.0:
+            if self.bounded is None:
+                raise InputError(
+                    "clamp is True, but projectors that mix colours, or a lower bound above 0, "
+                    "need the solve within the bounds; leave out clamp"
+                )
+            return None
+        device = self.device
+        direct = device.empty(self.seen.shape)
+        steps = self._direct_steps(direct)
+        if steps is None:
+            return None
+        divisors = self.seen.from_channels([divisor[:, None] for divisor in T.light_of_white])
+        factors = np.divide(self.unit, divisors, out=np.zeros_like(divisors), where=divisors > 0.0)
+        drive = device.empty(self.seen.shape)
+        exceeded = device.upload(np.zeros(1), np.int32)
+        arguments = self._light_arguments(device.upload(factors), direct)
+        clip = self._bind(
+            self._kernel("clip", "float32", self.seen, MIXED=0),
+            self.seen,
+            slack=0.0,
+            scales=device.upload(np.ones(self.seen.shape)),
+            x=drive,
+            exceeded=exceeded,
+            **arguments | {"pixels": self.seen.pixels},
+        )
+        matrix = T.sharing_matrix() / self.unit
+        count = self.seen.channels if self.seen.is_stacked else 1
+        share = block_diagonal([CSR(device, matrix)] * count)
+        return BySharing(steps, clip, share.bind(drive, self.direct), exceeded)
 
     def _bind_peaks(self) -> Launch:
         """The launch of the peaks, after the light of the background itself is found."""
@@ -633,7 +707,9 @@ class PreparedFrames:
             bounded.solve(deadline)
             return
         is_exceeded = self._count_exceeded() > 0
-        if is_exceeded or self._request.problem.counts_masked_pixels:
+        # What several projectors share is not exact.
+        is_inexact = isinstance(self.direct_steps, BySharing)
+        if is_exceeded or is_inexact or self._request.problem.counts_masked_pixels:
             bounded.solve(deadline)
         else:
             bounded.keep_start()
@@ -655,6 +731,10 @@ class PreparedFrames:
             judge.target.copy_from(self.target)
             clipped = self._count_exceeded()
             judge.keep_start()
+            if isinstance(self.direct_steps, BySharing):
+                share = self.direct_steps.count_clipped() / (self.seen.pixels * self.colours)
+                lit_values = self.colours * np.count_nonzero(~self._request.T.masked)
+                clipped = share * lit_values
         elif judge.errors is not None:
             clipped = judge.saturated()
         errors = judge.errors

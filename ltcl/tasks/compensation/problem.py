@@ -43,26 +43,40 @@ class ChannelSystem(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """The projector's bounds; pixels that are `masked`, (N,), stay dark whatever these are."""
+    """The projector's bounds; pixels that are `masked`, (N,), stay dark whatever these are.
+
+    Pixels with a ceiling, (N,) from 0 to 1, reach that part of the way from low to high.
+    """
 
     low: float
     high: float
     masked: np.ndarray
+    ceilings: np.ndarray | None = None
 
     @classmethod
-    def in_float32(cls, bounds: tuple[float, float], masked: np.ndarray) -> Limits:
+    def in_float32(
+        cls, bounds: tuple[float, float], masked: np.ndarray, ceilings: np.ndarray | None = None
+    ) -> Limits:
         """Limits of float32 within the bounds, so that a rounded pattern does not exceed them."""
         low, high = round_inwards(*bounds)
         if not -np.inf < low < high < np.inf:
             raise InputError(f"bounds is {bounds}; there must be two numbers of float32 within")
-        return cls(float(low), float(high), masked)
+        return cls(float(low), float(high), masked, ceilings)
+
+    @cached_property
+    def highest(self) -> np.ndarray:
+        """The largest light of each pixel, (N, 1) or (1, 1) float32."""
+        if self.ceilings is None:
+            return np.full((1, 1), self.high, np.float32)
+        highest = self.low + self.ceilings * (self.high - self.low)
+        return np.clip(highest.astype(np.float32), self.low, self.high)[:, None]
 
     def clip(self, light: np.ndarray) -> np.ndarray:
         """Light (N, k) moved within the bounds, as float32."""
         # What overflows becomes infinite, and then the bound.
         with np.errstate(over="ignore"):
             light = light.astype(np.float32)
-        light = np.clip(light, np.float32(self.low), np.float32(self.high))
+        light = np.clip(light, np.float32(self.low), self.highest)
         if self.masked.any():
             light[self.masked] = 0.0
         return light
@@ -71,7 +85,7 @@ class Limits:
         """The values (N, k) that are outside by more than rounding; None if there are none."""
         slack = BOUNDS_SLACK * (self.high - self.low)
         is_inside = light >= self.low - slack
-        is_inside &= light <= self.high + slack
+        is_inside &= light <= self.highest + np.float64(slack)
         is_inside |= self.masked[:, None]
         if is_inside.all():
             return None
@@ -170,7 +184,7 @@ class CompensationProblem:
         limits = self.limits
         free_scale = np.where(limits.masked, 0.0, scale)[:, None]
         lower = (free_scale * limits.low).astype(np.float32)
-        upper = (free_scale * limits.high).astype(np.float32)
+        upper = (free_scale * limits.highest).astype(np.float32)
         weights = None
         if self.weights is not None:
             weights = self.weights[index]
@@ -205,7 +219,7 @@ class CompensationProblem:
         light = np.divide(x, free_scale, out=np.zeros(x.shape), where=is_free)
         # Division rounds: values at a bound are to stay there.
         light = np.where(x <= lower, limits.low, light)
-        light = np.where(x >= upper, np.where(is_free, limits.high, 0.0), light)
+        light = np.where(x >= upper, np.where(is_free, limits.highest, 0.0), light)
         return limits.clip(light)
 
 

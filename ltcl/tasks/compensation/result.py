@@ -129,6 +129,11 @@ class Compensation:
     _evidence: Evidence
 
     @cached_property
+    def patterns(self) -> tuple[np.ndarray, ...]:
+        """`pattern` of each projector, where T is of several (`ltcl.combine`); else of the one."""
+        return self._evidence.solving.split(self.pattern)
+
+    @cached_property
     def appearance(self) -> np.ndarray:
         """T pattern + background: what the camera will see, on its grid."""
         return self._evidence.appearance_picture()

@@ -51,8 +51,8 @@ connection.addEventListener("open", async ({ detail: hello }) => {
   $("facts").textContent = [size, colours, compressed, hello.device].filter(Boolean).join(" · ");
   for (const tab of tabs) tab.hidden = !(tab.id === "tab-scan" ? hello.scan : hello.grid);
   document.body.classList.toggle("empty", !hello.grid); // an acquisition that has no transport yet
-  $("tab-bounces").disabled = !hello.square;
-  $("tab-bounces").title = hello.square ? "" : "Bounces need a camera grid equal to the projector’s";
+  $("tab-bounces").disabled = !hello.bounces;
+  $("tab-bounces").title = hello.bounces ? "" : "Bounces need a camera grid equal to the projector’s";
   await known();
   if (first) {
     for (const name in VIEWS) if (!$(`tab-${name}`).hidden) views[name] = VIEWS[name](app);

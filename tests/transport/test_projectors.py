@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Several projectors as one: places of patterns, direct light, weights, gamut and refusals."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import ltcl
+from ltcl.errors import InputError, InputTypeError
+from ltcl.transport.projectors.montage import Montage
+from tests.transport import projectors
+from tests.transport.projectors import CAMERA, LEFT, RIGHT
+
+random = np.random.default_rng(7)
+
+
+@pytest.fixture(scope="module")
+def S():
+    return projectors.corner()
+
+
+@pytest.fixture(scope="module")
+def members(device, S):
+    return projectors.transports(device, S)
+
+
+@pytest.fixture(scope="module")
+def T(members):
+    return ltcl.combine(members)
+
+
+@pytest.mark.parametrize("lead", [(), (2,)])
+@pytest.mark.parametrize("ending", [(), (3,)])
+def test_patterns_side_by_side(lead, ending):
+    montage = Montage(((2, 3), (4, 1), (3, 2)))
+    patterns = [random.random((*lead, *grid, *ending)) for grid in montage.grids]
+    picture = montage.join(patterns)
+    assert picture.shape == (*lead, 4, 6, *ending)
+    for pattern, found in zip(patterns, montage.split(picture), strict=True):
+        np.testing.assert_array_equal(found, pattern)
+    vectors = [random.random(h * w) for h, w in montage.grids]
+    whole = montage.vector(vectors)
+    assert not whole[montage.is_empty].any()
+    for places, vector in zip(montage.places, vectors, strict=True):
+        np.testing.assert_array_equal(whole[places], vector)
+
+
+@pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
+def test_pictures_add_up(device, members, form):
+    kept = []
+    for T in members:
+        matrix = form(T.matrices[0])
+        kept.append(ltcl.Transport(matrix, T.grid, camera_grid=CAMERA, device=device))
+    combined = ltcl.combine(kept)
+    patterns = [random.random(T.grid) for T in members]
+    wanted = sum(T @ pattern for T, pattern in zip(members, patterns, strict=True))
+    np.testing.assert_allclose(combined @ patterns, wanted, rtol=1e-5)
+    np.testing.assert_allclose(ltcl.relight(combined, combined.join(patterns)), wanted, rtol=1e-5)
+
+
+def test_direct_light_is_found(T):
+    crease = CAMERA[1] // 2
+    columns = np.arange(np.prod(CAMERA)) % CAMERA[1]
+    # Beside the crease, light that bounced across it is near, too.
+    is_plain = np.abs(columns - crease + 0.5) > 3
+    for share, projector in zip(T.shares, (LEFT, RIGHT), strict=True):
+        true = projector.direct()
+        is_whole = true.sum(axis=1) > 0.9 * true.sum(axis=1).max()
+        rows = is_whole & is_plain
+        error = share.direct[0].toarray()[rows] - true[rows]
+        assert np.linalg.norm(error) < 0.03 * np.linalg.norm(true[rows])
+
+
+def test_weights_fall_at_borders(T):
+    left, right = (
+        share.own.reshape(p.grid) for share, p in zip(T.shares, (LEFT, RIGHT), strict=True)
+    )
+    middle = LEFT.grid[0] // 2
+    assert left[middle, -1] < 0.05
+    assert right[middle, 0] < 0.05
+    # Where no other projector takes over, there is no border.
+    np.testing.assert_allclose(left[2:-2, 2], 1.0, atol=1e-6)
+    assert (np.diff(left[middle, 6:]) <= 1e-9).all()
+    relative = np.stack([share.relative for share in T.shares])
+    np.testing.assert_allclose(relative.max(axis=0), 1.0)
+
+
+@pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
+def test_balance_is_a_ceiling(members, balance):
+    T = ltcl.combine(members, balance=balance)
+    for share in T.shares:
+        is_strong = share.own >= max(balance, 1e-12)
+        np.testing.assert_allclose(share.ceiling[is_strong], 1.0)
+        if balance > 0.0:
+            weak = ~is_strong
+            np.testing.assert_allclose(share.ceiling[weak], share.own[weak] / balance)
+
+
+def test_shared_light_is_direct(T):
+    smooth = np.full((CAMERA[0] * CAMERA[1], 1), 0.25)
+    (pattern,) = T.share_light([smooth])
+    patterns = T.split(pattern.reshape(T.grid))
+    seen = LEFT.direct() @ patterns[0].ravel() + RIGHT.direct() @ patterns[1].ravel()
+    inner = np.zeros(CAMERA, bool)
+    inner[2:-2, 2:5] = True
+    inner[2:-2, -5:-2] = True
+    np.testing.assert_allclose(seen.reshape(CAMERA)[inner], smooth[0, 0], rtol=0.05)
+
+
+def test_own_weights(members):
+    weights = [np.ones(T.grid) for T in members]
+    T = ltcl.combine(members, blend=weights)
+    lit = np.all([share.white(0) > 0.1 for share in T.shares], axis=0)
+    for share in T.shares:
+        np.testing.assert_allclose(share.relative[lit], 1.0)
+
+
+def test_common_gamut(device, S):
+    mixings = [
+        np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.1], [0.0, 0.1, 1.0]]),
+        np.array([[0.8, 0.0, 0.1], [0.2, 0.7, 0.0], [0.1, 0.0, 1.1]]),
+    ]
+    members = []
+    for projector, mixing in zip((LEFT, RIGHT), mixings, strict=True):
+        matrix = (S @ projector.direct()).astype(np.float32)
+        member = ltcl.Transport(
+            [matrix] * 3, projector.grid, camera_grid=CAMERA, mixing=mixing, device=device
+        )
+        members.append(member)
+    gamut = ltcl.combine(members).gamut
+    for own in gamut.projectors:
+        light = np.linalg.solve(own, gamut.primaries)
+        assert light.min() >= -1e-9
+        assert light.sum(axis=1).max() <= 1.0 + 1e-9
+    np.testing.assert_allclose(gamut.light(np.ones((1, 1, 3)))[0, 0], gamut.white)
+    assert 0.0 < gamut.differences.max() < 1.0
+    assert "projector 2" in str(gamut)
+
+
+def test_scene_between_camera_pixels(T, S):
+    plain = np.abs(np.arange(CAMERA[1]) - CAMERA[1] / 2 + 0.5) > 3
+    direct = np.ones(np.prod(CAMERA))
+    true = (S @ direct - direct).reshape(CAMERA)
+    found = (T.scene.to_numpy() @ direct - direct).reshape(CAMERA)
+    # Light across the crease from the nearest pixels counts as direct, as it is not told apart.
+    np.testing.assert_allclose(found[:, plain], true[:, plain], rtol=0.3)
+
+
+def test_a_copy_is_alike(T):
+    twin = copy.deepcopy(T)
+    pattern = random.random(T.grid)
+    np.testing.assert_allclose(twin @ pattern, T @ pattern, rtol=1e-6)
+    np.testing.assert_array_equal(twin.ceilings, T.ceilings)
+
+
+def test_refusals(device, members, T):
+    one = members[0]
+    other_camera = ltcl.Transport(np.ones((4, 4)), (2, 2), camera_grid=(1, 4), device=device)
+    colour = ltcl.Transport([one.matrices[0]] * 3, one.grid, camera_grid=CAMERA, device=device)
+    blocks = [[one.matrices[0]] * 3] * 3
+    coupled = ltcl.Transport(blocks, one.grid, camera_grid=CAMERA, device=device)
+    black = np.zeros(CAMERA)
+    cases: tuple[tuple[str, Any, dict[str, Any]], ...] = (
+        ("1 members.*2 to 8", [one], {}),
+        ("9 members", [one] * 9, {}),
+        (r"transports\[1\].*camera_grid \(1, 4\)", [one, other_camera], {}),
+        (r"transports\[1\].*channels 3", [one, colour], {}),
+        (r"transports\[0\].*blocks", [coupled, coupled], {}),
+        (r"transports\[1\].*combination", [one, T], {}),
+        ("balance is 2", members, {"balance": 2}),
+        ("blend is 'round'", members, {"blend": "round"}),
+        ("blend .*2 projectors", members, {"blend": [np.ones(one.grid)]}),
+        (r"blend\[1\] has shape", members, {"blend": [np.ones((10, 13))] * 2}),
+        ("weights must be at least 0", members, {"blend": [-np.ones(m.grid) for m in members]}),
+        ("black is 'lifted'", members, {"black": "lifted"}),
+        ("blacks is None", members, {"black": "uniform"}),
+        ("blacks has 1 pictures", members, {"blacks": [black]}),
+        ("scene has grid", members, {"scene": ltcl.Transport(np.eye(4), (2, 2), device=device)}),
+    )
+    for match, transports, options in cases:
+        with pytest.raises(InputError, match=match):
+            ltcl.combine(transports, **options)
+    with pytest.raises(InputTypeError, match="list of"):
+        ltcl.combine(one)
+    with pytest.raises(InputTypeError, match=r"transports\[1\] is a int"):
+        ltcl.combine([one, 3])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"3 patterns.*2 projectors"):
+        T.join([np.ones(one.grid)] * 3)
+    with pytest.raises(InputError, match=r"pattern\[1\] has shape"):
+        T.join([np.ones(one.grid)] * 2)
+    with pytest.raises(InputError, match="frames and colours"):
+        T.join([np.ones(LEFT.grid), np.ones((*RIGHT.grid, 3))])
