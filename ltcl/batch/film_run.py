@@ -91,17 +91,13 @@ class BatchSolver:
             compensator = self._compensator()
             if compensator is None:
                 return self._solve_together(pictures)
-            solved = [self._solve_prepared(compensator, picture) for picture in pictures]
+            solved = []
+            for picture in pictures:
+                solved.append(self._solve_prepared(compensator, picture))
         except LtclError as error:
             error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
             raise
-        appearances = [batch.appearance for batch in solved if batch.appearance is not None]
-        return SolvedBatch(
-            pattern=np.concatenate([batch.pattern for batch in solved]),
-            appearance=np.concatenate(appearances) if appearances else None,
-            errors=[error for batch in solved for error in batch.errors],
-            clipped=[clipped for batch in solved for clipped in batch.clipped],
-        )
+        return _joined(solved)
 
     def _solve_together(self, pictures: np.ndarray) -> SolvedBatch:
         """Solve pictures (k, h, w[, 3]) at once."""
@@ -193,6 +189,24 @@ class BatchSolver:
         if self.reload is not None:
             state["T"] = None
         return _on_worker, (state,)
+
+
+def _joined(solved: Sequence[SolvedBatch]) -> SolvedBatch:
+    """Several batches as one."""
+    patterns = []
+    appearances = []
+    errors: list[float] = []
+    clipped: list[float] = []
+    for batch in solved:
+        patterns.append(batch.pattern)
+        if batch.appearance is not None:
+            appearances.append(batch.appearance)
+        errors += batch.errors
+        clipped += batch.clipped
+    appearance = None
+    if appearances:
+        appearance = np.concatenate(appearances)
+    return SolvedBatch(np.concatenate(patterns), appearance, errors, clipped)
 
 
 def _on_worker(state: dict[str, Any]) -> BatchSolver:

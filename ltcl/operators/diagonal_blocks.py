@@ -8,6 +8,8 @@ format become one core, so that a product is one launch.
 
 from __future__ import annotations
 
+import operator
+import weakref
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -66,15 +68,14 @@ class BlockDiagonal(Operator):
         device = check_blocks(blocks).device
         self.blocks = tuple(blocks)
         # Where each block begins, and the last one ends.
-        self._rows = np.cumsum([0, *(block.shape[0] for block in blocks)]).tolist()
-        self._columns = np.cumsum([0, *(block.shape[1] for block in blocks)]).tolist()
+        self._rows = [0]
+        self._columns = [0]
+        for block in blocks:
+            self._rows.append(self._rows[-1] + block.shape[0])
+            self._columns.append(self._columns[-1] + block.shape[1])
         super().__init__(device, (self._rows[-1], self._columns[-1]), *blocks)
         self.error = max(block.error for block in blocks)
-        self.solution_error = max(block.solution_error for block in blocks)
-        self.error_bound = max(block.error_bound for block in blocks)
-        weights = [block.weights for block in blocks if block.weights is not None]
-        if len(weights) == len(blocks):
-            self.weights = np.concatenate(weights)
+        _take_over_facts(self, blocks)
 
     def diagonal(self) -> np.ndarray:
         """The diagonals of the blocks, one behind the other."""
@@ -102,6 +103,18 @@ class BlockDiagonal(Operator):
                 place = Place(of[number], to[number])
                 launches.append(_bind_copies(block, place, x, out, epilogue, transpose))
         return in_order(launches)
+
+
+def _take_over_facts(joined: Operator, blocks: Sequence[Operator]) -> None:
+    """Errors of solutions, the largest of the blocks, and weights, where all blocks have some."""
+    weights = []
+    for block in blocks:
+        joined.solution_error = max(joined.solution_error, block.solution_error)
+        joined.error_bound = max(joined.error_bound, block.error_bound)
+        if block.weights is not None:
+            weights.append(block.weights)
+    if len(weights) == len(blocks):
+        joined.weights = np.concatenate(weights)
 
 
 def block_diagonal(blocks: Sequence[Operator]) -> Operator:
@@ -134,10 +147,15 @@ def block_diagonal(blocks: Sequence[Operator]) -> Operator:
 def joined_once(blocks: Sequence[Operator]) -> Operator:
     """`block_diagonal` of these operators, made once in the life of the first."""
     known = blocks[0].known
-    names = tuple(map(id, blocks))
-    if known.joined is None or known.joined[0] != names:
-        known.joined = (names, block_diagonal(blocks))
-    return known.joined[1]
+    if known.joined is not None:
+        references, joined = known.joined
+        # The memory of a block that is gone may be that of another one now.
+        known_blocks = [reference() for reference in references]
+        if len(blocks) == len(known_blocks) and all(map(operator.is_, blocks, known_blocks)):
+            return joined
+    joined = block_diagonal(blocks)
+    known.joined = (tuple(map(weakref.ref, blocks)), joined)
+    return joined
 
 
 def are_small(blocks: Sequence[Operator]) -> bool:
@@ -247,11 +265,7 @@ def _join_systems(blocks: Sequence[Operator]) -> Operator | None:
     if len(systems) != len(blocks) or len(signs) != 1:
         return None
     joined = IdentityPlus(block_diagonal([system.R for system in systems]), signs.pop())
-    joined.solution_error = max(system.solution_error for system in systems)
-    joined.error_bound = max(system.error_bound for system in systems)
-    weights = [system.weights for system in systems if system.weights is not None]
-    if len(weights) == len(systems):
-        joined.weights = np.concatenate(weights)
+    _take_over_facts(joined, systems)
     return joined
 
 
@@ -275,19 +289,29 @@ def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
     compressed = [block for block in blocks if isinstance(block, Compressed)]
     if len(compressed) != len(blocks):
         return None
-    has_sides = {(R.out is not None, R.into is not None) for R in compressed}
-    if len(has_sides) > 1 or has_sides == {(False, False)}:
+    out_bases: list[Basis] = []
+    into_bases: list[Basis] = []
+    diagonals = []
+    for R in compressed:
+        if R.out is not None:
+            out_bases.append(R.out)
+        if R.into is not None:
+            into_bases.append(R.into)
+        if R.known_diagonal is not None:
+            diagonals.append(R.known_diagonal)
+    counts = {0, len(blocks)}
+    if len(out_bases) not in counts or len(into_bases) not in counts:
         return None
-    out_bases = [R.out for R in compressed if R.out is not None]
-    into_bases = [R.into for R in compressed if R.into is not None]
     out = planes(out_bases) if out_bases else None
     into = out
     if any(R.into is not R.out for R in compressed):
         into = planes(into_bases) if into_bases else None
-    if (out_bases and out is None) or (into_bases and into is None):
+    has_no_planes = (out is None and out_bases) or (into is None and into_bases)
+    if has_no_planes or (out is None and into is None):
         return None
-    diagonals = [R.known_diagonal for R in compressed if R.known_diagonal is not None]
-    diagonal = np.concatenate(diagonals) if len(diagonals) == len(blocks) else None
+    diagonal = None
+    if len(diagonals) == len(blocks):
+        diagonal = np.concatenate(diagonals)
     error = max(R.error for R in compressed)
     core = block_diagonal([R.core for R in compressed])
     return Compressed(core, out, into, error, diagonal=diagonal)

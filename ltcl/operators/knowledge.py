@@ -7,6 +7,7 @@ may refer to that operator: device memory is freed by reference counting alone.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -119,7 +120,7 @@ class Knowledge:
     coefficient_system : Operator
         The same system between the coefficients of its basis.
     joined : tuple
-        Identities of the systems of all colours, of which it is the first, and all as one.
+        Weak references to the systems of all colours, of which it is the first, and all as one.
     relaxations : dict
         Block inverses and windows of `ltcl.operators.relaxation`.
     walk_tables : dict
@@ -134,6 +135,6 @@ class Knowledge:
     was_tried: bool = False
     factorization: Any = None
     coefficient_system: Operator | None = None
-    joined: tuple[tuple[int, ...], Operator] | None = None
+    joined: tuple[tuple[weakref.ref[Operator], ...], Operator] | None = None
     relaxations: dict[tuple[Any, ...], Any] = field(default_factory=dict)
     walk_tables: dict[str, Any] = field(default_factory=dict)

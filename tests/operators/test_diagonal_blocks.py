@@ -24,6 +24,7 @@ from ltcl.operators import (
     Wavelet,
     block_diagonal,
 )
+from ltcl.operators.diagonal_blocks import joined_once
 from tests.conftest import launched_as
 from tests.operators import helpers
 
@@ -153,6 +154,21 @@ def test_large_blocks_are_not_copied(device, monkeypatch):
     joined = block_diagonal(blocks)
     assert isinstance(joined, BlockDiagonal)
     assert joined.nbytes == sum(block.nbytes for block in blocks)
+
+
+def test_other_blocks_are_joined_anew(device):
+    """Also where a block that is gone had the memory of a new one."""
+    first = IdentityPlus(CSR(device, sparse(0)))
+    x = np.ones(2 * N)
+    for seed in range(1, 6):
+        # Garbage is gone at once, and its place is free for the next one.
+        second = IdentityPlus(CSR(device, sparse(seed)))
+        joined = joined_once([first, second])
+        assert joined_once([first, second]) is joined
+        expected = second.to_dense() @ x[N:]
+        found = np.asarray(joined @ x)
+        np.testing.assert_allclose(found[N:], expected, rtol=1e-5)
+        del second
 
 
 def test_facts_of_blocks(device):
