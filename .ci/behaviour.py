@@ -230,9 +230,9 @@ def help_commands() -> list[str]:
     """Ask each command for its help."""
     import typer
 
-    from ltcl.cli.main import app
+    from ltcl.cli.main import build_program
 
-    program: Any = typer.main.get_command(app)
+    program: Any = typer.main.get_command(build_program())
     lines = ["--help", "acquire plan --help", "acquire run --help", "acquire report --help"]
     return lines + [f"{command} --help" for command in program.commands]
 

@@ -10,6 +10,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage
+import scipy.optimize
 import scipy.sparse
 
 # Weights below this part of a row are left out.
@@ -105,6 +107,47 @@ def _span(number: int, count: int, overlap: float) -> tuple[float, float]:
     size = (1.0 + 2.0 * OVERSCAN) / (count - (count - 1) * overlap)
     start = number * size * (1.0 - overlap) - OVERSCAN
     return start, start + size
+
+
+def least_seam(
+    projectors: list[VirtualProjector],
+    camera_grid: tuple[int, int],
+    shift: float,
+    reach: int,
+    local: int,
+) -> float:
+    """The least seam that any weights can have, by a linear program along one axis.
+
+    Where the first projector fades to the next one below it, or beside it where there is none
+    below, an even picture changes by d = (A' - A) w after its shift, with its weights w and its
+    blur before and after, A and A'. Weights are 1 where it is alone; all others are free. The seam
+    is the largest |d - mean of d over `local` pixels| near both borders.
+    """
+    first = projectors[0]
+    axis = 0 if first.window[1] < 1.0 else 1
+    begin, end = first.window[2 * axis : 2 * axis + 2]
+    next_begin = min(p.window[2 * axis] for p in projectors if p.window[2 * axis] > begin)
+    pixels = first.grid[axis]
+    camera = camera_grid[axis]
+    A = _blurred(camera, (begin, end), pixels, first.blur, 0.0)
+    moved = _blurred(camera, (begin, end), pixels, first.blur, shift)
+    change = moved - A
+    detail = change - scipy.ndimage.uniform_filter1d(change, local, axis=0, mode="nearest")
+    y = np.arange(camera) + 0.5
+    near = np.minimum(np.abs(y - end * camera), np.abs(y - next_begin * camera)) <= reach
+    detail = detail[near]
+    # Unknowns are w and the largest deviation.
+    place = begin + (np.arange(pixels) + 0.5) / pixels * (end - begin)
+    bounds = [(1.0, 1.0) if at < next_begin else (0.0, 1.0) for at in place]
+    ones = np.ones((len(detail), 1))
+    limits = np.block([[detail, -ones], [-detail, -ones]])
+    cost = np.append(np.zeros(pixels), 1.0)
+    # Its light ends with its last pixel, which has to be dark.
+    bounds[-1] = (0.0, 0.0)
+    solution = scipy.optimize.linprog(
+        cost, limits, np.zeros(len(limits)), bounds=[*bounds, (0.0, None)]
+    )
+    return float(solution.fun)
 
 
 def border_band(

@@ -5,8 +5,9 @@
 
 Its steps: what `ltcl doctor` says; tests; products, transforms, sweeps, solves and frames beside
 the model of `bench/gpu_model.py`; sparse products beside CuPy's cuSPARSE, in CSR (CuPy has no
-sliced ELL); frames a second. Kernels are tuned on the way, and the variants that won are printed. A
-step that fails or takes too long is named, and the others go on. `--smoke` runs on any device.
+sliced ELL); frames a second; what several devices exchange. Kernels are tuned on the way, and the
+variants that won are printed, and the share of copies in the time of frames and solves. A step that
+fails or takes too long is named, and the others go on. `--smoke` runs on any device.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ def steps(smoke: bool) -> list[Step]:
         Step("products", ["bench/csr.py", *bench], 120, has_record=True),
         Step("tests", tests, 120),
         Step("video", ["bench/video.py", *bench], 60, has_record=True),
+        Step("exchange", ["bench/exchange.py", *bench], 60, has_record=True),
     ]
 
 
@@ -114,6 +116,17 @@ def run_all(smoke: bool) -> dict[str, Any]:
     return content
 
 
+def transfer_lines(content: dict[str, Any]) -> list[str]:
+    """Shares of copies between host and device of the cases of the model, predicted and timed."""
+    lines = []
+    for row in content.get("model", {}).get("rows", []):
+        if row["KB over the bus"]:
+            predicted = row["H200"]["bus"] / row["H200"]["sum"]
+            here = f"{row['copies here']:.0%} of the time on this device"
+            lines.append(f"  {row['case']}: {predicted:.0%} by the model, {here}")
+    return lines
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -125,6 +138,9 @@ def main() -> None:
     print("\n==== variants that won ====")
     for key, name in content.get("tuning", {}).items():
         print(f"  {name}  {key}")
+    print("\n==== copies between host and device ====")
+    for line in transfer_lines(content):
+        print(line)
     print("\n==== steps ====")
     for name, step in content["steps"].items():
         print(f"  {name}: {step['outcome']}, {step['seconds']} s")

@@ -43,6 +43,8 @@ GAINS = ("occupancy",)
 CPU_KERNELS = ("relax_strips",)
 # Right-hand sides of one launch.
 SIDES = ("1", "2", "3", "4", "8")
+# Files of which a GPU takes one right-hand side an item, and triangles, which have none.
+ONE_SIDE_FILES = ("wavelet", "wavelet_tail", "pyramid", "hats", "ordered", "triangle")
 # Complaints that are printed.
 MAX_COMPLAINTS = 40
 
@@ -113,7 +115,8 @@ def add_programs(entries: list[Entry], file: Path) -> None:
     for plain in json.loads(file.read_text(encoding="utf-8")):
         defines = plain["defines"]
         sides = [defines.get("K")]
-        is_default = plain["file"] != "walk" and "ROWS" not in defines
+        has_all_sides = plain["file"] not in ("walk", *ONE_SIDE_FILES)
+        is_default = has_all_sides and "ROWS" not in defines
         if plain["shape"] == "gpu" and sides[0] in SIDES and is_default:
             sides = list(SIDES)
         for k in sides:

@@ -24,6 +24,7 @@ from rich.table import Table
 import ltcl
 from _harness import Options, parse_options, record, write_json
 from ltcl.device import Device
+from ltcl.device.transfers import PinnedDownload, PinnedUpload
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet
 from ltcl.solvers.bounded import minimise
 
@@ -86,9 +87,9 @@ def record_traffic() -> Iterator[Traffic]:
     queue_copy = Device.queue_copy
     finish = Device.finish
 
-    def recorded_launch(self: Device, name: str, *rest: Any) -> None:
+    def recorded_launch(self: Device, name: str, *rest: Any) -> Any:
         traffic.events.append((name, 0))
-        launch(self, name, *rest)
+        return launch(self, name, *rest)
 
     def recorded_copy(self: Device, to: Any, source: Any, **sizes: Any) -> None:
         for array in (to, source):
@@ -106,12 +107,23 @@ def record_traffic() -> Iterator[Traffic]:
         traffic.events.append((WAIT, 0))
         finish(self)
 
-    with mock.patch.multiple(
-        Device,
-        launch=recorded_launch,
-        copy=recorded_copy,
-        queue_copy=recorded_queue_copy,
-        finish=recorded_finish,
+    def recorded_send(send: Callable[..., None]) -> Callable[..., None]:
+        def recorded(self: PinnedUpload | PinnedDownload, *rest: Any) -> None:
+            traffic.events.append((COPY, self.array.nbytes))
+            send(self, *rest)
+
+        return recorded
+
+    with (
+        mock.patch.multiple(
+            Device,
+            launch=recorded_launch,
+            copy=recorded_copy,
+            queue_copy=recorded_queue_copy,
+            finish=recorded_finish,
+        ),
+        mock.patch.object(PinnedUpload, "send", recorded_send(PinnedUpload.send)),
+        mock.patch.object(PinnedDownload, "send", recorded_send(PinnedDownload.send)),
     ):
         yield traffic
 

@@ -38,6 +38,7 @@ from _coefficients import note
 from _harness import Options, Row, medians, parse_options, product, report, seconds
 from ltcl import Transport
 from ltcl.device import Device
+from ltcl.device.discovery import open_together
 from ltcl.operators import Dense, MultiDevice, Streamed
 
 # Pixels along a side of the grid.
@@ -213,14 +214,14 @@ def residual(scene: Scene, light: np.ndarray, pictures: np.ndarray) -> float:
 
 
 def half_devices(device: Device) -> tuple[Device, Device]:
-    """Both halves of a device, as OpenCL sub-devices."""
+    """Both halves of a device, as OpenCL sub-devices that share a context, as of device="all"."""
     equally = [device.cl.device_partition_property.EQUALLY, device.compute_units // 2]
     halves = []
     for handle in device.handle.create_sub_devices(equally)[:2]:
         index = f"half {handle}"
-        halves.append(Device(dataclasses.replace(device.description, index=index, handle=handle)))
-    first, second = halves
-    return first, second
+        halves.append(dataclasses.replace(device.description, index=index, handle=handle))
+    first = open_together(halves)
+    return first, first.others[0]
 
 
 def compare_devices(options: Options) -> list[Row]:

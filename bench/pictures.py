@@ -204,7 +204,7 @@ def photograph_viewer(T: Transport, file: Path) -> None:
         page.resize(*WINDOW)
         page.open(viewer.url)
         page.evaluate(OPEN_TAB, "compensate")
-        page.wait(VIEWER_READY, "body[data-state=ready]")
+        page.wait(VIEWER_READY, ".viewer[data-state=ready]")
         shot = page.screenshot(JPEG_QUALITY)
     with replace_file(file) as temporary:
         temporary.write_bytes(shot)

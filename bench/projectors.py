@@ -21,7 +21,7 @@ from scipy.optimize import lsq_linear
 
 import ltcl
 from _harness import Options, parse_options, publish
-from _projectors import OVERSCAN, VirtualProjector, border_band, tiled
+from _projectors import OVERSCAN, VirtualProjector, border_band, least_seam, tiled
 from ltcl.operators import CSR, Dense, IdentityPlus, Product, ScaledColumns
 from ltcl.scenes import dihedral, landscape
 
@@ -138,6 +138,14 @@ def measure_layout(count: int, rows: int, options: Options) -> dict[str, Any]:
     shown_by_one = ltcl.compensate(one, even, rtol=RTOL)
     after = scene.picture([single.moved(SHIFT, SHIFT)], [shown_by_one.pattern])
     seams["one projector"] = seam(after, band)
+    for blend in ("smooth", "linear"):
+        blended = ltcl.combine(list(T.transports), blend=blend)
+        shown = ltcl.compensate(blended, even, rtol=RTOL)
+        seams[blend] = seam(scene.picture(moved, shown.patterns), band)
+    near = least_seam(projectors, scene.grid, SHIFT, BAND, LOCAL)
+    anywhere = least_seam(projectors, scene.grid, SHIFT, rows, LOCAL)
+    seams["least of any weights"] = near
+    seams["least of any weights, away from borders, too"] = anywhere
     for name, gamma in (("ramps", None), ("ramps of gamma 2.2", 2.2)):
         patterns = alpha_ramps(scene.grid, projectors, 0.25, gamma)
         seams[name] = seam(scene.picture(moved, patterns), band)

@@ -7,6 +7,10 @@ A virtual camera of 12 bits photographs a corner in three colours with texture o
 T p is compared with the truth for pictures of each kind (`sketch.pictures`), and a picture like
 nature is compensated and shown with the true T. Memory is what the process takes more while T is
 estimated than before; pictures stand in a temporary file.
+
+With `--megapixels` a larger camera looks at the corner (`_large_camera`), Gray code shows where its
+pixels look, and memory is what the process takes more at any time of the scan, from the first
+photograph on.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ import ltcl
 from _corner import textured_transport
 from _figures import Claim
 from _harness import Options, parse_options
+from _large_camera import LargeCameraRig
 from ltcl.acquisition import Report, acquire
 from sketch import (
     MAX_ERRORS,
@@ -45,6 +50,11 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         "default": "256x512",
         "help": "pixels of the projector",
     },
+    "megapixels": {
+        "type": float,
+        "default": None,
+        "help": "pixels of a larger camera, in millions; without it those of the projector",
+    },
 }
 # Pixels of a side of the cells between which light bounces.
 STEPS = {"256x512": 1, "1080x1920": 8}
@@ -60,9 +70,13 @@ MAX_LARGE_BYTES = 2e9
 
 
 class EstimateCost:
-    """Seconds from the last picture on, and the memory that the process takes more meanwhile."""
+    """Seconds from the last picture on, and the memory that the process takes more meanwhile.
 
-    def __init__(self) -> None:
+    With `of_whole_scan` memory is that from the first photograph on.
+    """
+
+    def __init__(self, of_whole_scan: bool = False) -> None:
+        self._of_whole_scan = of_whole_scan
         self.seconds = 0.0
         self.bytes = 0
         self._process = psutil.Process()
@@ -76,9 +90,11 @@ class EstimateCost:
     def progress(self, step: str, done: int, total: int) -> None:
         """Begin anew with each picture, until T is estimated."""
         self._is_estimating = self._is_estimating or step == "fit"
-        if not self._is_estimating:
+        if self._is_estimating:
+            return
+        self._start = time.perf_counter()
+        if not self._of_whole_scan:
             self._before = self._own_memory()
-            self._start = time.perf_counter()
             self.bytes = 0
 
     def stop(self) -> None:
@@ -109,20 +125,30 @@ class LargeSketch:
     compensated: float
     compensate_seconds: float
     frames_a_second: float
+    frames_a_second_of_half: float
     judged: float
     bound: float
 
 
-def run(grid: tuple[int, int], step: int, options: Options) -> LargeSketch:
+def make_rig(truth: ltcl.Transport, megapixels: float | None) -> CountingRig | LargeCameraRig:
+    """The camera before the corner."""
+    if megapixels is not None:
+        return LargeCameraRig(truth, megapixels)
+    return CountingRig(truth, truth.grid, response="linear", bits=12, ambient=0.01, seed=2)
+
+
+def run(
+    grid: tuple[int, int], step: int, megapixels: float | None, options: Options
+) -> LargeSketch:
     """Scan a corner of these pixels, and compare T with the truth."""
     truth = textured_transport(grid, step, options.device)
-    rig = CountingRig(truth, grid, response="linear", bits=12, ambient=0.01, seed=2)
-    cost = EstimateCost()
+    rig = make_rig(truth, megapixels)
+    cost = EstimateCost(of_whole_scan=megapixels is not None)
     with TemporaryDirectory() as folder:
         store = Path(folder) / "T.zarr"
         T = acquire(
             rig,
-            geometry="aligned",
+            geometry="aligned" if megapixels is None else "graycode",
             strategy="sketch",
             store=store,
             progress=cost.progress,
@@ -146,22 +172,29 @@ def run(grid: tuple[int, int], step: int, options: Options) -> LargeSketch:
             compensated=compensated,
             compensate_seconds=compensate_seconds,
             frames_a_second=prepared_rate(T),
+            frames_a_second_of_half=prepared_rate(T, bounces_every=2),
             judged=report.judged_error,
             bound=report.judged_bound,
         )
 
 
-def prepared_rate(T: ltcl.Transport) -> float:
-    """Frames of a prepared compensation a second, one by one, to 1 %."""
+def prepared_rate(T: ltcl.Transport, bounces_every: int = 1) -> float:
+    """Frames of a prepared compensation a second, one by one, to 1 %.
+
+    The light of bounces is computed of every so many frames, over which a frame is averaged.
+    """
     frame = np.full((*T.camera_grid, 3), 100, np.uint8)
-    with ltcl.Compensator(T, clamp=True, rtol=max(1e-2, T.error)) as compensator:
-        compensator(frame)
+    rtol = max(1e-2, T.error)
+    with ltcl.Compensator(T, clamp=True, rtol=rtol, bounces_every=bounces_every) as compensator:
+        for _ in range(bounces_every):
+            compensator(frame)
         times = []
-        for _ in range(5):
+        for _ in range(5 * bounces_every):
             start = time.perf_counter()
             compensator(frame)
             times.append(time.perf_counter() - start)
-    return 1.0 / float(np.median(times))
+    periods = np.reshape(times, (5, bounces_every)).mean(axis=1)
+    return 1.0 / float(np.median(periods))
 
 
 def claims(result: LargeSketch, is_large: bool) -> list[Claim]:
@@ -171,7 +204,7 @@ def claims(result: LargeSketch, is_large: bool) -> list[Claim]:
     )
     if is_large:
         amounts = [
-            ("memory of the estimate", result.cost.bytes / 1e6, MAX_LARGE_BYTES / 1e6, "MB"),
+            ("memory", result.cost.bytes / 1e6, MAX_LARGE_BYTES / 1e6, "MB"),
             ("compensate", result.compensate_seconds, MAX_COMPENSATE_SECONDS, "s"),
         ]
     else:
@@ -218,14 +251,17 @@ def main() -> None:
     options = parse_options(__doc__, ARGUMENTS)
     name = SMOKE_GRID if options.smoke else options.arguments.grid
     height, width = map(int, name.split("x"))
-    result = run((height, width), STEPS.get(name, 1), options)
+    megapixels = options.arguments.megapixels
+    result = run((height, width), STEPS.get(name, 1), megapixels, options)
     facts = {
         "grid": name,
+        "megapixels of the camera": megapixels,
         "seconds until T is there": result.cost.seconds,
         "memory while T is estimated, MB": result.cost.bytes / 1e6,
         "T, MB": result.nbytes / 1e6,
         "compensate, s": result.compensate_seconds,
         "prepared frames a second": result.frames_a_second,
+        "the same with bounces of every second frame": result.frames_a_second_of_half,
         "error that is stated": result.judged,
         "bound that is stated": result.bound,
     }

@@ -322,12 +322,12 @@ def touch(page: Chromium, T: Transport, workload: Workload) -> Touch:
 
     def measure_rate(view: str, drawn: str, script: str) -> float:
         page.evaluate(OPEN_TAB, view)
-        page.wait(drawn, "body[data-state=ready]")
+        page.wait(drawn, ".viewer[data-state=ready]")
         return page.evaluate(script, workload.touch_seconds)
 
     with ltcl.view(T, {"landscape": landscape(*T.grid)}, open_browser=False) as viewer:
         page.open(viewer.url)
-        page.wait("body[data-state=ready]")
+        page.wait(".viewer[data-state=ready]")
         # Warms up.
         page.evaluate(PROBE, 3)
         start = time.process_time()

@@ -7,6 +7,7 @@ Nothing in it is asked of another host: formulas are MathML, which browsers draw
 from __future__ import annotations
 
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ sys.path += [
     str(DOCS),
     str(DOCS.parent / "bench"),
 ]
+
+# The public addresses of the project, of which there are none yet.
+URLS = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))["project"]["urls"]
 
 project = "ltcl"
 author = "ltcl developers"
@@ -69,16 +73,21 @@ sphinx_gallery_conf: dict[str, Any] = {
 
 html_theme = "pydata_sphinx_theme"
 html_title = "ltcl"
+html_baseurl = URLS.get("Documentation", "")
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_show_copyright = False
-html_theme_options = {
+html_theme_options: dict[str, Any] = {
     "show_prev_next": False,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": [],
     "footer_end": [],
 }
+if "Repository" in URLS:
+    html_theme_options["icon_links"] = [
+        {"name": "Source", "url": URLS["Repository"], "icon": "fa-solid fa-code"}
+    ]
 html_sidebars = {"index": []}
 html_math_renderer = "mathml"
 

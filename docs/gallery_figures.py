@@ -16,7 +16,16 @@ from matplotlib.figure import Figure
 from PIL import Image
 from sphinx_gallery.scrapers import figure_rst
 
+from ltcl.plots.shown_figure import ShownFigure
+
 _shown: WeakSet[Figure] = WeakSet()
+
+
+def _leave_to_the_page(self: ShownFigure, warn: bool = True) -> None:
+    """Do nothing: `scrape` saves the figure for the page, and no window is to open."""
+
+
+ShownFigure.show = _leave_to_the_page
 
 
 def scrape(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]) -> str:

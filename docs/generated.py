@@ -13,7 +13,7 @@ from typing import Any
 
 import typer
 
-from ltcl.cli.main import app
+from ltcl.cli.main import build_program
 from ltcl.cli.reports.schema import schema
 
 # Written when the site is built; the page on JSON links to it.
@@ -30,7 +30,7 @@ def write_schema() -> None:
 
 def commands() -> str:
     """Return a section for each command, with its --help."""
-    return "\n".join(_command_lines(typer.main.get_command(app), "ltcl"))
+    return "\n".join(_command_lines(typer.main.get_command(build_program()), "ltcl"))
 
 
 def _command_lines(command: Any, name: str) -> Iterator[str]:
@@ -96,7 +96,7 @@ def fields() -> str:
 
 def _titles_of_commands() -> dict[str, str]:
     """Return titles by definitions of the schema."""
-    program: Any = typer.main.get_command(app)
+    program: Any = typer.main.get_command(build_program())
     titles = {}
     for name, command in program.commands.items():
         inner = getattr(command, "commands", None)

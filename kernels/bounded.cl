@@ -7,9 +7,10 @@
 //   bounded_look       the gradient g, h = A^T w A d, and the Frank-Wolfe gap
 //
 // z is -g, or 0 where x is at a bound and -g points out. Items, groups and partial sums:
-// common/columns.h, with its optional define ADJACENT.
+// common/columns.h, with its optional defines ADJACENT and PLANES.
 //
-// Layout: x, g, d, h are (rows, k), r is (height, k), lower and upper hold one value a row.
+// Layout: x, g, d, h are (rows, k), r is (height, k), lower and upper hold one value a row; with
+// PLANES all are planes (k, rows) or (k, height), and so are lower and upper.
 // `numbers` holds k columns by rows, which have names below: the step length alpha, the curvature,
 // lambda; from NUMBER_SUMS on the 2 sums of bounded_look by slices; then those of w r r.
 
@@ -21,6 +22,9 @@
 #define NUMBER_LAMBDA 2     // the share of d that x moved
 #define NUMBER_SUMS 4
 #define NUMBER(row) numbers[(row) * k + s.origin + j]
+
+// The bound of value i, which is in that row.
+#define BOUND(bounds, i, row) bounds[PLANES ? (i) : (row)]
 
 // Shorter shares of d are due to clipping, which has bent d: it is no longer conjugate. 1/2 refuses
 // every second d.
@@ -60,17 +64,18 @@ kernel void bounded_direction(
     const real alpha = alphas[s.column], beta = betas[s.column];
     real gd = 0, dd = 0, most = 0;
     EACH_VALUE(i, row) {
-        const real z = bounded_free(x[i], g[i], lower[row], upper[row]);
+        const real low = BOUND(lower, i, row), high = BOUND(upper, i, row);
+        const real z = bounded_free(x[i], g[i], low, high);
         // Two statements: LLVM 18 of PoCL 6 fails on the conditional expression.
         real p = z + beta * d[i];
         if (z == 0)
             p = 0;
-        const real step = alpha == 0 ? 0 : clamp(x[i] + alpha * p, lower[row], upper[row]) - x[i];
+        const real step = alpha == 0 ? 0 : clamp(x[i] + alpha * p, low, high) - x[i];
         d[i] = step;
         gd += g[i] * step;
         dd += step * step;
         if (step != 0)
-            most = fmax(most, step / ((step > 0 ? upper[row] : lower[row]) - x[i]));
+            most = fmax(most, step / ((step > 0 ? high : low) - x[i]));
     }
     const int slice = 3 * get_group_id(0);
     // One loop: PoCL compiles each function of barriers anew, and more than once.
@@ -114,8 +119,10 @@ kernel void bounded_move(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     const real lambda = lambdas[s.column];
-    EACH_VALUE(i, row)
-        x[i] = lambda == 0 ? x[i] : clamp(x[i] + lambda * d[i], lower[row], upper[row]);
+    EACH_VALUE(i, row) {
+        const real low = BOUND(lower, i, row), high = BOUND(upper, i, row);
+        x[i] = lambda == 0 ? x[i] : clamp(x[i] + lambda * d[i], low, high);
+    }
     s = columns_share(height, k);
     real rr = 0;
     EACH_VALUE(i, row) {
@@ -149,11 +156,12 @@ kernel void bounded_look(
     const real lambda = s.first < s.end ? lambdas[s.origin + s.column] : 0;
     real gap = 0, zh = 0;
     EACH_VALUE(i, row) {
+        const real low = BOUND(lower, i, row), high = BOUND(upper, i, row);
         if (!restart)
             h[i] = lambda == 0 ? 0 : (-q[i] - g[i]) / lambda;
         g[i] = -q[i];
-        gap += g[i] * (x[i] - (g[i] > 0 ? lower[row] : upper[row]));
-        zh += bounded_free(x[i], g[i], lower[row], upper[row]) * h[i];
+        gap += g[i] * (x[i] - (g[i] > 0 ? low : high));
+        zh += bounded_free(x[i], g[i], low, high) * h[i];
     }
     global real *sums = numbers + (NUMBER_SUMS + 2 * get_group_id(0)) * k;
     columns_sum(gap, sums, 0, s, scratch);

@@ -11,11 +11,14 @@
 //
 //   p_c = sum_d mixing[3 c + d] factors_d direct_d    with MIXED, else factors_c direct_c,
 //
-// and 0 where the factor of c is 0: at masked pixels. A work-item takes `span` neighbouring pixels.
+// and 0 where the factor of c is 0: at masked pixels. A work-item takes `span` neighbouring pixels,
+// BLOCK of them at a time, channel by channel: light stands in private memory between loops that do
+// one thing each, so that a CPU takes wide registers for all but the tables.
 //
 // Required defines: CODE, the type of codes: uchar, ushort or float; CHANNELS of the light, 1 or 3;
-// STACKED. Of frames_decode also COLOURS of a code, 1 or CHANNELS, and TABLE, 1 if a table tells
-// the light of each code, 0 if codes are light. Of the others MIXED. Of frames_encode STEPS: 0 if
+// STACKED. Optional: BLOCK, 1 by default. Of frames_decode also COLOURS of a code, 1 or CHANNELS,
+// and TABLE, 1 if a table tells the light of each code, 0 if codes are light; KEPT, 1 if the light
+// of bounces is that of an earlier frame. Of the others MIXED. Of frames_encode STEPS: 0 if
 // codes are light; else codes are places in an ascending list of light, `thresholds`, of which less
 // than 2^STEPS lie within a cell; BETWEEN, 1 for places between two of them; ROUNDED, 1 to round
 // these to whole numbers.
@@ -30,6 +33,12 @@
 #endif
 #ifndef COLOURS
 #define COLOURS CHANNELS
+#endif
+#ifndef BLOCK
+#define BLOCK 1
+#endif
+#ifndef KEPT
+#define KEPT 0
 #endif
 #ifndef MIXED
 #define MIXED 0
@@ -52,10 +61,26 @@
 #else
 #define AT(channel) (CHANNELS * pixel + (channel))
 #endif
-#define EACH_PIXEL(pixel) \
-    const int first = get_global_id(0) * span, end = min(first + span, pixels); \
-    for (int pixel = first; pixel < end; ++pixel)
 
+// min and clamp, which PoCL compiles to calls that no loop makes wide. What is no number is `low`.
+INLINE int least(int a, int b)
+{
+    return a < b ? a : b;
+}
+INLINE real within(real x, real low, real high)
+{
+    const real raised = x > low ? x : low;
+    return raised < high ? raised : high;
+}
+
+#define EACH_BLOCK(block) \
+    const int first = get_global_id(0) * span, end = min(first + span, pixels); \
+    for (int block = first; block < end; block += BLOCK)
+#define EACH_PIXEL(pixel, block) \
+    for (int pixel = block, stop = min(block + BLOCK, end); pixel < stop; ++pixel)
+
+// With KEPT also direct light without a solve: light to add, and the light of the bounces of an
+// earlier frame, less that of the background, which no gain scales.
 kernel void frames_decode(
     int pixels,                     // of a frame
     int span,                       // pixels of a work-item
@@ -64,17 +89,34 @@ kernel void frames_decode(
     global const CODE *codes,       // (pixels, COLOURS)
     global const real *table,       // light of each code; not read without TABLE
     global const real *background,  // like out; not read where it does not count
-    global real *out)               // light to add
-{
-    EACH_PIXEL(pixel)
-        for (int c = 0; c < CHANNELS; ++c) {
-            const CODE code = codes[pixel * COLOURS + min(c, COLOURS - 1)];
-#if TABLE
-            const real light = table[code];
-#else
-            const real light = code;
+#if KEPT
+    real share,                             // gain per that of the earlier frame
+    global const real *kept,                // its bounces without those of the background, like out
+    global const real *background_bounces,  // not read where the background does not count
+    global real *direct,                    // like out
 #endif
-            out[AT(c)] = gain * light - (subtracts != 0 ? background[AT(c)] : 0);
+    global real *out)  // light to add
+{
+    real light[BLOCK];
+    EACH_BLOCK(block)
+        for (int c = 0; c < CHANNELS; ++c) {
+            EACH_PIXEL(pixel, block) {
+                const CODE code = codes[pixel * COLOURS + least(c, COLOURS - 1)];
+#if TABLE
+                light[pixel - block] = table[code];
+#else
+                light[pixel - block] = code;
+#endif
+            }
+            EACH_PIXEL(pixel, block) {
+                const real dark = subtracts != 0 ? background[AT(c)] : 0;
+                const real added = gain * light[pixel - block] - dark;
+                out[AT(c)] = added;
+#if KEPT
+                const real dark_bounces = subtracts != 0 ? background_bounces[AT(c)] : 0;
+                direct[AT(c)] = added + (share * kept[AT(c)] - dark_bounces);
+#endif
+            }
         }
 }
 
@@ -110,13 +152,14 @@ kernel void frames_clip(
     global int *exceeded)       // [1]
 {
     int outside = 0;
-    EACH_PIXEL(pixel)
-        for (int c = 0; c < CHANNELS; ++c) {
-            const real light = LIGHT(c);
-            const bool is_lit = factors[AT(c)] != 0;
-            outside += is_lit && !(light >= low - slack && light <= high + slack);
-            x[AT(c)] = is_lit ? scales[AT(c)] * clamp(light, low, high) : 0;
-        }
+    EACH_BLOCK(block)
+        for (int c = 0; c < CHANNELS; ++c)
+            EACH_PIXEL(pixel, block) {
+                const real light = LIGHT(c);
+                const bool is_lit = factors[AT(c)] != 0;
+                outside += is_lit && !(light >= low - slack && light <= high + slack);
+                x[AT(c)] = is_lit ? scales[AT(c)] * within(light, low, high) : 0;
+            }
     if (outside)
         atomic_add(exceeded, outside);
 }
@@ -132,34 +175,47 @@ kernel void frames_encode(
     global const real *thresholds,  // (CHANNELS, count), ascending
     global CODE *codes)             // (pixels, CHANNELS)
 {
-    EACH_PIXEL(pixel)
+    real lights[BLOCK];
+    int in_cells[BLOCK];
+    CODE found[BLOCK * CHANNELS];
+    EACH_BLOCK(block) {
         for (int c = 0; c < CHANNELS; ++c) {
-            const real free_light = LIGHT(c);
-            const real light = factors[AT(c)] != 0 ? clamp(free_light, low, high) : 0;
-#if STEPS
-            const real at = (light - first_light) * cells_per_light;
-            const int cell = (int)clamp(at, (real)0, (real)(cells - 1));
+            EACH_PIXEL(pixel, block) {
+                const real free_light = LIGHT(c);
+                const real light = factors[AT(c)] != 0 ? within(free_light, low, high) : 0;
+                const real at = (light - first_light) * cells_per_light;
+                lights[pixel - block] = light;
+                in_cells[pixel - block] = (int)within(at, (real)0, (real)(cells - 1));
+            }
             global const real *list = thresholds + c * count;
-            int place = starts[c * cells + cell];
-            for (int more = 1 << (STEPS - 1); more > 0; more >>= 1)
-                place += light >= list[min(place + more, count) - 1] ? more : 0;
+            EACH_PIXEL(pixel, block) {
+                const real light = lights[pixel - block];
+#if STEPS
+                int place = starts[c * cells + in_cells[pixel - block]];
+                for (int more = 1 << (STEPS - 1); more > 0; more >>= 1)
+                    place += light >= list[least(place + more, count) - 1] ? more : 0;
 #if BETWEEN
-            const int i = clamp(place - 1, 0, count - 3);
-            const real width = list[i + 1] - list[i];
-            const real share = width > 0 ? clamp((light - list[i]) / width, 0.0f, 1.0f) : 1.0f;
-            const real code = (i + share) * code_step;
+                const int i = place < 1 ? 0 : least(place - 1, count - 3);
+                const real width = list[i + 1] - list[i];
+                const real share = width > 0 ? within((light - list[i]) / width, 0, 1) : 1.0f;
+                const real code = (i + share) * code_step;
 #if ROUNDED
-            codes[pixel * CHANNELS + c] = code + 0.5f;
+                found[(pixel - block) * CHANNELS + c] = code + 0.5f;
 #else
-            codes[pixel * CHANNELS + c] = code;
+                found[(pixel - block) * CHANNELS + c] = code;
 #endif
 #else
-            codes[pixel * CHANNELS + c] = place;
+                found[(pixel - block) * CHANNELS + c] = place;
 #endif
 #else
-            codes[pixel * CHANNELS + c] = light;
+                found[(pixel - block) * CHANNELS + c] = light;
 #endif
+            }
         }
+        const int begin = block * CHANNELS;
+        for (int i = begin; i < min(block + BLOCK, end) * CHANNELS; ++i)
+            codes[i] = found[i - begin];
+    }
 }
 
 // Of the pixels of each work-item the largest share of the way to `high` that some light goes, both
@@ -171,12 +227,13 @@ kernel void frames_peaks(
     global real *peaks)        // one a work-item
 {
     real peak = 0;
-    EACH_PIXEL(pixel)
-        for (int c = 0; c < CHANNELS; ++c) {
-            const real added = shifts != 0 ? shift[AT(c)] : 0;
-            if (high + added > 0)
-                peak = fmax(peak, (LIGHT(c) + added) / (high + added));
-        }
+    EACH_BLOCK(block)
+        for (int c = 0; c < CHANNELS; ++c)
+            EACH_PIXEL(pixel, block) {
+                const real added = shifts != 0 ? shift[AT(c)] : 0;
+                if (high + added > 0)
+                    peak = fmax(peak, (LIGHT(c) + added) / (high + added));
+            }
     if (first < pixels)
         peaks[get_global_id(0)] = peak;
 }

@@ -205,9 +205,10 @@ kernel void krylov_bicgstab(
     int k,                        // right-hand sides
     int slices,                   // of the partial sums
     int iteration,                // number of the step
+    int first,                    // value of next_partials with which the sums begin
     global const real *partials,  // <t, s>, <t, t>, <r*, s>, <r*, t> and <s, s>, (slices, 5, k)
     global real *state,           // see above
-    global real *next_partials,   // gets <g, p> and <p, p> of the next step, (slices, 2, k)
+    global real *next_partials,   // gets <g, p> and <p, p> of the next step, (groups, 2, k)
     global const real *g,         // S^T r*
     global const real *half_way,  // (rows, k)
     global const real *t,         // S s
@@ -255,7 +256,7 @@ kernel void krylov_bicgstab(
         r[i] = left;
         p[i] = next;
     }
-    global real *sums = next_partials + (int)get_group_id(0) * 2 * k;
+    global real *sums = next_partials + first + (int)get_group_id(0) * 2 * k;
     global real *squares = state + SQUARES_ROW * k;
     // One loop: PoCL compiles each function of barriers anew, and more than once.
     for (int n = 0; n < 3; n++) {

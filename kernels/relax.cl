@@ -7,8 +7,8 @@
 //
 //   relax_strips  CPUs: a panel of many blocks; a work-item takes a block of rows, which is a strip
 //                 of the panel
-//   relax_rows    GPUs: s_B; a work-group a row. A launch for each block, and one of
-//                 dense_matvec_group for x_B
+//   relax_rows    GPUs: s_B; a work-group a row
+//   relax_correct GPUs: x_B += P_BB^-1 s_B; a work-group a row. A launch of each for each block
 //
 // A strip first sums what no other strip changes before its turn. The rest, a narrow window of
 // columns, is added strip by strip by the item that ends the sums of a strip or the strip before
@@ -21,7 +21,7 @@
 //
 // Required define: K, see common/lanes.h. Optional: PACKED, see there; DENSE, where M has rows of
 // `width` numbers, without pointers, columns and windows. Layout: vectors are row-major with
-// `stride` right-hand sides. Both kernels have the arguments
+// `stride` right-hand sides. The first two kernels have the arguments
 //
 //   begin end            rows of this launch, in the panel or block
 //   first                row of M with which the slab begins
@@ -136,4 +136,28 @@ kernel void relax_rows(RELAX_ARGUMENTS,
         carry[j] = b[j] - scale * sum[c];
         s[j] = carry[j] - from_x;
     }
+}
+
+kernel void relax_correct(
+    int rows,                    // of the block
+    int start,                   // its first row
+    int block,                   // numbers in a row of `weights`
+    int is_triangle,             // 1: numbers right of the diagonal are 0, and are not read
+    int stride,                  // right-hand sides in all
+    int offset,                  // the first of the K of the launch
+    global const real *weights,  // rows of P_BB^-1
+    global const real *s,        // s_B in the rows of the block
+    global real *x,              // the iterate
+    local real *scratch)         // K reals a work-item
+{
+    stride = STRIDE(stride);
+    // One group a row exactly.
+    const int row = get_group_id(0), me = get_local_id(0), items = get_local_size(0);
+    global const real *inverse = weights + (size_t)(start + row) * block;
+    global const real *from = s + start * stride + offset;
+    real sum[K] = {0};
+    row_add(false, sum, 0, inverse, from, stride, me, is_triangle ? row + 1 : rows, items);
+    group_sums(sum, scratch);
+    for (int c = 0; me == 0 && c < K; ++c)
+        x[(start + row) * stride + offset + c] += sum[c];
 }

@@ -44,7 +44,7 @@ kernel void vector_scale_rows(
 {
     const int i = get_global_id(0);
     if (i < count)
-        out[i] = d[i / k] * x[i];
+        out[i] = d[k == 1 ? i : i / k] * x[i];
 }
 
 // Partial sums of left * right * weight over the rows of each column, for pair number

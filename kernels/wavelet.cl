@@ -6,170 +6,82 @@
 //
 // A level halves both sides at once: from the values that the filters reach, two by two are made.
 // Work-items stride through pieces of K right-hand sides (dimension 0), pairs of columns (1) and of
-// rows (2). A launch of several levels takes one group a piece, which waits for itself between
-// levels. Where K is 1, dimension 0 counts pictures, which stand one below the other. With PAIRS an
-// item makes two whole rows: the filters run down the columns first, side by side, into a buffer,
-// and then along it.
+// rows (2). A launch of several levels, on CPUs only, takes one group a piece, which waits for itself
+// between levels. Where K is 1, dimension 0 counts the right-hand sides of a picture, and then pictures, which
+// stand one below the other. With PAIRS an item makes two whole rows: the filters run down the
+// columns first, side by side, into a buffer, and then along it.
 //
 // Required defines: K, see common/lanes.h; TAPS, length of the filters; PAIRS, of columns that an
-// item makes at a time: 1, or 8 where there is one right-hand side, on CPUs.
-//
-// Layout: a picture is row-major, its k right-hand sides side by side. Coefficients stand as in
-// PyWavelets' coeffs_to_array: of each side the approximation first, ceil(n / 2) of n.
-//
-// Of the ceil(pixels / 2^level) samples of a side the last may stand for fewer pixels. It stays out
-// of the filters; where an odd number of whole ones is left, a rotation turns the last two into one
-// of the approximation and a detail, which is 0 of a constant: orthonormal, and a constant has one
-// coefficient on any grid. Both kernels have the arguments
-//
-//   height width     rows and columns of the picture
-//   first_level      levels first_level .. end_level - 1 are done by this launch; wavelet_split
-//   end_level        begins with the first, wavelet_join with the last of them
-//   levels           of the transform
-//   k                right-hand sides
-//   scale add_scale  factors; add is not read where add_scale is 0
-//   starts           pixel of `approximations` with which that of level i + 1 begins
-//   taps             [2 TAPS]: low-pass, high-pass filter, in the order of the samples
-//   x                picture or coefficients to be transformed
-//   approximations   of levels 1 .. levels - 1, scratch
-//   add              like out; may be out
-//   out              the result; wavelet_join writes it where first_level is 0
+// item makes at a time: 1, or 8 where there is one right-hand side, on CPUs. Layout, odd sides,
+// ORDERED and the arguments are those of common/wavelet_levels.h. wavelet_split begins with the first
+// of its levels, wavelet_join with the last of them.
 
-#include "common/lanes.h"
+#include "common/wavelet_levels.h"
 
-#ifndef TAPS
-#error "wavelet.cl needs -DTAPS=<length of the filters: 2, 4, ...>"
-#endif
-#ifndef PAIRS
-#error "wavelet.cl needs -DPAIRS=<of columns: 1, or 8 where K is 1, on CPUs>"
+// Rows of a pair whose loads are on their way at the same time, on GPUs; more take registers.
+#define SPLIT_ROWS 2
+#define JOIN_ROWS 1
+// A GPU makes one level a launch, and the small ones by wavelet_tail.cl; a loop takes registers, too.
+#if K == 1 && PAIRS == 1
+#define END_LEVEL (first_level + 1)
+#define WAIT_FOR_LEVEL (void)0
+#else
+#define END_LEVEL end_level
+#define WAIT_FOR_LEVEL barrier(CLK_GLOBAL_MEM_FENCE)
 #endif
 
-#define HALF (TAPS / 2)
-#define WRAPPED(i, n) (((i) % (n) + (n)) % (n))
-// Where the samples of pair 0 begin that need the same coefficients.
-#define FIRST ((HALF + 1) % 2)
-
-// One side of the picture at one level.
+// A level of a transform.
 typedef struct {
-    int n;        // samples
-    int pairs;    // of them, which is the number of samples of the approximation
-    int regular;  // pairs that the filters reach
-    real c, s;    // cosine and sine for the last two samples, where they are not a regular pair
-} side;
+    side a, b;              // rows and columns
+    piece p;                // of the right-hand sides
+    int k, width;           // right-hand sides; columns of a picture
+    int pitch;              // columns of the array of approximations
+    bool deepest;           // whether approximations are coefficients, too
+    real scale, add_scale;  // factors of what is written, and of add; of split: of details
+    real near_scale, near_add_scale;  // of split: of approximations
+    global const real *low;           // of split: samples; of join: approximations
+    global const real *x;             // of join: details
+    global const real *add;
+    global real *to;   // of split: approximations; of join: samples
+    global real *out;  // of split: details
+    constant real *taps;
+    global const int *order;  // of coefficients, where ORDERED
+} level_arrays;
 
-INLINE side side_at(int pixels, int level)
+// out = scale v + add_scale add of the coefficient of a row, if there is one.
+INLINE void put_coefficient(level_arrays l, int row, lanes v)
 {
-    const int size = 1 << level, whole = pixels >> level, rest = pixels & (size - 1);
-    const int n = whole + (rest > 0);
-    const real total = size + rest;
-    return (side){n, (n + 1) / 2, whole / 2, sqrt(size / total), sqrt(rest / total)};
+    if (row >= 0)
+        put(l.out, row * l.k + l.p.at, v, l.p.skip, l.scale, l.add_scale, l.add);
 }
 
-// Term t of pair m. Of analysis: sample `low`, and its weights in approximation and detail. Of
-// synthesis: approximation `low`, detail `high`, and the weights of both in the first sample and in
-// the second.
-typedef struct {
-    int low, high;
-    real w[4];
-} term;
-
-INLINE term split_term(side a, int m, int t, bool inside, constant real *taps)
+// A coefficient of a transform back.
+INLINE lanes coefficient(level_arrays l, int row_of_picture, int column)
 {
-    term v = {2 * m + 1 - HALF + t, 0, {taps[t], taps[TAPS + t], 0, 0}};
-    if (inside)
-        return v;
-    if (m < a.regular) {
-        v.low = WRAPPED(v.low, 2 * a.regular);
-        return v;
-    }
-    const bool two = a.n % 2 == 0;
-    v.low = a.n - 1 - (two && t == 0);
-    v.w[0] = t > two ? 0 : !two ? 1 : t ? a.s : a.c;
-    v.w[1] = t > two || !two ? 0 : t ? -a.c : a.s;
-    return v;
+    const int pixel = row_of_picture * l.width + column;
+#ifdef ORDERED
+    const int row = l.order[pixel];
+    return row < 0 ? (lanes)(0) : LOAD(l.x + row * l.k);
+#else
+    return LOAD(l.x + pixel * l.k);
+#endif
 }
 
-INLINE term join_term(side a, int m, int t, bool inside, constant real *taps)
+INLINE lanes sample(level_arrays l, int row, int column)
 {
-    const int i = m + HALF / 2 + 1 - HALF + t, tap = TAPS - 2 - 2 * t;
-    term v = {i, a.pairs + i, {taps[tap], taps[TAPS + tap], taps[tap + 1], taps[TAPS + tap + 1]}};
-    if (inside)
-        return v;
-    if (m < a.regular) {
-        v.low = WRAPPED(i, a.regular);
-        v.high = a.pairs + v.low;
-        return v;
-    }
-    const bool two = a.n % 2 == 0;
-    v.low = m;
-    v.high = two ? a.pairs + m : m;
-    v.w[0] = t ? 0 : two ? a.c : 1;
-    v.w[1] = v.w[2] = t || !two ? 0 : a.s;
-    v.w[3] = t || !two ? 0 : -a.c;
-    return v;
+    return LOAD(l.low + (row * l.b.n + column) * l.k);
 }
 
-// Where sample 0 or 1 of pair m stands; a.n: there is none.
-INLINE int place(side a, int m, int which)
+INLINE lanes approximation(level_arrays l, int row, int column)
 {
-    const int i = 2 * m + which;
-    return m < a.regular ? (i + FIRST) % (2 * a.regular) : i;
+#ifdef ORDERED
+    if (l.deepest)
+        return coefficient(l, row, column);
+#endif
+    return LOAD(l.low + (row * l.pitch + column) * l.k);
 }
 
-// The values of a pair of rows and one of columns: v01 is of the rows' first and the columns'
-// second.
-typedef struct {
-    lanes v00, v01, v10, v11;
-} quad;
-
-INLINE quad
-split(side a, int i, side b, int j, bool inside, global const real *x, int k, constant real *taps)
-{
-    quad q = {0, 0, 0, 0};
-    for (int s = 0; s < TAPS; ++s) {
-        const term r = split_term(a, i, s, inside, taps);
-        lanes near = 0, detail = 0;
-        for (int t = 0; t < TAPS; ++t) {
-            const term c = split_term(b, j, t, inside, taps);
-            const lanes v = LOAD(x + (r.low * b.n + c.low) * k);
-            near = c.w[0] * v + near;
-            detail = c.w[1] * v + detail;
-        }
-        q.v00 = r.w[0] * near + q.v00;
-        q.v01 = r.w[0] * detail + q.v01;
-        q.v10 = r.w[1] * near + q.v10;
-        q.v11 = r.w[1] * detail + q.v11;
-    }
-    return q;
-}
-
-// Approximations come from `near`, whose rows have near_pitch pixels, details from x.
-INLINE quad join(
-    side a, int i, side b, int j, bool inside, global const real *near, int near_pitch,
-    global const real *x, int pitch, int k, constant real *taps)
-{
-    quad q = {0, 0, 0, 0};
-    for (int s = 0; s < HALF; ++s) {
-        const term r = join_term(a, i, s, inside, taps);
-        lanes low0 = 0, low1 = 0, high0 = 0, high1 = 0;
-        for (int t = 0; t < HALF; ++t) {
-            const term c = join_term(b, j, t, inside, taps);
-            const lanes ll = LOAD(near + (r.low * near_pitch + c.low) * k);
-            const lanes lh = LOAD(x + (r.low * pitch + c.high) * k);
-            const lanes hl = LOAD(x + (r.high * pitch + c.low) * k);
-            const lanes hh = LOAD(x + (r.high * pitch + c.high) * k);
-            low0 = c.w[0] * ll + (c.w[1] * lh + low0);
-            low1 = c.w[2] * ll + (c.w[3] * lh + low1);
-            high0 = c.w[0] * hl + (c.w[1] * hh + high0);
-            high1 = c.w[2] * hl + (c.w[3] * hh + high1);
-        }
-        q.v00 = r.w[0] * low0 + (r.w[1] * high0 + q.v00);
-        q.v01 = r.w[0] * low1 + (r.w[1] * high1 + q.v01);
-        q.v10 = r.w[2] * low0 + (r.w[3] * high0 + q.v10);
-        q.v11 = r.w[2] * low1 + (r.w[3] * high1 + q.v11);
-    }
-    return q;
-}
+#include "common/wavelet_pairs.h"
 
 // out = a v + b y at i, where such a sample exists.
 INLINE void
@@ -179,50 +91,29 @@ store(bool exist, global real *out, int i, lanes v, int skip, real a, real b, gl
         put(out, i, v, skip, a, b, y);
 }
 
-// A level of a transform.
-typedef struct {
-    side a, b;              // rows and columns
-    piece p;                // of the right-hand sides
-    int k, width;           // right-hand sides; columns of a picture
-    int pitch;              // columns of the array of approximations
-    real scale, add_scale;  // factors of what is written, and of add; of split: of details
-    real near_scale, near_add_scale;  // of split: of approximations
-    global const real *low;           // of split: samples; of join: approximations
-    global const real *x;             // of join: details
-    global const real *add;
-    global real *to;   // of split: approximations; of join: samples
-    global real *out;  // of split: details
-    constant real *taps;
-} level_arrays;
-
 INLINE void split_pair(level_arrays l, int i, int j)
 {
     const side a = l.a, b = l.b;
-    const int k = l.k, row = 2 * i + 1 - HALF, column = 2 * j + 1 - HALF;
-    const bool inside =
-        row >= 0 && row + TAPS <= 2 * a.regular && column >= 0 && column + TAPS <= 2 * b.regular;
-    const quad q = inside ? split(a, i, b, j, true, l.low, k, l.taps)
-                          : split(a, i, b, j, false, l.low, k, l.taps);
-    const int right = b.pairs * k, below = a.pairs * l.width * k;
-    const int here = (i * l.width + j) * k + l.p.at, near = (i * l.pitch + j) * k;
-    const bool at_right = b.pairs + j < b.n, at_below = a.pairs + i < a.n;
-    const bool both = at_right && at_below;
-    const int skip = l.p.skip;
-    const real u = l.scale, v = l.add_scale;
-    store(true, l.to, near, q.v00, skip, l.near_scale, l.near_add_scale, l.add + l.p.at);
-    store(at_right, l.out, here + right, q.v01, skip, u, v, l.add);
-    store(at_below, l.out, here + below, q.v10, skip, u, v, l.add);
-    store(both, l.out, here + below + right, q.v11, skip, u, v, l.add);
+    const int pixel = i * l.width + j, right = b.pairs, below = a.pairs * l.width;
+    const bool at_right = right + j < b.n, at_below = a.pairs + i < a.n;
+    const quad q = split(l, i, j);
+    const int row00 = coefficient_row(l.order, l.deepest, pixel);
+    const int row01 = coefficient_row(l.order, at_right, pixel + right);
+    const int row10 = coefficient_row(l.order, at_below, pixel + below);
+    const int row11 = coefficient_row(l.order, at_right && at_below, pixel + below + right);
+    if (!l.deepest)
+        put(l.to, (i * l.pitch + j) * l.k, q.v00, l.p.skip, 1, 0, l.add);
+    put_coefficient(l, row00, q.v00);
+    put_coefficient(l, row01, q.v01);
+    put_coefficient(l, row10, q.v10);
+    put_coefficient(l, row11, q.v11);
 }
 
 INLINE void join_pair(level_arrays l, int i, int j)
 {
     const side a = l.a, b = l.b;
-    const int k = l.k, row = i + HALF / 2 + 1 - HALF, column = j + HALF / 2 + 1 - HALF;
-    const bool inside =
-        row >= 0 && row + HALF <= a.regular && column >= 0 && column + HALF <= b.regular;
-    const quad q = inside ? join(a, i, b, j, true, l.low, l.pitch, l.x, l.width, k, l.taps)
-                          : join(a, i, b, j, false, l.low, l.pitch, l.x, l.width, k, l.taps);
+    const int k = l.k;
+    const quad q = join(l, i, j);
     const int left = place(b, j, 0), right = place(b, j, 1);
     const int upper = place(a, i, 0) * b.n, lower = place(a, i, 1) * b.n;
     const bool at_right = right < b.n, at_below = lower < a.n * b.n;
@@ -260,8 +151,11 @@ INLINE void split_rows(level_arrays l, int i)
     const bool at_below = a.pairs + i < a.n;
     // Outside the loop over columns: they divide.
     term rows[TAPS];
-    for (int s = 0; s < TAPS; ++s)
-        rows[s] = split_term(a, i, s, false, taps);
+    int row = split_start(a, i);
+    for (int s = 0; s < TAPS; ++s) {
+        rows[s] = split_term(a, i, s, row, false, taps);
+        row = split_next(a, row, false);
+    }
     int done = 0;
     for (int start = 0; start + 8 <= b.regular; start = done) {
         const int pairs = min(CHUNK, b.regular - start) / 8 * 8;
@@ -270,7 +164,7 @@ INLINE void split_rows(level_arrays l, int i)
         for (int c = 0; c < count;) {
             const int column = first + c;
             const bool wide = column >= 0 && column + 8 <= 2 * b.regular;
-            global const real *p = l.low + (wide ? column : WRAPPED(column, 2 * b.regular));
+            global const real *p = l.low + (wide ? column : wrapped(column, 2 * b.regular));
             real8 u = 0, v = 0;
             for (int s = 0; s < TAPS; ++s) {
                 const term r = rows[s];
@@ -324,8 +218,11 @@ INLINE void join_rows(level_arrays l, int i)
     const int whole = b.regular - FIRST;
     // Outside the loop over columns: they divide.
     term rows[HALF];
-    for (int s = 0; s < HALF; ++s)
-        rows[s] = join_term(a, i, s, false, taps);
+    int row = join_start(a, i);
+    for (int s = 0; s < HALF; ++s) {
+        rows[s] = join_term(a, i, s, row, false, taps);
+        row = join_next(a, row, false);
+    }
     int done = 0;
     for (int start = 0; start + 8 <= whole; start = done) {
         const int pairs = min(CHUNK, whole - start) / 8 * 8;
@@ -334,13 +231,13 @@ INLINE void join_rows(level_arrays l, int i)
         for (int c = 0; c < count;) {
             const int column = first + c;
             const bool wide = column >= 0 && column + 8 <= b.regular;
-            const int at = wide ? column : WRAPPED(column, b.regular);
+            const int at = wide ? column : wrapped(column, b.regular);
             global const real *near = l.low + at, *x = l.x + at;
             real8 l0 = 0, l1 = 0, h0 = 0, h1 = 0;
             for (int s = 0; s < HALF; ++s) {
                 const term r = rows[s];
-                const int row = r.low * l.width + b.pairs, below = r.high * l.width;
-                global const real *ll = near + r.low * l.pitch, *lh = x + row;
+                const int right = r.low * l.width + b.pairs, below = r.high * l.width;
+                global const real *ll = near + r.low * l.pitch, *lh = x + right;
                 global const real *hl = x + below, *hh = hl + b.pairs;
                 const real8 u = wide ? LOAD8(ll) : (real8)(*ll),
                             v = wide ? LOAD8(hl) : (real8)(*hl);
@@ -397,29 +294,17 @@ INLINE void join_rows(level_arrays l, int i)
     name##_pair(l, i, j)
 #endif
 
-#define TRANSFORM_ARGUMENTS \
-    int height, int width, int first_level, int end_level, int levels, int k, real scale, \
-        real add_scale, constant int *starts, constant real *taps, global const real *x, \
-        global real *approximations, global const real *add, global real *out
-
-// Where K is 1: the arrays of picture number get_global_id(0).
-#if K == 1
-#define CHOOSE_PICTURE \
-    const int picture = get_global_id(0), first_pixel = picture * height * width; \
-    x += first_pixel, add += first_pixel, out += first_pixel; \
-    approximations += picture * starts[levels]; \
-    const piece p = {0, 0}
-#else
-#define CHOOSE_PICTURE const piece p = piece_of(get_global_id(0), k)
-#endif
-
 kernel void wavelet_split(TRANSFORM_ARGUMENTS)
 {
     CHOOSE_PICTURE;
-    for (int level = first_level; level < end_level; ++level) {
+    CHOOSE_PIXELS(x);
+    CHOOSE_COEFFICIENTS(add);
+    CHOOSE_COEFFICIENTS(out);
+    for (int level = first_level; level < END_LEVEL; ++level) {
         const bool deepest = level + 1 == levels;
         level_arrays l = {side_at(height, level), side_at(width, level), p, k, width};
         l.pitch = deepest ? width : l.b.pairs;
+        l.deepest = deepest;
         l.scale = scale;
         l.add_scale = add_scale;
         l.near_scale = deepest ? scale : 1;
@@ -429,8 +314,9 @@ kernel void wavelet_split(TRANSFORM_ARGUMENTS)
         l.to = deepest ? out + p.at : approximations + starts[level] * k + p.at;
         l.out = out;
         l.taps = taps;
+        l.order = ORDER;
         ROWS_OF(split, l);
-        barrier(CLK_GLOBAL_MEM_FENCE);
+        WAIT_FOR_LEVEL;
     }
 }
 
@@ -438,10 +324,14 @@ kernel void wavelet_split(TRANSFORM_ARGUMENTS)
 kernel void wavelet_join(TRANSFORM_ARGUMENTS)
 {
     CHOOSE_PICTURE;
-    for (int level = end_level - 1; level >= first_level; --level) {
+    CHOOSE_COEFFICIENTS(x);
+    CHOOSE_PIXELS(add);
+    CHOOSE_PIXELS(out);
+    for (int level = END_LEVEL - 1; level >= first_level; --level) {
         const bool deepest = level + 1 == levels;
         level_arrays l = {side_at(height, level), side_at(width, level), p, k, width};
         l.pitch = deepest ? width : l.b.pairs;
+        l.deepest = deepest;
         l.scale = level ? 1 : scale;
         l.add_scale = level ? 0 : add_scale;
         l.low = deepest ? x + p.at : approximations + starts[level] * k + p.at;
@@ -449,7 +339,8 @@ kernel void wavelet_join(TRANSFORM_ARGUMENTS)
         l.add = add + p.at;
         l.to = (level ? approximations + starts[level - 1] * k : out) + p.at;
         l.taps = taps;
+        l.order = ORDER;
         ROWS_OF(join, l);
-        barrier(CLK_GLOBAL_MEM_FENCE);
+        WAIT_FOR_LEVEL;
     }
 }

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from importlib.machinery import ModuleSpec
 from typing import TYPE_CHECKING, Any
 
 # Before all that takes long: Ctrl-C while the program is imported.
@@ -26,24 +27,21 @@ from ltcl.cli import interrupt as _interrupt  # noqa: F401
 
 # isort: split
 from ltcl import errors
-from ltcl.batch import cluster
-from ltcl.device import Device, list_devices, open_device
-from ltcl.solvers import Inverse, Solution, Status, solve
-from ltcl.store import load, load_inverse, save, save_inverse
-from ltcl.tasks import compensation, compression
-from ltcl.tasks.analysis import Analysis, analyze
-from ltcl.tasks.compensation import Compensation, Compensator, compensate
-from ltcl.tasks.compression import Compression, compress, invert
-from ltcl.tasks.denoising import denoise
-from ltcl.tasks.relighting import relight
-from ltcl.tasks.separation import Separation, separate
-from ltcl.transport import noise
-from ltcl.transport.projectors import CombinedTransport, Gamut, combine
-from ltcl.transport.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
     from ltcl.acquisition import acquire, align, fit, update
+    from ltcl.device import Device, list_devices, open_device
+    from ltcl.solvers import Inverse, Solution, Status, solve
+    from ltcl.store import load, load_inverse, save, save_inverse
+    from ltcl.tasks.analysis import Analysis, analyze
+    from ltcl.tasks.compensation import Compensation, Compensator, compensate
+    from ltcl.tasks.compression import Compression, compress, invert
+    from ltcl.tasks.denoising import denoise
+    from ltcl.tasks.relighting import relight
+    from ltcl.tasks.separation import Separation, separate
+    from ltcl.transport.projectors import CombinedTransport, Gamut, combine
+    from ltcl.transport.transport import Transport
     from ltcl.viewer import view
 
 __version__ = "0.1.0"
@@ -91,28 +89,96 @@ __all__ = [
     "view",
 ]
 
-# What moved into folders keeps its public import path.
-_PUBLIC_PATHS = {
-    "ltcl.cluster": cluster,
-    "ltcl.compensation": compensation,
-    "ltcl.compression": compression,
-    "ltcl.noise": noise,
+# Names are loaded at their first use: the help of the program needs none of them.
+_PACKAGES = {
+    "acquisition",
+    "batch",
+    "demo",
+    "device",
+    "images",
+    "operators",
+    "plots",
+    "scenes",
+    "show",
+    "solvers",
+    "store",
+    "tasks",
+    "theory",
+    "transport",
+    "viewer",
 }
-sys.modules.update(_PUBLIC_PATHS)
-
-_LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
-_FUNCTIONS = {
+_MODULES = {
+    "Analysis": "tasks.analysis",
+    "CombinedTransport": "transport.projectors",
+    "Compensation": "tasks.compensation",
+    "Compensator": "tasks.compensation",
+    "Compression": "tasks.compression",
+    "Device": "device",
+    "Gamut": "transport.projectors",
+    "Inverse": "solvers",
+    "Separation": "tasks.separation",
+    "Solution": "solvers",
+    "Status": "solvers",
+    "Transport": "transport.transport",
     "acquire": "acquisition",
     "align": "acquisition",
+    "analyze": "tasks.analysis",
+    "combine": "transport.projectors",
+    "compensate": "tasks.compensation",
+    "compress": "tasks.compression",
+    "denoise": "tasks.denoising",
     "fit": "acquisition",
+    "invert": "tasks.compression",
+    "list_devices": "device",
+    "load": "store",
+    "load_inverse": "store",
+    "open_device": "device",
+    "relight": "tasks.relighting",
+    "save": "store",
+    "save_inverse": "store",
+    "separate": "tasks.separation",
+    "solve": "solvers",
     "update": "acquisition",
     "view": "viewer",
 }
+# What moved into folders keeps its public import path.
+_PUBLIC_PATHS = {
+    "ltcl.cluster": "ltcl.batch.cluster",
+    "ltcl.compensation": "ltcl.tasks.compensation",
+    "ltcl.compression": "ltcl.tasks.compression",
+    "ltcl.noise": "ltcl.transport.noise",
+}
+
+
+class _PublicPaths:
+    """Finder and loader of `_PUBLIC_PATHS`: `ltcl.noise` is the module `ltcl.transport.noise`."""
+
+    def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
+        loader: Any = self
+        if fullname not in _PUBLIC_PATHS:
+            return None
+        return ModuleSpec(fullname, loader)
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """Let importlib make a module, which `exec_module` replaces."""
+
+    def exec_module(self, module: Any) -> None:
+        name = module.__name__
+        sys.modules[name] = importlib.import_module(_PUBLIC_PATHS[name])
+
+
+sys.meta_path.append(_PublicPaths())
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
+    if name in _MODULES:
+        value = getattr(importlib.import_module(f"ltcl.{_MODULES[name]}"), name)
+        globals()[name] = value
+        return value
+    if name in _PACKAGES or f"ltcl.{name}" in _PUBLIC_PATHS:
         return importlib.import_module(f"ltcl.{name}")
-    if name in _FUNCTIONS:
-        return getattr(importlib.import_module(f"ltcl.{_FUNCTIONS[name]}"), name)
     raise AttributeError(f"module 'ltcl' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES, *_PACKAGES})

@@ -9,17 +9,22 @@ from __future__ import annotations
 import contextlib
 import copy
 import decimal
+import functools
+import importlib
+import inspect
 import math
 import operator
 import os
 import textwrap
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import scipy.sparse
 
-from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.errors import InputError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.interop.arrays import kind_of
+from ltcl.interop.calls import Call, Differentiable, without_derivative
 
 BOUNDS = {
     "above": ("above", operator.gt),
@@ -29,6 +34,43 @@ BOUNDS = {
 }
 TWO_DIGITS_UPWARDS = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING)
 UNLIMITED = 1 << 62  # bytes
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def takes_arrays(
+    *names: str, differentiable: Differentiable | None = None
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a public call: the arguments of these names may be arrays of other libraries.
+
+    Results are then of the kind of the first of these. Calls with NumPy's arrays run as they are.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+        places = [(name, list(signature.parameters).index(name)) for name in names]
+
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            arrays = {}
+            for name, place in places:
+                value = args[place] if place < len(args) else kwargs.get(name)
+                if kind_of(type(value)) is not None:
+                    arrays[name] = value
+            if not arrays:
+                return function(*args, **kwargs)
+            return Call(
+                function=function,
+                arguments=signature.bind(*args, **kwargs),
+                arrays=arrays,
+                read=real,
+                differentiable=differentiable,
+            ).run()
+
+        return call
+
+    return decorate
 
 
 def finite(name: str, array: np.ndarray) -> np.ndarray:
@@ -54,23 +96,32 @@ def real(name: str, value: Any) -> np.ndarray:
         advice = "read a picture with ltcl.images.read, a transport with ltcl.load"
         raise InputTypeError(f"{name} is the text {str(value)!r}; it must be an array: {advice}")
     unmasked(name, value)
+    untracked(name, value)
+    kind = kind_of(type(value))
     try:
-        array = np.asarray(value)
+        array = np.asarray(value) if kind is None else kind.read(value)
     except ValueError as error:
         raise InputError(
             f"{name} is ragged; it must be a rectangular array of real numbers"
         ) from error
-    except (RuntimeError, TypeError) as error:
-        # Tensors that require a gradient, or are sparse, in bfloat16, or on another device.
-        reason = str(error).partition("\n")[0]
+    except (BufferError, RuntimeError, TypeError) as error:
+        # Tensors that are sparse, without numbers, or in a type that NumPy lacks.
+        advice = "give it as a NumPy array" if kind is None else kind.unreadable_advice(value)
+        reason = str(error).partition("\n")[0].rstrip(".")
         raise InputTypeError(
-            f"{name} is a {type(value).__name__} that NumPy cannot read ({reason}); a tensor must "
-            "be dense: give it as .detach().cpu().float().numpy()"
+            f"{name} is a {type(value).__name__} that NumPy cannot read ({reason}); {advice}"
         ) from error
     if array.dtype.kind not in "fiub":
         content = "is None" if value is None else f"holds {array.dtype}"
         raise InputTypeError(f"{name} {content}; it must hold real numbers")
     return array
+
+
+def untracked(name: str, value: Any) -> None:
+    """Refuse an array whose derivative is asked for: it would be lost."""
+    kind = kind_of(type(value))
+    if kind is not None and kind.is_tracked(value):
+        raise without_derivative(name, value)
 
 
 def unmasked(name: str, value: Any) -> None:
@@ -109,6 +160,8 @@ def grid(name: str, value: Any, pixels: int | None = None) -> tuple[int, int]:
 
 def number(name: str, value: Any, **bounds: float) -> float:
     """Return `value` as a finite float; bounds are above=, least=, most= and below=."""
+    if not isinstance(value, (int, float, np.generic)):
+        untracked(name, value)
     x = math.nan
     is_scalar = not isinstance(value, (bool, str, bytes)) and not getattr(value, "ndim", 0)
     if is_scalar:
@@ -286,3 +339,17 @@ def upwards(error: float) -> str:
     """Two digits, rounded up: 0.00421 -> '0.0043'."""
     rounded = TWO_DIGITS_UPWARDS.create_decimal(repr(float(error)))
     return f"{float(rounded):.2g}"
+
+
+def load_extra(module: str, extra: str, user: str, kind: type[LtclError] = InputError) -> Any:
+    """Import a module that an extra of ltcl brings; an error of that kind says who needs it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise kind(missing_extra(module, extra, user, error)) from None
+
+
+def missing_extra(module: str, extra: str, user: str, error: ImportError) -> str:
+    """Say in one line which module is missing, who needs it, and how it is installed."""
+    cause = " ".join(str(error).split())
+    return f'{user} needs {module} ({cause}); install it with python -m pip install "ltcl[{extra}]"'

@@ -172,12 +172,12 @@ def _put_folder(temporary: Path, target: Path) -> None:
                 raise
 
 
-def exchange(one: Path, two: Path) -> bool:
+def exchange(first: Path, second: Path) -> bool:
     """Exchange the names of two folders at once; False where that cannot be done."""
     if IS_WINDOWS:
         return False
     system = ctypes.CDLL(None, use_errno=True)
-    names = os.fsencode(one), os.fsencode(two)
+    names = os.fsencode(first), os.fsencode(second)
     if hasattr(system, "renameat2"):
         from_name = (CURRENT_FOLDER, names[0])
         failed = system.renameat2(*from_name, CURRENT_FOLDER, names[1], RENAME_EXCHANGE)
@@ -187,7 +187,7 @@ def exchange(one: Path, two: Path) -> bool:
         return False
     code = ctypes.get_errno()
     if failed and code not in CANNOT_EXCHANGE:
-        raise OSError(code, os.strerror(code), str(two))
+        raise OSError(code, os.strerror(code), str(second))
     return not failed
 
 

@@ -22,10 +22,8 @@ class MatrixBasis(Basis):
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
         self.isometric = bool(np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5))
 
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
-        return self._on_device._bind_product(x, out, Epilogue(a, b, y), transpose)
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
+        return self._on_device._bind_product(x, out, epilogue, transpose)
 
 
 def rotation(n: int, seed: int = 0) -> np.ndarray:

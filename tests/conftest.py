@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import ltcl
+from ltcl.cli.main import main
 from ltcl.device import Device
 from ltcl.device.device import SPARE_BYTES
 from ltcl.device.kernels import Kernel
@@ -105,6 +106,16 @@ def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def device(private_cache: Path) -> Device:
     """The device that ltcl opens here; without one, tests fail rather than skip."""
     return ltcl.open_device()
+
+
+@pytest.fixture(scope="session")
+def room_of_two(private_cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of two virtual projectors on a corner that were scanned; not to be changed."""
+    folder = tmp_path_factory.mktemp("several") / "room"
+    words = ["simulate", "dihedral", "--size", "12", "--projectors", "2", "--out", str(folder)]
+    assert main([*words, "--strategy", "pixel", "--quiet"]) == 0
+    assert main(["acquire", "run", str(folder), "--quiet"]) == 0
+    return folder
 
 
 def launched_as(device: Device, kind: str) -> Device:

@@ -91,6 +91,17 @@ def relax_correct(inverse: np.ndarray, s: np.ndarray, x: np.ndarray) -> np.ndarr
     return x + inverse @ s
 
 
+def triangle_products(L: np.ndarray, A_inverse: np.ndarray) -> np.ndarray:
+    """T = L A^-1 of one pair of triangles."""
+    return np.asarray(L, np.float64) @ A_inverse
+
+
+def triangle_join(A_inverse: np.ndarray, C_inverse: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """The inverse of [[A, 0], [L, C]] with T = L A^-1."""
+    above = np.hstack([A_inverse, np.zeros((len(A_inverse), len(C_inverse)))])
+    return np.vstack([above, np.hstack([-C_inverse @ T, C_inverse])])
+
+
 def relax_windows(M: np.ndarray, block: int, panel: int, *, inverses: bool) -> np.ndarray:
     """First entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
     i = np.arange(len(M))
@@ -512,6 +523,11 @@ def frames_decode(
     return gain * np.asarray(table, np.float64)[codes] - background
 
 
+def frames_between(target: np.ndarray, bounces: np.ndarray, share: float) -> np.ndarray:
+    """Direct light of a frame in between, by the bounces that an earlier one takes off."""
+    return np.asarray(target, np.float64) + share * bounces
+
+
 def frames_light(factors: np.ndarray, direct: np.ndarray, mixing: np.ndarray) -> np.ndarray:
     """Projector light without bounds, (pixels, channels); 0 at masked pixels."""
     return np.where(factors == 0.0, 0.0, (factors * direct) @ mixing.T)
@@ -565,6 +581,21 @@ def hats_gather(grid: tuple[int, int]) -> np.ndarray:
         if max(height, width) <= 2:
             return np.array(hats)
         height, width, scale = height // 2 + 1, width // 2 + 1, 2 * scale
+
+
+def patch_hats(grid: tuple[int, int], walls: int, detail: int) -> np.ndarray:
+    """W (patches, N) of `PatchHats`, from its formula."""
+
+    def along(pixels: int) -> np.ndarray:
+        """Hats of one side of a wall, (patches, pixels)."""
+        middles = np.arange(pixels // detail)[:, None]
+        places = (np.arange(pixels) + 0.5) / detail - 0.5
+        within = np.clip(places, 0, len(middles) - 1)
+        return np.maximum(1.0 - np.abs(within - middles), 0.0)
+
+    h, w = grid
+    across = np.kron(np.eye(walls), along(w // walls))
+    return np.kron(along(h), across)
 
 
 def hats_spread(grid: tuple[int, int]) -> np.ndarray:

@@ -14,7 +14,7 @@ import yaml
 
 import ltcl
 from ltcl.acquisition import VirtualRig
-from ltcl.cli.main import app
+from ltcl.cli.main import build_program
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / ".github").rglob("*.md"))]
@@ -24,7 +24,7 @@ PAGES = [ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / ".githu
 def test_pages_for_contributors_name_what_exists(page: Path) -> None:
     """Commands, links, and files of the repository in code, but for those with a NAME to choose."""
     text = page.read_text(encoding="utf-8")
-    program: Any = typer.main.get_command(app)
+    program: Any = typer.main.get_command(build_program())
     for first, second in re.findall(r"`ltcl ([a-z]+)(?: ([a-z]+))?", text):
         command = program.commands[first]
         assert second in getattr(command, "commands", {second: None}), (first, second)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -36,6 +37,41 @@ def test_the_readme_is_short_and_its_links_lead_somewhere():
     assert README.count("\n") <= 120
     links = re.findall(r"\]\(([^)#]+)", README)
     assert [link for link in links if not (ROOT / link).is_file()] == []
+
+
+def record(name: str) -> dict[str, Any]:
+    path = ROOT / "bench" / "results" / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def rounded(value: float) -> str:
+    """A number with two digits, or with all before its point."""
+    return f"{float(f'{value:.2g}'):g}" if value < 10 else f"{value:.0f}"
+
+
+def sketch_row(name: str) -> list[str]:
+    """Cells of the table of costs that a record of bench/sketch_large.py gives."""
+    facts = record(name)["facts"]
+    (photographs,) = (c for c in record(name)["claims"] if c["text"] == "photographs")
+    return [
+        facts["grid"].replace("x", " x "),
+        photographs["measured"],
+        f"{rounded(facts['seconds until T is there'])} s",
+        f"{rounded(facts['memory while T is estimated, MB'])} MB",
+        f"{rounded(facts['T, MB'])} MB",
+        f"{rounded(facts['compensate, s'])} s",
+    ]
+
+
+def test_the_table_of_costs_has_the_figures_of_the_records():
+    table = README.partition("## What it costs")[2].partition("\n**")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")]
+    assert sketch_row("sketch_large") in rows
+    assert sketch_row("sketch_large_1080") in rows
+    films = {row["question"]: row["ours"] for row in record("video-epyc-pocl3.0")["rows"]}
+    late = films["colour, kept inverse: 99 % of frames within"]
+    pace = films["colour, kept inverse: one by one"]
+    assert f"99 % within {late:.1f} ms, {pace:.0f} a second" in table
 
 
 @pytest.mark.slow

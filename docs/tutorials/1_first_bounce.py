@@ -6,9 +6,9 @@ Your first bounce of light
 Ten minutes, no hardware. You throw a picture into the corner of a room, see why it looks wrong, and
 let ltcl find the pattern that makes it look right. Then you take the light apart, bounce by bounce.
 
-You need ltcl (``pip install ltcl``) and a little Python. Each block below can be copied into a
-Python prompt or a notebook, in this order. A notebook shows each figure below its block; a prompt
-opens it with ``figure.show()``.
+You need ltcl with its extra ``plots`` (:doc:`../install`) and a little Python. Each block below can
+be copied into a Python prompt or a notebook, in this order. ``figure.show()`` shows a figure below
+its block in a notebook, and from a prompt in the program that opens pictures on your computer.
 """
 
 # %%
@@ -16,25 +16,26 @@ opens it with ``figure.show()``.
 # ------------------------------
 #
 # ltcl can compute rooms. This one is the corner of a room: a red wall, a yellow wall and a pink
-# floor. Each has 32 x 32 small squares, *pixels* of the projector. The numbers are the red, green
-# and blue light that a wall gives back.
+# floor. The numbers are the red, green and blue light that a wall gives back. Each wall has 256 x
+# 256 *pixels* of the projector. Light that bounces is smooth, so it is computed between 32 x 32
+# squares of each wall, ``box(32, ...)``, which ``refine(..., 8)`` divides into 8 x 8 pixels each.
 
 import ltcl
 from ltcl.plots import pictures
 
 walls = [(0.85, 0.35, 0.25), (0.85, 0.75, 0.35), (0.85, 0.5, 0.7)]  # left, right, floor
-corner = ltcl.scenes.box(32, sides=3, albedo=walls)
-photo = ltcl.scenes.landscape(480, 480)  # any picture, as numbers of linear light from 0 to 1
+corner = ltcl.scenes.refine(ltcl.scenes.box(32, sides=3, albedo=walls), 8)
+photo = ltcl.scenes.landscape(800, 800)  # any picture, as numbers of linear light from 0 to 1
 wanted = 0.25 + 0.75 * corner.sample(photo)  # its pixels on the three walls, as seen from in front
 
 
 def view(light):
     """The corner as somebody sees it who stands in front of it."""
-    return corner.view(light, size=320, supersample=2)
+    return corner.view(light, size=500, supersample=2)
 
 
-figure = pictures({"the picture": photo, "on the walls": view(wanted)}, width=640)
-figure
+figure = pictures({"the picture": photo, "on the walls": view(wanted)})
+figure.show()
 
 # %%
 # The picture looks flat, although it lies on three walls: this is what we want.
@@ -48,8 +49,8 @@ figure
 transport = corner.transport()
 as_it_is = transport @ wanted
 
-figure = pictures({"wanted": view(wanted), "seen": view(as_it_is)}, width=640)
-figure
+figure = pictures({"wanted": view(wanted), "seen": view(as_it_is)})
+figure.show()
 
 # %%
 # Two things went wrong. The walls have colours. And they light each other: light that meets the red
@@ -63,10 +64,8 @@ result = ltcl.compensate(transport, wanted, gain="auto")
 print(f"error {result.error:.1%}, at {result.gain:.0%} of the brightness")
 
 then = result.appearance / result.gain
-figure = pictures(
-    {"throw this pattern": view(result.pattern), "and this is seen": view(then)}, width=640
-)
-figure
+figure = pictures({"throw this pattern": view(result.pattern), "and this is seen": view(then)})
+figure.show()
 
 # %%
 # The pattern is green and blue where the walls are red, and darker where other walls will add their
@@ -89,8 +88,9 @@ shown = {"all light": view(as_it_is), "direct light": view(parts.direct)}
 for number, light in enumerate(parts.bounces, start=1):
     times = float(f"{parts.direct.mean() / light.mean():.2g}")
     shown[f"bounce {number}\n{times:g} times as bright"] = view(times * light)
+
 figure = pictures(shown)
-figure
+figure.show()
 
 # %%
 # The direct light has all of the detail. Each bounce is smoother and redder than the one before it,
@@ -117,7 +117,7 @@ figure = pictures(
         "first bounce × 3\nshown darker": view(0.6 * strong),
     }
 )
-figure
+figure.show()
 
 # %%
 # What you have done, in the words of the paper
@@ -134,6 +134,7 @@ figure
 #
 # Where to go on: :doc:`with a matrix that you have <2_my_matrix>`, :doc:`with a corner of your own
 # <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser
-# with sliders. A picture of 256 x 512 pixels stands at the end of :doc:`another page <6_large>`.
+# with sliders. A picture made with photographs alone, of 256 x 512 pixels, stands at the end of
+# :doc:`another page <6_large>`.
 
 # sphinx_gallery_thumbnail_number = 9

@@ -17,7 +17,9 @@ asks whether it is good enough, and uses it: with its noise, and with pixels tha
 # the gamma of the camera first.
 #
 # We make such a file here: two white walls that meet in a corner, 12 x 24 pixels. To be like a
-# measured one it has noise, and three projector pixels miss the walls.
+# measured one it has noise, and three projector pixels miss the walls. A file with all of T is only
+# for few pixels, and so pictures on this page are coarse: 288 x 288 numbers here would be 1.7e10,
+# 69 GB, for 256 x 512 pixels. :doc:`6_large` says how these are kept.
 
 import tempfile
 from pathlib import Path
@@ -116,6 +118,46 @@ figure = pictures(
 figure
 
 # %%
+# A camera of more pixels
+# -----------------------
+#
+# Most cameras see more pixels than were projected. T then has a row for each pixel of the camera,
+# and is not square: tell ltcl ``camera_grid``, too. Here each projector pixel is 8 x 8 pixels of
+# the camera.
+
+fine = ltcl.scenes.refine(corner, 8)
+walls = fine.transport()
+columns = []
+for pixel in np.eye(len(true)).reshape(-1, *corner.grid):
+    light = pixel.repeat(8, axis=0).repeat(8, axis=1)
+    columns.append((walls @ light).ravel())
+np.save(folder / "camera.npy", np.stack(columns, axis=1))
+
+C = ltcl.load(folder / "camera.npy", grid=corner.grid, camera_grid=fine.grid)
+print(C.shape, C.grid, C.camera_grid)
+
+# %%
+# What is wanted, and what is seen, are then pictures of the camera. The projector still has its own
+# pixels, of which the error tells.
+
+wanted = 0.5 * fine.sample(ltcl.scenes.landscape(240, 480)[..., 1]) + 0.2
+result = ltcl.compensate(C, wanted, gain="auto")
+print(f"error {result.error:.1%} at {result.gain:.0%} of the brightness")
+lights = {"wanted": wanted, "seen": result.appearance / result.gain}
+figure = pictures({name: fine.view(light, size=400) for name, light in lights.items()})
+figure
+
+# %%
+# Such a T has no S, and so no bounces: for these the grids must be one.
+
+from ltcl.errors import InputError
+
+try:
+    ltcl.separate(C, result.appearance, bounces=2)
+except InputError as error:
+    print(error)
+
+# %%
 # How sure are bounces?
 # ---------------------
 #
@@ -155,6 +197,7 @@ ltcl.save(folder / "T.npz", better)
 #    ltcl analyze T.npy --grid 12x24
 #    # from one format to another; .npz keeps the grid, and no further command needs it
 #    ltcl convert T.mat T.npz --grid 12x24
+#    ltcl convert camera.npy camera.npz --grid 12x24 --camera-grid 96x192
 #    ltcl compensate T.npz picture.png --resize crop --out out
 #    # a photograph of the scene in linear light, or what 'compensate' has made
 #    ltcl separate T.npz out/picture_appearance.exr --out out

@@ -8,7 +8,9 @@ and how long to expose; you take the photographs; ltcl checks each of them and m
 of your corner.
 
 There is a :doc:`checklist to print <../checklist>`. This page does the whole thing once, with a
-small simulated corner in place of yours, and then makes every mistake, to show what ltcl says.
+small simulated corner in place of yours, and then makes every mistake, to show what ltcl says. All
+of these scans have 8 x 16 pixels, as a first one by hand may have, so their pictures are coarse:
+:doc:`the next page <4_webcam>` scans 256 x 512.
 """
 
 # %%
@@ -22,8 +24,8 @@ small simulated corner in place of yours, and then makes every mistake, to show 
 #    ltcl reads JPEG, but most of the dim light that bounced is lost in it.
 # 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes
 #    does.
-# 4. Install what shows patterns on a projector, ``python -m pip install ".[projector]"``, and for
-#    raw files ``".[camera]"``. Let the projector extend the desktop of your computer, not mirror
+# 4. Install what shows patterns on a projector, the extra ``projector`` (:doc:`../install`), and
+#    for raw files ``camera``. Let the projector extend the desktop of your computer, not mirror
 #    it.
 # 5. Make a folder ``scan``, with a file ``acquisition.toml`` in it. It says how many pixels you
 #    want, and which exposures your camera has, in seconds: 0.0167 is 1/60 s. Without that line ltcl

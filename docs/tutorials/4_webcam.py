@@ -12,7 +12,7 @@ frame for old and half-changed pictures.
 # The real one
 # ------------
 #
-# Install the extras: ``pip install "ltcl[camera,projector]"``. Put this into
+# Install the extras ``camera`` and ``projector`` (:doc:`../install`). Put this into
 # ``scan/acquisition.toml``:
 #
 # .. code-block:: toml
@@ -23,7 +23,7 @@ frame for old and half-changed pictures.
 #    kind = "opencv"       # or "gphoto2" for a camera on a USB cable
 #    source = 0            # the first webcam
 #    [rig.display]
-#    grid = [24, 32]       # pixels that the projector is divided into
+#    grid = [135, 240]     # pixels that the projector is divided into
 #    index = 1             # the second display
 #
 # and then
@@ -45,8 +45,8 @@ frame for old and half-changed pictures.
 # ``channels`` (1 or 3), and ``photograph(codes, seconds)``. It shows the codes, numbers from 0 to 1
 # on the grid, waits, exposes, and gives the image back as the camera made it.
 #
-# This one has no hardware: it asks a simulated corner. Put the two lines of your display and of
-# your camera there.
+# This one has no hardware: it asks a simulated corner of 256 x 512 pixels. Put the two lines of
+# your display and of your camera there.
 
 import tempfile
 from pathlib import Path
@@ -54,18 +54,18 @@ from pathlib import Path
 import numpy as np
 
 import ltcl
-from ltcl.acquisition import Setup, VirtualRig
+from ltcl.acquisition import Report, Setup, VirtualRig
 from ltcl.plots import pictures
 
-corner = ltcl.scenes.dihedral(8, albedo=(0.8, 0.6, 0.4))
+corner = ltcl.scenes.refine(ltcl.scenes.dihedral(16, albedo=0.7), 16)
 simulated = VirtualRig(corner.transport(), corner.grid, bits=12, response="film", ambient=0.01)
 
 
 class MyRig:
     """A projector and a camera."""
 
-    projector_grid = (8, 16)
-    channels = 3
+    projector_grid = (256, 512)
+    channels = 1  # or 3, in colour
     bits = 12  # in use, of images of 16 bits
 
     def __init__(self):
@@ -82,21 +82,22 @@ class MyRig:
 
 rig = MyRig()
 store = Path(tempfile.mkdtemp()) / "corner.zarr"
-T = ltcl.acquire(rig, geometry="aligned", strategy="hadamard", store=store)
-print(
-    f"{len(rig.photographs)} photographs; T is {T.shape[0]} x {T.shape[1]} in {T.channels} colours"
-)
+T = ltcl.acquire(rig, geometry="aligned", strategy="sketch", store=store)
+print(f"{len(rig.photographs)} photographs; T is {T.shape[0]} x {T.shape[1]}")
+print(f"pictures by T are wrong by {Report.of(store).judged_error:.1%}")
 
 # %%
 # ``geometry="aligned"`` says that camera and projector have the same pixels, as here. Leave it out
 # for a real camera: then stripes (Gray code) tell which pixel of the camera sees which one of the
 # projector.
 #
-# These are four of the photographs. Patterns that light half of the pixels at a time give a better
-# T than single pixels, since every photograph has more light.
+# These are four of the photographs. Coarse and finer patterns tell the light that bounces, which is
+# smooth; the finest tell the direct light of each pixel: so these few do for 131 072 pixels. The
+# last are of pictures that T is never made from: they tell its error
+# (:doc:`../guide/photographs`).
 
-picked = np.linspace(len(rig.photographs) * 0.5, len(rig.photographs) - 1, 4).astype(int)
-figure = pictures({f"photograph {k}": rig.photographs[k] / 4095 for k in picked})
+chosen = {"a coarse pattern": 41, "a finer one": 68, "the finest": -21, "one that judges T": -5}
+figure = pictures({name: rig.photographs[k] / 4095 for name, k in chosen.items()})
 figure
 
 # %%
@@ -107,7 +108,7 @@ figure
 # shown, and photographed.
 
 setup = Setup.of(store)
-wanted = 0.2 + 0.6 * corner.sample(ltcl.scenes.landscape(240, 480))
+wanted = 0.2 + 0.6 * corner.sample(ltcl.scenes.landscape(480, 960)[..., 0])
 result = ltcl.compensate(T, wanted, gain="auto", background=setup.ambient)
 
 
@@ -122,7 +123,7 @@ exact = photograph_of(result.pattern)
 
 def view(light):
     """The corner seen from in front, as bright as the wanted picture."""
-    return corner.view(light * np.median(wanted) / np.median(light), size=320, supersample=2)
+    return corner.view(light * np.median(wanted) / np.median(light), size=480, supersample=2)
 
 
 figure = pictures(
@@ -138,7 +139,7 @@ figure
 # to the last bit; what is finished is read, and takes no photograph:
 
 before = len(rig.photographs)
-T = ltcl.acquire(rig, geometry="aligned", strategy="hadamard", store=store)
+T = ltcl.acquire(rig, geometry="aligned", strategy="sketch", store=store)
 print(f"{len(rig.photographs) - before} new photographs")
 
 # sphinx_gallery_thumbnail_number = 9

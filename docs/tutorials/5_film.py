@@ -12,8 +12,9 @@ brightness, so that nothing flickers. A run that was stopped goes on where it wa
 # -----------------
 #
 # The walls are computed here; yours come from :doc:`photographs <3_photograph_a_corner>` or from a
-# :doc:`file <2_my_matrix>`. The film is a dozen frames: the camera pans over a landscape. A folder
-# of numbered pictures is a film, and so is any video file, ``film.mp4``.
+# :doc:`file <2_my_matrix>`. Each has 256 x 256 pixels; light bounces between 32 x 32 patches of
+# it. The film is a dozen frames: the camera pans over a landscape. A folder of numbered pictures is
+# a film, and so is any video file, ``film.mp4``.
 
 import tempfile
 from pathlib import Path
@@ -21,14 +22,15 @@ from pathlib import Path
 import ltcl
 from ltcl.plots import pictures
 
-corner = ltcl.scenes.dihedral(16, albedo=[(0.8, 0.5, 0.4), (0.5, 0.7, 0.8)])
+walls = ltcl.scenes.dihedral(32, albedo=[(0.8, 0.5, 0.4), (0.5, 0.7, 0.8)])
+corner = ltcl.scenes.refine(walls, 8)
 T = corner.transport()
 
 folder = Path(tempfile.mkdtemp())
-wide = ltcl.scenes.landscape(240, 800)
+wide = ltcl.scenes.landscape(480, 1600)
 for number in range(12):
-    start = 24 * number
-    frame = 0.2 + 0.7 * corner.sample(wide[:, start : start + 480])
+    start = 48 * number
+    frame = 0.2 + 0.7 * corner.sample(wide[:, start : start + 960])
     ltcl.images.write(folder / "film" / f"{number:03}.png", frame)
 
 # %%
@@ -64,11 +66,11 @@ print(f"{done.worst.error:.1%} ({done.worst.name})")
 
 def view(light):
     """The corner as seen from in front of it."""
-    return corner.view(light, size=240, supersample=2)
+    return corner.view(light, size=480, supersample=2)
 
 
 rows = [{}, {}, {}]
-for number in (0, 4, 8, 11):
+for number in (0, 5, 11):
     frame = ltcl.images.read(folder / "film" / f"{number:03}.png")
     pattern = ltcl.images.read(patterns / f"pattern_{number + 1:06}.png")
     rows[0][f"frame {number + 1}\nprojected as it is"] = view(T @ frame)
@@ -96,12 +98,12 @@ for record in done.records[::4]:
 #    ltcl film T.npz film.mp4 --gain auto --resize crop crop --out patterns --resume
 #    # on the projector, 24 a second (extra projector)
 #    ltcl show patterns --every 0.0417
-#    # or compensated while it plays, in a window for the projector (extra view)
+#    # or compensated while it plays, in a window for the projector (extras view, film)
 #    ltcl play film.mp4 T.npz
 #    # or between other programs, as raw video
 #    ffmpeg -i film.mp4 -f rawvideo -pix_fmt rgb24 -s 640x480 - |
 #        ltcl play --pipe --video-size 640x480 --gain 0.4 - T.npz |
-#        ffplay -f rawvideo -pixel_format rgb24 -video_size 48x24 -framerate 25 -
+#        ffplay -f rawvideo -pixel_format rgb24 -video_size 512x256 -framerate 25 -
 #
 # A pattern has as many pixels as the projector's grid in T. ``ltcl show`` and ``ltcl play`` make
 # each pixel a square, where the scan had it. ``--video patterns.mkv`` writes a film for other

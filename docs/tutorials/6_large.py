@@ -4,8 +4,9 @@
 =======================
 
 T has as many numbers as the projector has pixels, times as many as the camera has. With 131 072
-pixels, 256 x 512, these are 1.7e10 numbers, 69 GB for each colour. This page shows, with a small T,
-how ltcl makes that small; and what was measured with the large one.
+pixels, 256 x 512, these are 1.7e10 numbers, 69 GB for each colour. This page shows how ltcl makes
+that small, with a T of 24 x 48 pixels, of which a computer still holds all numbers; then what was
+measured with the large one, and its pictures.
 """
 
 # %%

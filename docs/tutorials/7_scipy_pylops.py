@@ -22,7 +22,7 @@ import scipy.sparse.linalg
 import ltcl
 from ltcl.plots import pictures
 
-corner = ltcl.scenes.dihedral(16, albedo=0.8)
+corner = ltcl.scenes.refine(ltcl.scenes.dihedral(16, albedo=0.8), 16)  # 256 x 512 pixels
 T = corner.transport()
 (S,) = T.systems
 print(
@@ -36,14 +36,14 @@ print(
 # NumPy in, NumPy out. ``S @ x``, ``S.T``, sums and products of operators, ``gmres``, ``svds``,
 # ``eigs``: all run the products on the device.
 
-picture = T @ (0.2 + 0.8 * corner.sample(ltcl.scenes.landscape(240, 480)[..., 0]))
+picture = T @ (0.2 + 0.8 * corner.sample(ltcl.scenes.landscape(480, 960)[..., 0]))
 b = picture.ravel()
 
 steps = []
 x, failed = scipy.sparse.linalg.gmres(
     S, b, rtol=1e-4, callback=steps.append, callback_type="pr_norm"
 )
-ours = ltcl.solve(S, b, "gmres", rtol=1e-4)  # without a name: up to 512 pixels a factorization
+ours = ltcl.solve(S, b, "gmres", rtol=1e-4)
 print(f"SciPy's GMRES: {len(steps)} steps; ltcl's: {ours.products} products")
 print(f"difference {np.linalg.norm(x - ours.x) / np.linalg.norm(x):.1e}")
 
@@ -64,7 +64,7 @@ print(np.sort(values)[::-1].round(3))
 
 A = pylops.aslinearoperator(S)
 rows, columns = np.mgrid[: corner.grid[0], : corner.grid[1]]
-hidden = (rows + columns) % 5 < 2
+hidden = (rows + columns) % 20 < 8
 visible = np.flatnonzero(~hidden)
 camera = pylops.Restriction(b.size, visible, dtype="float32") @ A
 smooth = pylops.Laplacian(dims=corner.grid, dtype="float32")
@@ -75,7 +75,7 @@ found = pylops.optimization.leastsquares.regularized_inversion(
 
 def view(light):
     """The corner as seen from in front of it."""
-    return corner.view(np.reshape(light, corner.grid), size=320, supersample=2)
+    return corner.view(np.reshape(light, corner.grid), size=480, supersample=2)
 
 
 true = ours.x

@@ -9,20 +9,23 @@ and with the light undone that bounces between the walls.
 """
 
 # %%
-# Two scans with one camera
-# -------------------------
+# Scans with one camera
+# ---------------------
 #
-# Each projector was scanned while the other one was off, and the camera did not move. Here the
-# scans are computed: S, the light between the walls, is the same for both, and F says what a
-# projector lights. The right one is brighter and has other pixels.
+# Each projector was scanned while the other one was off, and the camera did not move. S, the light
+# between the walls, is the same for both: one full scan, on the camera's 256 x 512 pixels, tells
+# it. Of each projector only F was scanned, the light that it throws itself, by
+# ``strategy="direct"``, in some 40 photographs. Here all of this is computed. The right projector
+# is brighter and has other pixels.
 
 import numpy as np
+import scipy.sparse
 
 import ltcl
 from ltcl.plots import pictures
 
-corner = ltcl.scenes.dihedral(20, albedo=0.7)
-S = corner.transport().to_numpy() / 0.7
+corner = ltcl.scenes.refine(ltcl.scenes.dihedral(16, albedo=0.7), 16)
+scene = corner.transport()
 height, width = corner.grid
 
 
@@ -32,29 +35,36 @@ def direct_light(grid, left, right, brightness):
     def weights(camera, begin, end, pixels):
         place = (np.arange(camera) + 0.5) / camera
         at = (place - begin) / (end - begin) * pixels - 0.5
-        return np.exp(-0.5 * ((at[:, None] - np.arange(pixels)) / 0.5) ** 2) / (0.5 * 2.507)
+        blur = np.exp(-0.5 * ((at[:, None] - np.arange(pixels)) / 0.7) ** 2) / (0.7 * 2.507)
+        return scipy.sparse.csr_array(np.where(blur > 1e-4, blur, 0.0))
 
     rows = weights(height, -0.05, 1.05, grid[0])
     columns = weights(width, left, right, grid[1])
-    return brightness * np.kron(rows, columns)
+    F = scipy.sparse.csr_array(brightness * scipy.sparse.kron(rows, columns))
+    return ltcl.Transport(F, grid, camera_grid=corner.grid)
 
 
-scans = []
-for grid, left, right, brightness in (((22, 29), -0.05, 0.65, 0.7), ((26, 34), 0.35, 1.05, 0.9)):
-    F = direct_light(grid, left, right, brightness)
-    scans.append(ltcl.Transport((S @ F).astype(np.float32), grid, camera_grid=corner.grid))
+grids = [(200, 280), (230, 320)]
+direct = [direct_light(grids[0], -0.05, 0.65, 0.7), direct_light(grids[1], 0.35, 1.05, 0.9)]
 
-whites = {"left": scans[0] @ np.ones(scans[0].grid), "right": scans[1] @ np.ones(scans[1].grid)}
-figure = pictures({name: corner.view(white / 1.5) for name, white in whites.items()})
+
+def on_the_walls(light):
+    """The walls (h, w) under direct light and all that bounces."""
+    return scene @ (light / 0.7)
+
+
+whites = [on_the_walls(F @ np.ones(F.grid)) for F in direct]
+figure = pictures({"left": corner.view(whites[0] / 1.5), "right": corner.view(whites[1] / 1.5)})
 figure
 
 # %%
 # As one
 # ------
 #
-# The two need nothing else: where they overlap is in their scans.
+# Where the two overlap is in their scans. Of small projectors with full scans,
+# ``ltcl.combine([T_left, T_right])`` finds S by itself.
 
-T = ltcl.combine(scans)
+T = ltcl.combine(direct, scene=scene)
 print(T)
 print(T.gamut)
 
@@ -65,7 +75,7 @@ print(T.gamut)
 # What the camera is to see is given on its own grid. There is a pattern for each projector; both
 # fade out towards where the other one goes on alone.
 
-desired = 0.25 + 0.4 * corner.sample(ltcl.scenes.landscape(240, 480)[..., 1])
+desired = 0.15 + 0.8 * corner.sample(ltcl.scenes.landscape(480, 960)[..., 1])
 c = ltcl.compensate(T, desired, gain="auto")
 left, right = c.patterns
 print(f"error {c.error:.1%} at {c.gain:.0%} of the brightness")
@@ -85,27 +95,29 @@ figure
 # A nudge
 # -------
 #
-# How soft are the seams? Let the left projector slip by half a pixel. What a careless cut down the
-# middle would show is beside it.
+# How soft are the seams? Let the left projector slip by half of its pixels. What a careless cut
+# down the middle would show is beside it.
 
-F = direct_light(scans[0].grid, -0.05 + 0.012, 0.65 + 0.012, 0.7)
-slipped = ltcl.Transport((S @ F).astype(np.float32), scans[0].grid, camera_grid=corner.grid)
+slip = 0.5 * 0.7 / 280
+slipped = direct_light(grids[0], -0.05 + slip, 0.65 + slip, 0.7)
 even = np.full(corner.grid, 0.5)
 
 
 def after(T):
+    """The walls under patterns for an even picture, when the left projector has slipped."""
     left, right = ltcl.compensate(T, even).patterns
-    return slipped @ left + scans[1] @ right
+    return on_the_walls(slipped @ left + direct[1] @ right)
 
 
-columns = [np.linspace(-0.05, 0.65, 29), np.linspace(0.35, 1.05, 34)]
+columns = [np.linspace(-0.05, 0.65, 280), np.linspace(0.35, 1.05, 320)]
 cut = [
-    np.broadcast_to((columns[0] < 0.45) * 1.0, scans[0].grid),
-    np.broadcast_to((columns[1] > 0.45) * 1.0, scans[1].grid),
+    np.broadcast_to((columns[0] < 0.45) * 1.0, grids[0]),
+    np.broadcast_to((columns[1] > 0.45) * 1.0, grids[1]),
 ]
-shown = {"shared": after(T), "cut": after(ltcl.combine(scans, blend=cut))}
+shown = {"shared": after(T), "cut": after(ltcl.combine(direct, scene=scene, blend=cut))}
 for name, picture in shown.items():
-    print(f"{name}: {np.ptp(picture[10, 12:18]) / 0.5:.1%} of the brightness, side by side")
+    row = picture[height // 2, 160:256]
+    print(f"{name}: {np.ptp(row) / 0.5:.1%} of the brightness, side by side")
 figure = pictures({name: corner.view(1.4 * picture) for name, picture in shown.items()})
 figure
 
@@ -129,7 +141,7 @@ figure
 # Keep it, and look at it
 # -----------------------
 #
-# ``ltcl.save("both.npz", T)`` keeps both scans and how they share their light; ``ltcl view
+# ``ltcl.save("both.npz", T)`` keeps the scans and how both share their light; ``ltcl view
 # both.npz`` shows them in the browser, with both patterns side by side. Weights, black and colours
 # stand in :doc:`../guide/projectors`.
 

@@ -8,8 +8,10 @@
 // columns, the first by get_group_id(2). It leaves partial sums at [slice][sum][column], which
 // every group of the next kernel adds up, in one order, with the same get_num_groups(0).
 //
-// `scratch` holds a real a work-item and those that a kernel names. Optional define: ADJACENT, 1 or
-// 0.
+// With -DPLANES=1 columns stand one below the other, as the colours of one picture do.
+//
+// `scratch` holds a real a work-item and those that a kernel names. Optional defines: ADJACENT and
+// PLANES, 1 or 0.
 
 #ifndef LTCL_COLUMNS_H
 #define LTCL_COLUMNS_H
@@ -18,6 +20,9 @@
 
 #ifndef ADJACENT
 #define ADJACENT 1
+#endif
+#ifndef PLANES
+#define PLANES 0
 #endif
 
 // The part of a work-item: values first, first + step, ... below end, in the rows row, row + rows,
@@ -41,9 +46,13 @@ INLINE share columns_share(int rows, int k)
     const int height = (rows + parts - 1) / parts;
     s.row = ADJACENT ? min(part * height, rows) : part;
     s.rows = ADJACENT ? 1 : parts;
-    s.end = (ADJACENT ? min(s.row + height, rows) : rows) * k;
-    s.first = me < together * s.width ? s.row * k + s.origin + s.column : s.end;
-    s.step = s.rows * k;
+    const int last = ADJACENT ? min(s.row + height, rows) : rows;
+    const int column = s.origin + s.column;
+    s.end = PLANES ? column * rows + last : last * k;
+    s.first = PLANES ? column * rows + s.row : s.row * k + column;
+    if (me >= together * s.width)
+        s.first = s.end;
+    s.step = PLANES ? s.rows : s.rows * k;
     return s;
 }
 

@@ -12,7 +12,10 @@
     updating/     a finished scan carried over by 12 photographs, after a nudge
     agreement     photographs that deviate from the others are refused by number; `anchor`: did
                   anything move?
-    project       an acquisition as a folder with an acquisition.toml
+    project       an acquisition as a folder with an acquisition.toml, whose tables `project_file`
+                  checks
+    several       the scans of several projectors one by one, onto pixels that they share, which
+                  projectors/ has
 
 Codes in [0, 1] are fed to a projector and come from a camera; they are not linear in light.
 """
@@ -25,6 +28,7 @@ from ltcl.acquisition.captures import Capture, PhotographOrder, import_gray_code
 from ltcl.acquisition.estimation.fit import Fit, fit
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.project import Project
+from ltcl.acquisition.projectors import CombinedSetup, combine_scans
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import (
     Display,
@@ -45,6 +49,7 @@ __all__ = [
     "Alignment",
     "Calibration",
     "Capture",
+    "CombinedSetup",
     "Correspondence",
     "Display",
     "Fit",
@@ -65,6 +70,7 @@ __all__ = [
     "acquire",
     "align",
     "camera_map",
+    "combine_scans",
     "finalize",
     "fit",
     "import_gray_code",

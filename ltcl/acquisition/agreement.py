@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from ltcl.acquisition.radiometry import NoiseModel, Response
+from ltcl.acquisition.rig import shot_key
 from ltcl.errors import AcquisitionError
 
 # Systematic errors, relative to light and to full scale.
@@ -155,9 +156,14 @@ def find_deviation(
 
 @dataclass(frozen=True, kw_only=True)
 class _RecordedPhotograph:
-    """Codes, seconds and number of a photograph, and its image at some pixels."""
+    """Pattern, seconds and number of a photograph, and its image at some pixels.
 
-    codes: np.ndarray
+    `pattern` is the key of its codes, which need not stay in memory, `inverse` that of the inverse
+    pattern, if they are 0 and 1.
+    """
+
+    pattern: str
+    inverse: str | None
     seconds: float
     sample: np.ndarray
     number: int
@@ -167,7 +173,7 @@ class AgreementRecord:
     """Photographs of a calibration, at some pixels, to be compared when its noise is known."""
 
     def __init__(self) -> None:
-        self._by_pattern: dict[bytes, list[_RecordedPhotograph]] = defaultdict(list)
+        self._by_pattern: dict[str, list[_RecordedPhotograph]] = defaultdict(list)
         self._by_exposure: dict[float, list[_RecordedPhotograph]] = defaultdict(list)
 
     def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
@@ -178,8 +184,15 @@ class AgreementRecord:
         self, codes: np.ndarray, seconds: float, sample: np.ndarray, number: int
     ) -> None:
         """Record one photograph by its values (n, c) at the pixels of `sample`."""
-        photograph = _RecordedPhotograph(codes=codes, seconds=seconds, sample=sample, number=number)
-        self._by_pattern[codes.tobytes()].append(photograph)
+        is_binary = bool(np.all((codes == 0) | (codes == 1)))
+        photograph = _RecordedPhotograph(
+            pattern=shot_key(codes),
+            inverse=shot_key(1.0 - codes) if is_binary else None,
+            seconds=seconds,
+            sample=sample,
+            number=number,
+        )
+        self._by_pattern[photograph.pattern].append(photograph)
         self._by_exposure[seconds].append(photograph)
 
     def check(self, camera: CameraModel, name: PhotographName = name_by_number) -> None:
@@ -212,7 +225,7 @@ def _deviation_of_inverses(
     """Patterns and inverses, at one exposure, that do not add up to the same as the others."""
     first = []
     for k, (photograph, following) in enumerate(pairwise(group)):
-        if _are_inverse(photograph.codes, following.codes):
+        if photograph.inverse == following.pattern:
             first.append(k)
     if len(first) < 3:
         return None
@@ -237,13 +250,6 @@ def _deviation_of_inverses(
         cause="deviates: a pattern and its inverse must add up to white, as the other ones do "
         "(is a dynamic contrast on?)",
     )
-
-
-def _are_inverse(a: np.ndarray, b: np.ndarray) -> bool:
-    """True for codes of 0 and 1 of a pattern and its inverse."""
-    if a.shape != b.shape:
-        return False
-    return bool(np.all(a + b == 1.0) and np.all(a * b == 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)

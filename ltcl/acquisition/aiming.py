@@ -47,7 +47,7 @@ MAX_SATURATED_SHARE = 0.001
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reading:
-    """What the camera sees of the projector.
+    """The camera's view of the projector, in figures.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Reading:
 
     @property
     def advice(self) -> list[str]:
-        """What should be better, each in a line."""
+        """Advice on what should be better, each in a line."""
         lines = []
         if self.saturated > MAX_SATURATED_SHARE:
             lines.append(f"{self.saturated:.1%} of the lit area are saturated: expose shorter")
@@ -142,8 +142,8 @@ class Aim:
         photographs = [self._shots.photograph(pattern, seconds) for pattern in patterns]
         reading = read_patterns(photographs, seconds)
         if not MIN_WHITE_CODE <= reading.brightness <= MAX_WHITE_CODE:
-            wanted = seconds * exposure_factor(reading.brightness)
-            self._seconds = nearest(self._shots.exposures, wanted)
+            better_exposure = seconds * exposure_factor(reading.brightness)
+            self._seconds = nearest(self._shots.exposures, better_exposure)
         return reading
 
 

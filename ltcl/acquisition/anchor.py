@@ -107,7 +107,9 @@ class Anchor:
         `codes` and the ambient light `room` are those at `pixels`, (n, c); `gain` is that of the
         lamp since then.
         """
-        value = self.value if gain == 1.0 else room + gain * (self.value - room)
+        value = self.value
+        if gain != 1.0:
+            value = room + gain * (self.value - room)
         known = value, self.variance
         return find_deviation([codes], [seconds], camera, known)
 

@@ -112,17 +112,28 @@ class Effort:
     ramp_pixels: int
     codes: tuple[float, ...]
 
-    def ramps(self, grid: tuple[int, int], camera_pixels: int) -> list[np.ndarray]:
-        """Codes from 0 to 1 along the longer side, each shifted further."""
-        height, width = grid
+    def ramps(
+        self, grid: tuple[int, int], camera_pixels: int, lit: np.ndarray | None = None
+    ) -> list[np.ndarray]:
+        """Codes from 0 to 1 along the longer side of what is lit, each shifted further.
+
+        `lit` (h, w) are the pixels that the projector lights; None: all.
+        """
+        if lit is None:
+            lit = np.ones(grid, bool)
+        rows, columns = _lit_box(lit)
+        height = rows.stop - rows.start
+        width = columns.stop - columns.start
         count = min(-(-self.ramp_pixels // camera_pixels), MAX_RAMPS)
-        codes = np.linspace(0.0, 1.0, max(grid), dtype=np.float32)
+        codes = np.linspace(0.0, 1.0, max(height, width), dtype=np.float32)
         ramps = []
         for k in range(count):
             shifted = np.roll(codes, k * len(codes) // count)
             if width < height:
                 shifted = shifted[:, None]
-            ramps.append(np.broadcast_to(shifted, grid).copy())
+            ramp = np.zeros(grid, np.float32)
+            ramp[rows, columns] = shifted
+            ramps.append(ramp)
         return ramps
 
     def repeats(self, frames: int, camera_pixels: float) -> int:
@@ -152,17 +163,27 @@ class Effort:
             count = 1 if is_single else repeats
             bright_requests += _repeated(white, [seconds], count)
         codes = self.codes
-        lit_channels = [white]
+        colours = [np.float32(1.0)]
+        shape = grid
         if channels == 3:
             codes = (*codes, 1.0)
-            colours = np.eye(3, dtype=np.float32)
-            lit_channels = [white[..., None] * colour for colour in colours]
+            colours = list(np.eye(3, dtype=np.float32))
+            shape = (*grid, 3)
         groups = [blocks[:1], dark_requests, bright_requests]
-        for channel in lit_channels:
-            groups.append([(np.float32(code) * channel, times.black[0]) for code in codes])
+        for colour in colours:
+            # Views: the codes of many pixels in all colours would fill the memory.
+            uniform = [np.broadcast_to(np.float32(code) * colour, shape) for code in codes]
+            groups.append([(pattern, times.black[0]) for pattern in uniform])
         few = anchor.sparse_pattern(grid)
         others = 1.0 - few
         return [*groups, [(few, times.black[0])], blocks, [(others, times.black[0])]]
+
+
+def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:
+    """The rows and the columns from the first lit pixel to the last."""
+    rows = np.flatnonzero(lit.any(axis=1))
+    columns = np.flatnonzero(lit.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def _repeated(codes: np.ndarray, times: Sequence[float], count: int) -> list[Request]:
@@ -288,10 +309,7 @@ def measure(
     before, dark, bright, *uniform, few, after, others = session.take(requests)
 
     # 4. Noise and offset of the camera; then photographs can be compared.
-    of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
-    consistency.check_black(session, of_white_exposure)
-    shown = {photograph.seconds: photograph.sampled for photograph in bright}
-    check_full_scale(shots, list(shown), list(shown.values()))
+    _check_black_and_white(session, dark, bright, white_exposure)
     with session.naming_photographs():
         session.camera = _measure_camera(session, dark, bright)
     session.check_agreement()
@@ -378,7 +396,7 @@ def _response_from_ramps(
     longest = white_exposure * RESPONSE_SPAN
     times = [*offered_exposures(shots, bracket(shortest, longest, effort.exposures))]
     height, width = shots.camera_grid or (0, 0)
-    ramps = effort.ramps(shots.grid, height * width)
+    ramps = effort.ramps(shots.grid, height * width, getattr(shots.rig, "lit", None))
     if times[0] * MIN_DARK_RATIO > white_exposure:
         ramps.append(np.zeros(shots.grid, np.float32))
     exposed = session.take([[(ramp, seconds) for ramp in ramps] for seconds in times])
@@ -404,15 +422,24 @@ def _expose_dark_colours(
     exposed: list[list[Photograph]],
 ) -> None:
     """Add longer exposures of the ramps, until every colour reaches the last code."""
-    longer = [times[-1] * 2.0**k for k in range(1, MAX_EXTRA_EXPOSURES + 1)]
-    lit = [k for k, ramp in enumerate(ramps) if ramp.any()]
-    for seconds in offered_exposures(session.shots, longer):
-        image = _side_by_side([exposed[-1][k] for k in lit], hot)
-        darkest_colour = np.quantile(image, 1.0 - SATURATED_SHARE, axis=(0, 1)).min()
-        if seconds <= times[-1] or darkest_colour >= SATURATED_CODE:
+    longer = times[-1] * 2.0 ** np.arange(1, MAX_EXTRA_EXPOSURES + 1)
+    for seconds in offered_exposures(session.shots, longer.tolist()):
+        if seconds <= times[-1] or _are_saturated(ramps, exposed[-1], hot):
             return
         times.append(seconds)
         exposed += session.take([[(ramp, seconds) for ramp in ramps]])
+
+
+def _are_saturated(
+    ramps: Sequence[np.ndarray], photographs: Sequence[Photograph], hot: np.ndarray
+) -> bool:
+    """True if the photographs of ramps reach the last code in every colour."""
+    lit = []
+    for ramp, photograph in zip(ramps, photographs, strict=True):
+        if ramp.any():
+            lit.append(photograph)
+    brightest = np.quantile(_side_by_side(lit, hot), 1.0 - SATURATED_SHARE, axis=(0, 1))
+    return bool(brightest.min() >= SATURATED_CODE)
 
 
 def _side_by_side(photographs: Sequence[Photograph], hot: np.ndarray) -> np.ndarray:
@@ -472,6 +499,19 @@ def _measure_geometry(
         light=light,
         mapping=StoredMap.of(geometry, session.file),
     )
+
+
+def _check_black_and_white(
+    session: CaptureSession,
+    dark: Sequence[Photograph],
+    bright: Sequence[Photograph],
+    white_exposure: float,
+) -> None:
+    """Check that black does not change, and that white reaches the full scale of the camera."""
+    of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
+    consistency.check_black(session, of_white_exposure)
+    by_exposure = {photograph.seconds: photograph.sampled for photograph in bright}
+    check_full_scale(session.shots, list(by_exposure), list(by_exposure.values()))
 
 
 def _measure_camera(

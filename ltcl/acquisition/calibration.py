@@ -77,7 +77,7 @@ class Calibration:
         Light (H, W[, 3]) of a black projector, and what a white one adds; large pictures are in a
         temporary file.
     projector : Response
-        From codes to light of the projector.
+        The projector's response: light of each code.
     mixing : ndarray, optional
         How its colours mix, (3, 3); None with one channel.
     resampling : Resampling
@@ -123,7 +123,7 @@ class Calibration:
 
         FileError if it has none, or is damaged.
         """
-        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        scan = BlockStore.of(store)
         names = [name for name in scan.extras if name.startswith(PREFIX)]
         if not names:
             raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
@@ -189,10 +189,10 @@ def stored_map(store: BlockStore) -> Correspondence:
 
     FileError if it was made before maps were kept.
     """
-    parts = _parts(name for name in store.extras if name.startswith(PREFIX + MAP))
+    extras = _extras_of_arrays(store, MAP)
     grid = np.shape(store.extra(f"{PREFIX}resampling.coverage"))
     height, width = grid
-    if not parts:
+    if not extras:
         camera_grid = np.array(store.extra(f"{PREFIX}resampling.camera_grid")).tolist()
         if store.attributes["settings"]["geometry"] != "aligned" or camera_grid != [*grid]:
             raise FileError(
@@ -200,8 +200,8 @@ def stored_map(store: BlockStore) -> Correspondence:
                 "ltcl.acquire keeps it now: scan again"
             )
         return Correspondence.aligned((height, width))
-    x = _joined(store, parts[f"{MAP}x"])
-    y = _joined(store, parts[f"{MAP}y"])
+    x = _joined(store, extras[f"{MAP}x"])
+    y = _joined(store, extras[f"{MAP}y"])
     return Correspondence(x, y, np.isfinite(x), (height, width))
 
 
@@ -221,40 +221,48 @@ def _write_parts(
         store.extra(f"{PREFIX}{name}{PART}{number}", read(slice(top, min(top + step, length))))
 
 
-def _parts(names: Iterable[str]) -> dict[str, list[str]]:
+def _extras_of_arrays(store: BlockStore, prefix: str) -> dict[str, list[str]]:
+    """Extra arrays of the arrays that begin with `prefix`, by their names without `PREFIX`."""
+    return _group_strips(name for name in store.extras if name.startswith(PREFIX + prefix))
+
+
+def _group_strips(names: Iterable[str]) -> dict[str, list[str]]:
     """The extra arrays of each array of a calibration, in order, by its name without `PREFIX`."""
     numbered: dict[str, dict[int, str]] = {}
     for name in names:
         array, _, number = name.removeprefix(PREFIX).partition(PART)
         numbered.setdefault(array, {})[int(number or 0)] = name
-    return {array: [parts[k] for k in sorted(parts)] for array, parts in numbered.items()}
+    grouped = {}
+    for array, strips in numbered.items():
+        grouped[array] = [strips[number] for number in sorted(strips)]
+    return grouped
 
 
 def _small_arrays(store: BlockStore, names: Iterable[str]) -> dict[str, np.ndarray]:
     """The arrays of a calibration but pictures, by their names without `PREFIX`."""
     arrays = {}
-    for name, parts in _parts(names).items():
+    for name, strips in _group_strips(names).items():
         if name.startswith(PICTURES):
             continue
-        first = np.array(store.extra(parts[0]))
-        if len(parts) > 1:
-            first = _joined(store, parts)
-        arrays[name] = first
+        if len(strips) == 1:
+            arrays[name] = np.array(store.extra(strips[0]))
+        else:
+            arrays[name] = _joined(store, strips)
     return arrays
 
 
-def _joined(store: BlockStore, parts: list[str]) -> np.ndarray:
-    """One array of several, which are never in memory together."""
+def _joined(store: BlockStore, names: list[str]) -> np.ndarray:
+    """Join arrays of a store one below the other, without having all in memory."""
     file = ImageFile()
-    stored = []
-    for part in parts:
-        stored.append(file.append(np.array(store.extra(part))))
-    length = sum(part.shape[0] for part in stored)
-    joined = np.empty((length, *stored[0].shape[1:]), stored[0].dtype)
+    strips = []
+    for name in names:
+        strips.append(file.append(np.array(store.extra(name))))
+    length = sum(strip.shape[0] for strip in strips)
+    joined = np.empty((length, *strips[0].shape[1:]), strips[0].dtype)
     top = 0
-    for part in stored:
-        joined[top : top + part.shape[0]] = part.read()
-        top += part.shape[0]
+    for strip in strips:
+        joined[top : top + strip.shape[0]] = strip.read()
+        top += strip.shape[0]
     return joined
 
 
@@ -280,23 +288,21 @@ def _write_radiance(store: BlockStore, prefix: str, light: RadiancePicture) -> N
 
 def _read_radiance(store: BlockStore, prefix: str) -> RadiancePicture:
     """A picture of a store; a large one in a temporary file."""
-    parts = _parts(name for name in store.extras if name.startswith(PREFIX + prefix))
-    names = [f"{prefix}{name}" for name in ("value", "variance", "valid")]
-    if all(len(parts[name]) == 1 for name in names):
-        return Radiance(*(np.array(store.extra(parts[name][0])) for name in names))
+    extras = _extras_of_arrays(store, prefix)
+    names = [extras[prefix + name] for name in ("value", "variance", "valid")]
+    if max(map(len, names)) == 1:
+        value, variance, valid = (np.array(store.extra(name)) for [name] in names)
+        return Radiance(value, variance, valid)
     file = ImageFile()
-    pictures = []
-    for name in names:
-        shapes = []
-        stored = []
-        for part in parts[name]:
-            rows = store.extra(part)
-            stored.append(file.append(rows))
-            shapes.append(rows.shape)
-        height = sum(shape[0] for shape in shapes)
-        pictures.append(replace(stored[0], shape=(height, *shapes[0][1:])))
-    values, variances, validity = pictures
+    values, variances, validity = (_copy_to_file(store, strips, file) for strips in names)
     return StoredRadiance(values=values, variances=variances, validity=validity)
+
+
+def _copy_to_file(store: BlockStore, names: list[str], file: ImageFile) -> StoredImage:
+    """Strips of a picture, one behind the other in a file, as one image."""
+    strips = [file.append(store.extra(name)) for name in names]
+    height = sum(strip.shape[0] for strip in strips)
+    return replace(strips[0], shape=(height, *strips[0].shape[1:]))
 
 
 def _resampling_arrays(resampling: Resampling) -> dict[str, np.ndarray]:
@@ -349,7 +355,7 @@ class Setup:
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Setup:
         """Read the set-up in a store of `ltcl.acquire`; FileError as from `Calibration.of`."""
-        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        scan = BlockStore.of(store)
         calibration = Calibration.of(scan)
         side = 1
         if scan.attributes.get("strategy") == "block":
@@ -365,6 +371,16 @@ class Setup:
     def channels(self) -> int:
         """1 or 3."""
         return len(self.calibration.offset)
+
+    @property
+    def response(self) -> Response:
+        """The projector's response: light of each code."""
+        return self.calibration.projector
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """(h, w) of the codes of the projector."""
+        return self.blocks.pixels
 
     @property
     def ambient(self) -> np.ndarray:
@@ -396,7 +412,8 @@ class Setup:
         """
         random = np.random.default_rng(0)
         is_on = random.random((COMPARED_PATTERNS, *T.grid)) < 0.5
-        patterns = is_on.astype(np.float32)
+        # A rig of one of several projectors does not light all pixels.
+        patterns = (is_on & getattr(rig, "lit", True)).astype(np.float32)
         black = self._picture(rig, np.zeros_like(patterns[0]))
         estimated = []
         expected = []

@@ -66,7 +66,8 @@ MAX_PROBES = 10
 
 def offered_exposures(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
     """The exposures of a camera nearest to `seconds`: ascending, each once."""
-    return tuple(sorted({nearest(shots.exposures, t) for t in seconds}))
+    offered = {nearest(shots.exposures, exposure) for exposure in seconds}
+    return tuple(sorted(offered))
 
 
 def unsaturated_exposure(shots: Shots, seconds: float) -> float:
@@ -178,16 +179,16 @@ def upper_quantile(
     4.0
     """
     place = (count - 1) * quantile
-    kept = count - math.floor(place)
+    top_count = count - math.floor(place)
     largest = np.empty(0, np.float32)
     for strip in strips:
         values = strip.ravel()
-        if len(largest) == kept:
+        if len(largest) == top_count:
             values = values[values > largest.min()]
         largest = np.concatenate([largest, values])
-        if len(largest) > kept:
-            largest = np.partition(largest, len(largest) - kept)[len(largest) - kept :]
-    ends = np.sort(np.partition(largest, min(1, kept - 1))[:2])
+        if len(largest) > top_count:
+            largest = np.partition(largest, len(largest) - top_count)[len(largest) - top_count :]
+    ends = np.sort(np.partition(largest, min(1, top_count - 1))[:2])
     return float(np.quantile(ends, place - math.floor(place), method=method))
 
 
@@ -245,8 +246,12 @@ def check_full_scale(shots: Shots, seconds: Sequence[float], images: Sequence[np
     `images` (H, W[, c]) in [0, 1] are of one scene for so many seconds.
     """
     for c in range(shots.channels):
-        planes = [sample(image)[:, c] for image in images]
-        levels = [float(np.quantile(plane, BRIGHT_QUANTILE)) for plane in planes]
+        planes = []
+        levels = []
+        for image in images:
+            plane = sample(image)[:, c]
+            planes.append(plane)
+            levels.append(float(np.quantile(plane, BRIGHT_QUANTILE)))
         for a, b in combinations(np.argsort(seconds), 2):
             ratio = seconds[b] / seconds[a]
             is_below_full = levels[a] > MIN_BRIGHT_CODE and levels[b] < SATURATED_CODE

@@ -11,16 +11,18 @@
 Keys of [rig] are arguments of its class, those of [acquire] of `ScanSettings`; "none" stands for
 None. A virtual rig has the files `transport` and `camera_map`, a live one the tables [rig.camera],
 of kind "opencv" or "gphoto2", and [rig.display].
+
+Several projectors are tables [[projector]], each with a `name` and the keys of [rig] that are its
+own; [rig] has those that all have in common, and [scene] the `side` of the pixels of T in camera
+pixels. Each is a `Project` of its own with the same folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-import inspect
 import math
 import os
-import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,25 @@ from ltcl import checks
 from ltcl.acquisition import rigs
 from ltcl.acquisition.calibration import Calibration, is_calibrated
 from ltcl.acquisition.metering import expected_exposures
+from ltcl.acquisition.project_file import (
+    CAMERAS,
+    check_rig,
+    check_side,
+    check_table,
+    check_tables,
+    projector_tables,
+    read_toml,
+    settings_of_several,
+)
+from ltcl.acquisition.projectors import (
+    ProjectorView,
+    Warp,
+    WarpedRig,
+    camera_geometry,
+    read_view,
+)
+from ltcl.acquisition.projectors.combined import MAP_SUFFIX
+from ltcl.acquisition.projectors.warp import default_side, scene_grid
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import RigError, Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
@@ -38,23 +59,11 @@ from ltcl.acquisition.rigs.simulated import CURVES, Sensor
 from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.settings import ScanSettings
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
-from ltcl.files import as_path, input_file
+from ltcl.files import as_path
 from ltcl.store import BlockStore, StoreRecord, formats, load
 
 FILE = "acquisition.toml"
 STORE = "transport.zarr"
-RIGS: dict[str, Any] = {
-    "virtual": rigs.VirtualRig,
-    "mitsuba": rigs.MitsubaRig,
-    "folder": rigs.FolderRig,
-    "live": rigs.LiveRig,
-}
-CAMERAS: dict[str, Any] = {
-    "opencv": rigs.OpenCVCamera,
-    "gphoto2": rigs.GPhoto2Camera,
-}
-# Arguments of rigs that are objects, which no file has.
-OBJECT_ARGUMENTS = frozenset({"T", "folder"})
 # Electrons at full scale of a camera without photon noise.
 NOISELESS_ELECTRONS = 1e9
 # Codes at which the curve of a known response is tabulated.
@@ -84,6 +93,10 @@ class Project:
         The table [rig].
     settings : dict
         The table [acquire], arguments of `ltcl.acquire` and fields of `ScanSettings`.
+    name : str
+        Of one of several projectors; else empty.
+    side : int, optional
+        Camera pixels along a side of a pixel of T, for several projectors; None: chosen.
 
     Examples
     --------
@@ -107,40 +120,99 @@ class Project:
     folder: Path
     table: dict[str, Any]
     settings: dict[str, Any]
+    name: str = ""
+    side: int | None = None
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str]) -> Project:
-        """Read and check the file of a folder.
+    def open(cls, folder: str | os.PathLike[str], projector: str | None = None) -> Project:
+        """Read and check the file of a folder; with several projectors take one by its name.
 
-        FileError if the folder has none, or it is not valid TOML; InputError for its keys.
+        FileError if the folder has none, or it is not valid TOML; InputError for its keys, and for
+        a projector that is needed and not named, or is not there.
+        """
+        projects = cls.open_all(folder)
+        path = as_path(folder) / FILE
+        names = [project.name for project in projects]
+        if projector is None and len(projects) > 1:
+            raise InputError(
+                f"{path}: has the projectors {', '.join(names)}; name one (--projector NAME), or "
+                "make one transport of all with 'ltcl combine'"
+            )
+        for project in projects:
+            if projector in (None, project.name):
+                return project
+        has = "has no [[projector]]"
+        if names[0]:
+            has = f"has the projectors {', '.join(names)}"
+        raise InputError(f"projector is {projector!r}; {path} {has}")
+
+    @classmethod
+    def open_all(cls, folder: str | os.PathLike[str]) -> tuple[Project, ...]:
+        """Read and check the file of a folder: one project, or one for each projector.
+
+        Errors are those of `open`.
         """
         folder = as_path(folder)
         path = folder / FILE
-        content = _read_toml(path)
-        for name, value in content.items():
-            if name not in ("rig", "acquire") or not isinstance(value, dict):
-                raise InputError(
-                    f"{path}: has {name!r}; it must have the tables [rig] and [acquire] only"
-                )
-        table = _check_kind(path, "rig", content.get("rig"), RIGS)
-        if table["kind"] == "live":
-            camera = table["camera"]
-            display = table["display"]
-            table["camera"] = _check_kind(path, "rig.camera", camera, CAMERAS)
-            table["display"] = _check_table(path, "rig.display", display, rigs.Display)
+        content = read_toml(path)
+        check_tables(path, content)
         settings = content.get("acquire", {})
-        settings = _check_table(path, "acquire", settings, ScanSettings)
-        project = cls(folder, table, settings)
+        settings = check_table(path, "acquire", settings, ScanSettings)
+        if "projector" not in content:
+            if "scene" in content:
+                raise InputError(f"{path}: has [scene], but no [[projector]], whose T it is about")
+            projects = [cls(folder, check_rig(path, "rig", content.get("rig")), settings)]
+        else:
+            settings = settings_of_several(path, settings)
+            side = check_side(path, content.get("scene", {}))
+            projects = []
+            for name, table in projector_tables(path, content).items():
+                rig = check_rig(path, f"projector {name}", table)
+                projects.append(cls(folder, rig, settings, name, side))
         curve = settings.get("response")
         if curve is not None:
-            with project.naming("acquire"):
+            with projects[0].naming("acquire"):
                 settings["response"] = _known_response(curve)
-        return project
+        return tuple(projects)
 
     @property
     def store(self) -> Path:
         """Folder of the transport."""
-        return self.folder / STORE
+        return self.folder / (f"{self.name}.zarr" if self.name else STORE)
+
+    @property
+    def view_path(self) -> Path:
+        """File of the map of one of several projectors."""
+        return self.folder / f"{self.name}{MAP_SUFFIX}"
+
+    @property
+    def check_path(self) -> Path:
+        """File that says that the camera did not move before the scan of this projector."""
+        return self.folder / f"{self.name}.check.json"
+
+    @property
+    def rig_folder(self) -> Path:
+        """Folder of the patterns and photographs of a folder rig."""
+        return self.folder / self.name if self.name else self.folder
+
+    def view(self) -> ProjectorView | None:
+        """The map of one of several projectors; None before it is measured."""
+        return read_view(self.view_path) if self.view_path.exists() else None
+
+    def scan_side(self, camera_grid: tuple[int, int]) -> int:
+        """Camera pixels along a side of a pixel of T."""
+        return default_side(camera_grid) if self.side is None else self.side
+
+    def scan_settings(self, camera_grid: tuple[int, int]) -> dict[str, Any]:
+        """Arguments of `ltcl.acquire`: those of the file, and the geometry of several projectors.
+
+        All have the pixels of T, of `scan_side`, in common.
+        """
+        if not self.name:
+            return self.settings
+        with self.naming("scene"):
+            geometry = camera_geometry(camera_grid, self.scan_side(camera_grid))
+        return {**self.settings, "geometry": geometry}
 
     @property
     def kind(self) -> str:
@@ -162,7 +234,12 @@ class Project:
 
     @contextlib.contextmanager
     def rig(
-        self, *, closed: bool = False, aligned: bool = False, photographs: Path | None = None
+        self,
+        *,
+        closed: bool = False,
+        aligned: bool = False,
+        photographs: Path | None = None,
+        own_pixels: bool = False,
     ) -> Iterator[Any]:
         """The rig, which is closed at the end of the block.
 
@@ -174,15 +251,20 @@ class Project:
             Photograph a virtual rig on the pixels that its transport has.
         photographs : Path, optional
             Folder of patterns and photographs of a folder rig, instead of that of the acquisition.
+        own_pixels : bool
+            Take patterns on the projector's own pixels; else one of several projectors, whose map
+            is measured, takes those on the pixels of T.
         """
         table = dict(self.table)
-        if aligned:
+        view = None if own_pixels or not self.name else self.view()
+        if aligned and view is None:
             table.pop("camera_map", None)
             table.pop("camera_grid", None)
         with self.naming("rig"):
             try:
-                if self.kind == "folder" and photographs is not None:
-                    rig = _make_rig(photographs, table, closed)
+                if self.kind == "folder":
+                    place = self.rig_folder if photographs is None else photographs
+                    rig = _make_rig(place, table, closed)
                 else:
                     rig = _make_rig(self.folder, table, closed)
             except LtclError:
@@ -193,21 +275,30 @@ class Project:
         with contextlib.ExitStack() as opened:
             if hasattr(rig, "close"):
                 opened.callback(rig.close)
-            yield rig
+            if view is None:
+                yield rig
+                return
+            with self.naming("scene"):
+                warp = Warp.of(view.mapping, self.scan_side(view.mapping.camera_grid))
+            yield WarpedRig(rig, warp)
 
     @contextlib.contextmanager
     def naming(self, table: str) -> Iterator[None]:
         """Begin refusals of values with the file and the table that they stand in.
 
-        A `RigError` is about [rig], whatever the table.
+        A `RigError` is about [rig], whatever the table; so is all about [rig] about [[projector]],
+        where there are several.
         """
+        of_rig = f"projector {self.name}" if self.name else "rig"
+        if table == "rig":
+            table = of_rig
         try:
             yield
         except FileError:
             # It begins with a file.
             raise
         except RigError as error:
-            raise RigError(f"{self.folder / FILE}: [rig] {error}") from None
+            raise RigError(f"{self.folder / FILE}: [{of_rig}] {error}") from None
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.folder / FILE}: [{table}] {error}") from None
 
@@ -218,9 +309,12 @@ class Project:
         """
         with self.rig(closed=True) as rig:
             shots = Shots(rig)
-            with self.naming("acquire"):
-                settings = ScanSettings(**self.settings).for_rig(shots)
             camera_grid = known_camera_grid(rig)
+            arguments = self.settings
+            if self.name and camera_grid is not None:
+                arguments = self.scan_settings(camera_grid)
+            with self.naming("acquire"):
+                settings = ScanSettings(**arguments).for_rig(shots)
             noise = _expected_noise(rig)
             light = _expected_light(rig)
             exposures = settings.exposures
@@ -233,17 +327,21 @@ class Project:
             light = measured(calibration)
             exposures = calibration.exposures
             camera_grid = calibration.resampling.camera_grid
+        grid = shots.grid
+        if self.name:
+            grid = self._grid_of_several(camera_grid)
         megapixels = None
         if camera_grid is not None:
             megapixels = math.prod(camera_grid) / 1e6
         facts = {
-            "grid": shots.grid,
+            "grid": grid,
             "channels": shots.channels,
             "exposures": tuple(sorted(exposures)),
             "noise": noise,
             "light": light,
             "frames": settings.frames,
-            "aligned": settings.geometry == "aligned",
+            # A map that is there takes no photographs either.
+            "aligned": settings.geometry != "graycode",
             "by_hand": self.kind == "folder",
             "fixed_exposures": settings.exposures is not None or self.state != "new",
             "block": settings.block,
@@ -253,17 +351,18 @@ class Project:
         }
         return settings, facts
 
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise FileError(
-            f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one"
-        )
-    try:
-        text = input_file(path).read_text(encoding="utf-8-sig")
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileError(f"{path}: is not valid TOML: {error}") from None
+    def _grid_of_several(self, camera_grid: tuple[int, int] | None) -> tuple[int, int]:
+        """Height and width of T on the pixels that several projectors share."""
+        view = self.view()
+        if view is not None:
+            camera_grid = view.mapping.camera_grid
+        if camera_grid is None:
+            raise InputError(
+                f"{self.folder / FILE}: [projector {self.name}] its photographs have a size that "
+                "is not known yet; 'ltcl acquire run' begins with some of Gray code, which tell it"
+            )
+        with self.naming("scene"):
+            return scene_grid(camera_grid, self.scan_side(camera_grid))
 
 
 def _known_response(curve: Any) -> Response:
@@ -275,7 +374,7 @@ def _known_response(curve: Any) -> Response:
 
 def known_camera_grid(rig: Any) -> tuple[int, int] | None:
     """(H, W) of the photographs of a rig, if it tells, or if a folder has one; else None."""
-    if isinstance(rig, rigs.FolderRig):
+    if isinstance(getattr(rig, "rig", rig), rigs.FolderRig):
         return rig.photographed_grid()
     return getattr(rig, "camera_grid", None)
 
@@ -299,63 +398,6 @@ def _expected_light(rig: Any) -> Light:
     if ambient is None:
         return Light()
     return Light(ambient=float(np.mean(ambient)))
-
-
-def _check_kind(path: Path, name: str, table: Any, classes: Mapping[str, Any]) -> dict[str, Any]:
-    """Check a table whose key "kind" says of which class its other keys are arguments."""
-    _check_is_table(path, name, table)
-    kind = table.get("kind")
-    if kind not in list(classes):
-        kinds = ", ".join(classes)
-        raise InputError(f"{path}: [{name}] kind is {kind!r}; it must be one of {kinds}")
-    return _check_table(path, name, table, classes[kind], {"kind": True})
-
-
-def _check_table(
-    path: Path,
-    name: str,
-    table: Any,
-    make: Callable[..., Any],
-    more_keys: Mapping[str, bool] | None = None,
-) -> dict[str, Any]:
-    """Check that a table has the arguments of `make`, and more keys; "none" becomes None.
-
-    `more_keys` says of each whether it is required.
-    """
-    _check_is_table(path, name, table)
-    required = {} if more_keys is None else dict(more_keys)
-    for key, parameter in _parameters(make).items():
-        if key not in OBJECT_ARGUMENTS:
-            required[key] = parameter.default is parameter.empty
-    if make is rigs.VirtualRig:
-        # The transport is a file, which may have the grid.
-        required |= {"transport": True, "grid": False}
-    for key in table:
-        if key not in required:
-            allowed = ", ".join(required)
-            raise InputError(f"{path}: [{name}] has {key!r}; it may have {allowed}")
-    for key, is_required in required.items():
-        if is_required and key not in table:
-            raise InputError(f"{path}: [{name}] has no {key!r}; it must be there")
-    checked = dict(table)
-    for key, value in table.items():
-        if value == "none":
-            checked[key] = None
-    return checked
-
-
-def _check_is_table(path: Path, name: str, table: Any) -> None:
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: has no table [{name}]; it must have one")
-
-
-def _parameters(make: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Parameters of a class, with those of the sensor of a simulated rig."""
-    parameters = dict(inspect.signature(make).parameters)
-    if "sensor" in parameters:
-        del parameters["sensor"]
-        parameters |= inspect.signature(Sensor).parameters
-    return parameters
 
 
 def _make_rig(folder: Path, table: dict[str, Any], closed: bool) -> Any:

@@ -45,11 +45,11 @@ class RadiancePicture(Protocol):
         ...
 
     def rows(self, rows: slice) -> Radiance:
-        """Some rows of the picture."""
+        """The picture in some rows."""
         ...
 
     def part(self, name: str, rows: slice) -> np.ndarray:
-        """Some rows of value, variance or valid."""
+        """Value, variance or valid in some rows."""
         ...
 
 
@@ -111,12 +111,12 @@ class StoredRadiance:
         return self.validity.read()
 
     def rows(self, rows: slice) -> Radiance:
-        """Some rows of the picture."""
+        """The picture in some rows."""
         value = self.values.read(rows)
         return Radiance(value, self.variances.read(rows), self.validity.read(rows))
 
     def part(self, name: str, rows: slice) -> np.ndarray:
-        """Some rows of value, variance or valid."""
+        """Value, variance or valid in some rows."""
         arrays = {"value": self.values, "variance": self.variances, "valid": self.validity}
         return arrays[name].read(rows)
 
@@ -153,7 +153,7 @@ def values_at(picture: RadiancePicture, pixels: np.ndarray, name: str) -> np.nda
 
 
 def plane(picture: RadiancePicture, name: str, channel: int) -> np.ndarray:
-    """One channel (H, W) of value, variance or valid of a picture, float32; 0 where not valid."""
+    """A channel (H, W) of value, variance or valid of a picture, float32; 0 where not valid."""
     H, W = picture.shape[:2]
     result = np.zeros((H, W), np.float32)
     for rows in row_strips(picture.shape):
@@ -174,7 +174,9 @@ def planes(picture: RadiancePicture, name: str) -> Iterator[np.ndarray]:
 def on_projector(picture: RadiancePicture, name: str, resampling: Resampling) -> np.ndarray:
     """Value or valid of a picture on the projector's grid, (h, w[, c])."""
     channels = [resampling.apply(values) for values in planes(picture, name)]
-    return channels[0] if len(picture.shape) == 2 else np.stack(channels, axis=-1)
+    if len(picture.shape) == 2:
+        return channels[0]
+    return np.stack(channels, axis=-1)
 
 
 def valid_values(picture: RadiancePicture) -> np.ndarray:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import json
 import math
 from collections.abc import Iterable, Iterator
@@ -61,6 +60,8 @@ class Rig(Protocol):
         Called for a photograph of an earlier session.
     keeps_photographs : bool
         Whether the rig stores its photographs itself.
+    lit : (h, w) bool
+        Pixels that get direct light; without it all do.
     number, file_name(number)
         Number of the last photograph, and the file of a photograph, for messages.
     close()
@@ -175,10 +176,9 @@ class Shots(Closing):
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
         """Announce the (codes, seconds) that come next, in order, to a rig that lists them."""
-        checked = [as_shot(self, codes, seconds) for codes, seconds in shots]
         prepare = getattr(self.rig, "prepare", None)
         if prepare is not None:
-            prepare(checked)
+            prepare([as_shot(self, codes, seconds) for codes, seconds in shots])
 
     def photograph(self, codes: Any, seconds: float, stored: Any = None) -> np.ndarray:
         """Take one photograph of codes (h, w[, 3]) in [0, 1].
@@ -462,17 +462,6 @@ def require_members(name: str, value: Any, *members: str) -> None:
     if missing:
         kind = type(value).__name__
         raise InputTypeError(f"{name} is a {kind} without {', '.join(missing)}")
-
-
-def load_extra(module: str, extra: str, user: str) -> Any:
-    """Import `module` of an extra of ltcl; AcquisitionError says that `user` needs it, and how."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        cause = " ".join(str(error).split())
-        raise AcquisitionError(
-            f'{user} needs {module} ({cause}); install it with pip install "ltcl[{extra}]"'
-        ) from None
 
 
 def shot_key(codes: np.ndarray, *seconds: float) -> str:

@@ -131,7 +131,7 @@ class StoredImage:
     dtype: np.dtype
 
     def read(self, rows: slice = slice(None)) -> np.ndarray:
-        """Some rows of the picture."""
+        """The picture in some rows."""
         numbers = range(self.shape[0])[rows]
         array = np.empty((len(numbers), *self.shape[1:]), self.dtype)
         if len(numbers) == 0:

@@ -96,7 +96,7 @@ class Photograph:
         return self.read(slice(None, None, self.step))[:, :: self.step]
 
     def read(self, rows: slice) -> np.ndarray:
-        """Some rows of the image."""
+        """The image in some rows."""
         return scale_codes(self.stored.read(rows), self.rig)
 
     def at(self, pixels: np.ndarray) -> np.ndarray:
@@ -157,11 +157,14 @@ def merge_photographs(
     merged = StoredRadiance.reserve(file, shape)
 
     def merge_rows(rows: slice) -> None:
-        light = np.stack([read(rows) for read in readers]).reshape(len(readers), -1, channels)
-        parts = []
+        exposed = [read(rows) for read in readers]
+        light = np.stack(exposed).reshape(len(readers), -1, channels)
+        pixels = light.shape[1]
+        value = np.empty((pixels, channels), np.float32)
+        variance = np.empty((pixels, channels), np.float32)
+        valid = np.empty((pixels, channels), bool)
         for c in range(channels):
-            parts.append(merger.merge(light[..., c], c))
-        value, variance, valid = (np.stack(part, axis=-1) for part in zip(*parts, strict=True))
+            value[:, c], variance[:, c], valid[:, c] = merger.merge(light[..., c], c)
         strip_shape = (rows.stop - rows.start, *shape[1:])
         strip = Radiance(
             value.reshape(strip_shape), variance.reshape(strip_shape), valid.reshape(strip_shape)
@@ -225,8 +228,13 @@ class CaptureSession:
             if photograph is None:
                 photograph = self._take(name, request)
             photographs.append(photograph)
-        remaining = iter(photographs)
-        return [[next(remaining) for _ in group] for group in groups]
+        grouped = []
+        first = 0
+        for group in groups:
+            end = first + len(group)
+            grouped.append(photographs[first:end])
+            first = end
+        return grouped
 
     def photograph(self, codes: np.ndarray, seconds: float) -> Photograph:
         """The photograph of one request."""

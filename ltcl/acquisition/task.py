@@ -29,7 +29,7 @@ from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, RigError, Shots
 from ltcl.acquisition.scanning import adaptive, columns, direct, plan, sketch
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
-from ltcl.acquisition.scanning.pictures import LAMP_GAIN, ScanCamera, ScanGrid
+from ltcl.acquisition.scanning.pictures import LAMP_GAIN, LIT, ScanCamera, ScanGrid
 from ltcl.acquisition.session import (
     ProgressFunction,
     check_same,
@@ -115,7 +115,7 @@ def acquire(
         all.
     rtol : float, optional
         Relative error of T p, for pictures that judge it, down to which a sketch goes on with
-        rounds of 16 more patterns, as long as they help.
+        rounds of 16 more patterns, as long as they help. Of a sketch alone, as `photographs` is.
     photographs : int, optional
         Photographs that a sketch takes at most, those of the set-up included; without `rtol` it
         takes them all.
@@ -345,6 +345,8 @@ def _calibrate(
     elif plan.is_sketched(settings.strategy, shots.grid):
         windows.check_memory(shots.grid, shots.channels)
         _check_photographs(shots, settings)
+    if not plan.is_sketched(settings.strategy, shots.grid):
+        _check_no_goal(shots, settings)
     calibration = calibrate.measure(
         shots,
         sparing=plan.is_sparing(settings.strategy, shots.grid),
@@ -370,6 +372,9 @@ def _calibrate(
     calibration.write(store)
     if calibration.mixing is not None:
         store.extra("mixing", calibration.mixing)
+    lit = getattr(shots.rig, "lit", None)
+    if lit is not None:
+        store.extra(LIT, np.asarray(lit, np.float32))
     store.update(
         settings=settings.to_json(), why=reason, plan=asdict(chosen), strategy=chosen.strategy
     )
@@ -394,6 +399,21 @@ def _check_photographs(shots: Shots, settings: ScanSettings) -> None:
         raise InputError(
             f"photographs is {settings.photographs}; a sketch of {height} x {width} pixels takes "
             f"about {least}, so it must be as many or more"
+        )
+
+
+def _check_no_goal(shots: Shots, settings: ScanSettings) -> None:
+    """Refuse an error or a number of photographs that only a sketch would keep to."""
+    for name in ("rtol", "photographs"):
+        value = getattr(settings, name)
+        if value is None:
+            continue
+        maker = f"strategy is {settings.strategy!r}"
+        if settings.strategy == "auto":
+            height, width = shots.grid
+            maker += f", which makes no sketch of {height} x {width} pixels"
+        raise InputError(
+            f"{name} is {value:g}, but {maker}; it must be 'sketch', or {name} be left out"
         )
 
 

@@ -182,7 +182,10 @@ def connect(
             raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
     # Without this, a worker that takes 15 s to start again, on a busy machine, is given up.
     patience = {"distributed.deploy.lost-worker-timeout": f"{PATIENCE}s"}
-    place = _processes(workers, device) if is_local else contextlib.nullcontext(cluster)
+    if is_local:
+        place = _processes(workers, device)
+    else:
+        place = contextlib.nullcontext(cluster)
     # Lost workers are not logged: one error names them.
     quiet = distributed.utils.silence_logging_cmgr(logging.CRITICAL)
     with place as address, config.set(patience), quiet:
@@ -240,11 +243,7 @@ def _worker_devices(requested: str | None) -> list[str]:
 
 
 def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as error:
-        raise ClusterError(f"a cluster needs Dask ({error}); pip install 'ltcl[batch]'") from None
-    return distributed
+    return checks.load_extra("distributed", "batch", "a cluster", ClusterError)
 
 
 def _pickled(

@@ -106,9 +106,12 @@ class BatchSolver:
         pattern = solved.pattern
         if self.needs_codes:
             pattern = from_linear(pattern / self._white(), "srgb", 16, is_float=False)
+        appearance = None
+        if self.needs_appearance:
+            appearance = solved.appearance
         return SolvedBatch(
             pattern=pattern,
-            appearance=solved.appearance if self.needs_appearance else None,
+            appearance=appearance,
             errors=solved.frame_errors.tolist(),
             clipped=solved.frame_clipped.tolist(),
         )
@@ -159,10 +162,10 @@ class BatchSolver:
 
     def _given_options(self) -> set[str]:
         """Names of the options that are not the default."""
-        given = {name for name, value in self.options.items() if value is not None}
+        names = {name for name, value in self.options.items() if value is not None}
         if self.options.get("method") == "auto":
-            given.remove("method")
-        return given - {"callback"}
+            names.remove("method")
+        return names - {"callback"}
 
     def _white(self) -> np.float32:
         """Light that is white in .png."""

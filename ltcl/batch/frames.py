@@ -11,6 +11,7 @@ tolerance: the rest after `frames=`, or a lost pattern.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -32,9 +33,9 @@ from ltcl.images.encoding import Encoding
 from ltcl.images.frames import Source, check_video, open_frames, write_video
 from ltcl.images.pictures import RESIZES
 from ltcl.tasks.compensation import compensate
-from ltcl.tasks.compensation.inputs import check_gain
+from ltcl.tasks.compensation.inputs import ARGUMENTS, check_gain, check_solves
 from ltcl.tasks.report import versions
-from ltcl.tasks.requirements import check_exact, error_note
+from ltcl.tasks.requirements import error_note
 from ltcl.transport import frames as picture_frames
 from ltcl.transport.transport import Transport, check_transport
 
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from distributed import Client
 
 DEFAULT_FPS = 25.0
+# Options of `compensate` that say how light is found.
+SOLVES = ("method", "rtol", "exact", "inverse", "clamp")
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -191,7 +194,7 @@ def compensate_frames(
         fps = checks.number("fps", fps, above=0.0)
     if frames is not None:
         frames = checks.count("frames", frames)
-    white = _check_light(T, gain, loss, options)
+    white = _check_light(T, gain, loss, options, has_client=client is not None)
     _check_functions(codes=codes, progress=progress)
     if video is not None:
         check_video(video, T.grid)
@@ -234,37 +237,57 @@ def compensate_frames(
     with locked(folder, wait=False):
         run.records |= manifest.read(folder, head, resume)
         with _finished_frames_named(run):
-            # Closed at once where Ctrl-C ends it: a batch that is solved is written.
-            with contextlib.closing(run.solve(gain, loss)) as batches:
-                for done in batches:
-                    if progress is not None:
-                        progress("frames", done, run.count)
+            _solve_batches(run, gain, loss, progress)
             if video is not None:
                 rate = fps or source_frames.fps or DEFAULT_FPS
                 video = as_path(video)
                 write_video(video, run.patterns(), rate)
+    records = [run.records[number] for number in sorted(run.done)]
     reference = options.get("exact") or T
     return CompensatedFrames(
         folder=folder,
         video=video,
         gain=head["gain"] or 0.0,
-        records=tuple(run.records[number] for number in sorted(run.done)),
+        records=tuple(records),
         solved=run.solved_count,
         seconds=time.perf_counter() - start,
         transport_error=reference.error,
     )
 
 
+def _solve_batches(
+    run: FilmRun,
+    gain: float | str,
+    loss: float | None,
+    progress: Callable[[str, int, int | None], object] | None,
+) -> None:
+    """Solve and write all batches; tell `progress` of each."""
+    # Closed at once where Ctrl-C ends it: a batch that is solved is written.
+    with contextlib.closing(run.solve(gain, loss)) as batches:
+        for done in batches:
+            if progress is not None:
+                progress("frames", done, run.count)
+
+
 def _check_light(
-    T: Transport, gain: float | str, loss: float | None, options: dict[str, Any]
+    T: Transport,
+    gain: float | str,
+    loss: float | None,
+    options: dict[str, Any],
+    *,
+    has_client: bool,
 ) -> float:
     """Check T and what `compensate` gets; return the light that is white in .png."""
     check_transport(T, square=False)
-    if options.get("exact") is not None:
-        check_exact(T, options["exact"])
     check_gain(gain, loss)
     _check_pictures(T, options)
     _, high = checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
+    solves = {name: options[name] for name in SOLVES if name in options}
+    if has_client:
+        # An inverse is tried out on a device; the workers have one.
+        solves.pop("inverse", None)
+    others = {name: value for name, value in options.items() if name not in ARGUMENTS}
+    check_solves(T, **solves, options=others)
     return high if high > 0 else 1.0
 
 
@@ -272,7 +295,7 @@ def _head(T: Transport, **settings: Any) -> dict[str, Any]:
     """Return the head of the list of frames: what must be the same when a run goes on."""
     if settings["codes"] is not None:
         settings["codes"] = curve(settings["codes"], T.grid)
-    settings = {**(compensate.__kwdefaults__ or {}), **settings}
+    settings = {**_defaults(), **settings}
     settings.pop("callback", None)
     return {
         "versions": versions(),
@@ -280,6 +303,15 @@ def _head(T: Transport, **settings: Any) -> dict[str, Any]:
         "transport": identity(T),
         "gain": None,
     }
+
+
+def _defaults() -> dict[str, Any]:
+    """The options of `compensate` with their defaults."""
+    defaults = {}
+    for name, parameter in inspect.signature(compensate).parameters.items():
+        if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
+            defaults[name] = parameter.default
+    return defaults
 
 
 @contextlib.contextmanager

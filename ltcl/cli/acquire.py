@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import shlex
@@ -15,16 +16,20 @@ import typer
 from ltcl import checks, store
 from ltcl.cli import options
 from ltcl.cli.aim import aim
-from ltcl.cli.command import WAITING, Answer, Context, command
+from ltcl.cli.command import Answer, Context, command
+from ltcl.cli.failure import WAITING
 from ltcl.cli.fit import fit
 from ltcl.cli.importing import import_photographs
 from ltcl.cli.options import file_option, option
+from ltcl.cli.projectors import copy_from_card, report_several, run_several
 from ltcl.cli.reports.acquisition import (
     NextPhotograph,
     PhotographMissing,
     PlanReport,
+    PlansReport,
     RigKind,
     ScanReport,
+    ScansReport,
     StrategyPlan,
     UpdateReport,
 )
@@ -75,11 +80,43 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
     are guessed. No camera is opened.
     """
     from ltcl.acquisition import Project
+
+    projects = Project.open_all(folder)
+    reports = [_plan(project, overhead) for project in projects]
+    lines = []
+    for project, report in zip(projects, reports, strict=True):
+        lines += [*_heading(project), *_plan_lines(report)]
+    if len(projects) == 1:
+        return Answer(reports[0], lines)
+    by_name = {}
+    for project, report in zip(projects, reports, strict=True):
+        by_name[project.name] = report
+        lines += _map_lines(project)
+    return Answer(PlansReport(folder=folder, projectors=by_name), lines)
+
+
+def _heading(project: Any) -> list[str]:
+    """The name of one of several projectors."""
+    return [f"[{project.name}]"] if project.name else []
+
+
+def _map_lines(project: Any) -> list[str]:
+    """Lines that say what the map of one of several projectors takes."""
+    from ltcl.acquisition.projectors.view import expected_photographs
+
+    if project.view() is not None:
+        return [f"{project.name}: its map is there"]
+    with project.rig(closed=True) as rig:
+        count = expected_photographs(rig.projector_grid)
+    return [f"{project.name}: its map takes about {count} photographs of Gray code before that"]
+
+
+def _plan(project: Any, overhead: float) -> PlanReport:
+    """The plan of one projector."""
     from ltcl.acquisition.scanning import sketch
     from ltcl.acquisition.scanning.pace import seconds_per_megapixel
     from ltcl.acquisition.scanning.plan import choose, plans
 
-    project = Project.open(folder)
     settings, facts = project.outlook()
     with project.naming("acquire"):
         pace = seconds_per_megapixel(facts["channels"])
@@ -90,7 +127,7 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
     exposures = len(facts["exposures"]) if is_measured else 1
     first = strategies["sketch"].photographs
     report = PlanReport(
-        folder=folder,
+        folder=project.folder,
         rig=_rig_kind(project),
         measured=is_measured,
         asked_for=settings.strategy,
@@ -108,7 +145,7 @@ def plan(context: Context, folder: options.Acquisition, overhead: Overhead = 0.0
     )
     for name, strategy in strategies.items():
         report.plans[name] = StrategyPlan.from_attributes(strategy)
-    return Answer(report, _plan_lines(report))
+    return report
 
 
 def _rig_kind(project: Any) -> RigKind:
@@ -173,6 +210,10 @@ def run(
 ) -> Answer:
     """Measure the set-up, then photograph all patterns; the transport comes to DIR/transport.zarr.
 
+    Several projectors, with [[projector]] in acquisition.toml, are scanned one by one, into
+    DIR/NAME.zarr, while the others show black; in between it is checked that the camera did not
+    move.
+
     A run that was stopped continues: after Ctrl-C or a power cut, with photographs that were
     missing, or with nothing but the transport left to be made.
 
@@ -181,10 +222,12 @@ def run(
     """
     from ltcl.acquisition import Project, acquire
 
-    project = Project.open(folder)
+    project, *others = Project.open_all(folder)
     options.check_writable_folder(project.store)
     # The device is opened before the photographs, not after them.
     opened = open_device(device)
+    if others:
+        return _run_several(context, [project, *others], take, opened)
     _check_card(project, take)
     if _has_all_photographs(project):
         # No camera or display has to be there.
@@ -192,7 +235,7 @@ def run(
     try:
         with project.rig() as rig:
             if take is not None:
-                rig.take([file for file in take.glob("[!.]*") if file.is_file()])
+                copy_from_card(rig, take, project)
             try:
                 with project.naming("acquire"):
                     acquire(
@@ -211,6 +254,27 @@ def run(
         error.args = (f"{problem}; {_advice(project, error)}",)
         raise
     return _report(context, folder, device)
+
+
+def _run_several(context: Context, projects: Any, take: Path | None, device: Any) -> Answer:
+    """Scan several projectors one by one."""
+    folder = projects[0].folder
+    for project in projects:
+        _check_card(project, take)
+    again = f"ltcl acquire run {shlex.quote(str(folder))}"
+    try:
+        waiting = run_several(context, projects, take, device)
+    except (AcquisitionError, KeyboardInterrupt) as error:
+        problem = str(error) or "interrupted"
+        error.args = (f"{problem}; what was done before is kept; '{again}' goes on",)
+        raise
+    if waiting is None:
+        return report_several(folder, projects)
+    step, error, missing = waiting
+    answer = _ask_for_photograph(step.folder, error, missing, again)
+    others = [project.name for project in projects if project.name != step.project.name]
+    hint = f"shown by {step.project.name}; black: {', '.join(others)}"
+    return dataclasses.replace(answer, lines=[*answer.lines, hint])
 
 
 def _check_card(project: Any, take: Path | None) -> None:
@@ -241,6 +305,7 @@ def _ask_for_photograph(
 ) -> Answer:
     """Tell which photograph a person has to take next, and how it goes on."""
     name = shlex.quote(str(folder))
+    verb = "is" if len(missing) == 1 else "are"
     report = PhotographMissing(
         folder=folder,
         next=NextPhotograph(**error.shot._asdict()),
@@ -248,7 +313,7 @@ def _ask_for_photograph(
     )
     lines = [
         f"next: {error}",
-        f"{folder / 'shots.csv'} is the list; {len(missing)} are missing",
+        f"{folder / 'shots.csv'} is the list; {len(missing)} {verb} missing",
         f"on the projector: ltcl show {name}; then: {again} --take CARD",
     ]
     return Answer(report, lines, WAITING)
@@ -280,7 +345,8 @@ def update(
     to: Annotated[
         Path | None,
         file_option(
-            "Folder of the new transport, which must not exist. Default: DIR/updated.zarr.",
+            "Folder of the new transport, which must not exist. Default: DIR/updated.zarr, or "
+            "DIR/NAME.updated.zarr.",
             "--store",
             metavar="STORE",
         ),
@@ -293,6 +359,7 @@ def update(
             min=12,
         ),
     ] = None,
+    projector: options.ProjectorName = None,
     take: Card = None,
     device: options.DeviceName = None,
 ) -> Answer:
@@ -308,16 +375,18 @@ def update(
     missing.
     """
     from ltcl import acquisition
+    from ltcl.acquisition.several import keep_facts
 
-    project = acquisition.Project.open(folder)
-    target = folder / "updated.zarr" if to is None else to
+    project = acquisition.Project.open(folder, projector)
+    default = f"{projector}.updated.zarr" if projector else "updated.zarr"
+    target = folder / default if to is None else to
     opened = open_device(device)
     _check_card(project, take)
     settings = {} if photographs is None else {"photographs": photographs}
     by_hand = target.with_name(f"{target.name}.photographs")
     with project.rig(photographs=by_hand) as rig:
         if take is not None:
-            rig.take([file for file in take.glob("[!.]*") if file.is_file()])
+            copy_from_card(rig, take, project)
         try:
             with project.naming("acquire"):
                 result = acquisition.update(
@@ -334,7 +403,11 @@ def update(
                 again += f" --store {shlex.quote(str(to))}"
             if photographs is not None:
                 again += f" --photographs {photographs}"
+            if projector is not None:
+                again += f" --projector {projector}"
             return _ask_for_photograph(by_hand, error, rig.missing(), again)
+    if project.name:
+        keep_facts(project, target)
     report = UpdateReport(
         folder=folder,
         store=target,
@@ -380,16 +453,32 @@ def report(
 
 
 def _report(context: Context, folder: Path, device: str | None) -> Answer:
-    from ltcl.acquisition import Project, Report, Setup
+    from ltcl.acquisition import Project
 
-    project = Project.open(folder)
+    projects = Project.open_all(folder)
     opened = open_device(device)
+    lines = []
+    by_name = {}
+    for project in projects:
+        report, own_lines = _scan_report(context, project, opened)
+        by_name[project.name] = report
+        lines += [*_heading(project), *own_lines]
+    if len(projects) == 1:
+        return Answer(by_name[""], lines)
+    lines.append("what they are good for together: 'ltcl combine', then 'ltcl analyze'")
+    return Answer(ScansReport(folder=folder, projectors=by_name), lines)
+
+
+def _scan_report(context: Context, project: Any, device: Any) -> tuple[ScanReport, list[str]]:
+    """The report of one scan, and its lines."""
+    from ltcl.acquisition import Report, Setup
+
     if not project.store.exists():
         advice = "'ltcl acquire run' makes it"
         raise FileError(f"{project.store}: no such folder yet; {advice}")
     context.progress("entries and noise")
     facts = Report.of(project.store)
-    T = store.load(project.store, on_dark="mask", device=opened)
+    T = store.load(project.store, on_dark="mask", device=device)
     judgement = verdict(
         T,
         sum_deviation=facts.sum_deviation,
@@ -397,7 +486,7 @@ def _report(context: Context, folder: Path, device: str | None) -> Answer:
         left_out=facts.left_out,
     )
     scan = ScanReport(
-        folder=folder,
+        folder=project.folder,
         store=project.store,
         **json.loads(facts.to_json()),
         verdict=VerdictReport.from_verdict(judgement),
@@ -410,4 +499,7 @@ def _report(context: Context, folder: Path, device: str | None) -> Answer:
         errors = ", ".join(f"{error:.2%}" for error in scan.error)
         lines.append(f"relative error of T p, for p that were not scanned: {errors}")
     lines.append(f"transport in {project.store}")
-    return Answer(scan, [*lines, *verdict_lines({str(project.store): judgement})])
+    if not project.name:
+        # One of several projectors lights a part of the scene.
+        lines += verdict_lines({str(project.store): judgement})
+    return scan, lines

@@ -34,6 +34,7 @@ def aim(
             metavar="FOLDER",
         ),
     ] = None,
+    projector: options.ProjectorName = None,
     looks: Annotated[
         int | None,
         option("End after so many looks. Default: with Ctrl-C.", metavar="N", min=1),
@@ -49,11 +50,11 @@ def aim(
     from ltcl.viewer.aim import AimScene
     from ltcl.viewer.server import Viewer
 
-    project = Project.open(folder)
+    project = Project.open(folder, projector)
     if photographs is not None and project.kind != "folder":
         rig = f"the rig of {project.folder} is {project.kind}"
         raise InputError(f"--photographs is given, but {rig}, not folder")
-    place = folder / "photographs" if photographs is None else photographs
+    place = project.rig_folder / "photographs" if photographs is None else photographs
     scene = AimScene(folder.name)
     report = AimReport(folder=folder)
     count = 0
@@ -89,7 +90,7 @@ def _readings(project: Any, place: Path, scene: Any) -> Iterator[tuple[str, Any]
         return
     from ltcl.acquisition.aiming import Aim
 
-    with project.rig() as rig:
+    with project.rig(own_pixels=True) as rig:
         aim_rig = Aim(rig)
         for number in itertools.count(1):
             yield f"look {number}", aim_rig.look()

@@ -22,7 +22,7 @@ def align(
     file: options.TransportFile,
     out: Annotated[Path, out_option("The transport on the projector's grid: .npz or .zarr.")],
     picture: Annotated[
-        list[Path] | None, argument("PICTURE...", "Photographs of the camera of TRANSPORT.")
+        list[Path] | None, argument("PICTURE", "Photographs of the camera of TRANSPORT.")
     ] = None,
 ) -> Answer:
     """Bring TRANSPORT onto the projector's grid, so that 'ltcl separate' finds its bounces.

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ltcl import checks
 from ltcl.cli import loading, options, panels
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import check_writable_file, file_option, option
@@ -20,8 +21,10 @@ PLOT_FORMATS = (".png", ".svg", ".pdf")
 
 
 def _check_plot(path: Path | None) -> Path | None:
-    if path is not None and path.suffix.lower() not in PLOT_FORMATS:
-        raise typer.BadParameter(f"{path} must be a .png, .svg or .pdf")
+    if path is not None:
+        if path.suffix.lower() not in PLOT_FORMATS:
+            raise typer.BadParameter(f"{path} must be a .png, .svg or .pdf")
+        checks.load_extra("matplotlib", "plots", "--plot")
     return check_writable_file(path)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The frame of every command: shared options, results, notes, errors in one line, exit codes.
+"""The frame of every command: shared options, results, notes.
 
 Results are on stdout, as tables or as one JSON document; notes, warnings, errors and progress are
 on stderr.
@@ -10,9 +10,9 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-import traceback
+import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -20,32 +20,16 @@ import typer
 from typer.models import ArgumentInfo
 
 from ltcl.cli import interrupt
+from ltcl.cli.failure import fail
 from ltcl.cli.progress import Progress
-from ltcl.cli.reports.parts import ErrorReport
 from ltcl.cli.reports.report import document
 from ltcl.cli.streams import print_line, print_result
-from ltcl.errors import FileError, LtclError
 from ltcl.tasks import report
 
-FAILED = 1
-USAGE = 2
-WAITING = 3
-INTERNAL = 70
-INTERRUPTED = 130
-EXIT_CODES = (
-    "**Exit codes:** 0 done; 1 refused or failed, with one line that tells "
-    "why; 2 wrong usage; 3 'ltcl acquire run', or 'update', waits for photographs "
-    "that a person has to take; 70 an error in ltcl itself; 130 Ctrl-C.\n\n"
-    "With **--json** stdout holds one JSON document, also if a command fails: "
-    '{"error": the problem, "type": its class in ltcl.errors, '
-    '"exit_code": as above}. docs/reference/json.md has all fields.'
-)
 # Level of a note, between INFO and WARNING.
 NOTE = 25
 SHARED_PANEL = "Options of every command"
 _logger = logging.getLogger(__name__)
-# Typer exports only classes derived from this one.
-UsageError: Any = typer.BadParameter.__base__
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +126,26 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
 def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
     """Return all parameters as ones that are passed by keyword."""
     signature = inspect.signature(function, eval_str=True)
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    return [parameter.replace(kind=keyword) for parameter in signature.parameters.values()]
+    parameters = []
+    for parameter in signature.parameters.values():
+        if parameter.annotation is not Context:
+            _name_value(parameter)
+        parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+    return parameters
+
+
+def _name_value(parameter: inspect.Parameter) -> None:
+    """Let the help show what a value is: N for integers, and else RTOL for --rtol."""
+    declared = parameter.annotation.__metadata__[0]
+    kind = str(parameter.annotation.__origin__)
+    if declared.metavar is not None or "Literal[" in kind:
+        return
+    declared.metavar = parameter.name.upper()
+    if re.search(r"\bint\b", kind):
+        declared.metavar = "N"
+    elif re.search(r"\bbool\b", kind):
+        # A flag has no value.
+        declared.metavar = ""
 
 
 def _is_argument(parameter: inspect.Parameter) -> bool:
@@ -157,32 +159,6 @@ def _print_answer(answer: Answer, json: bool) -> None:
     for line in answer.lines:
         if line is not None:
             print_result(line)
-
-
-def fail(error: BaseException, json: bool = False, verbose: bool = False) -> ErrorReport:
-    """Print an error as one line on stderr, and as JSON on stdout if asked; return its report."""
-    kind = type(error).__name__
-    message = " ".join(str(error).split())
-    code = FAILED
-    if isinstance(error, KeyboardInterrupt):
-        code = INTERRUPTED
-        if not message:
-            message = "interrupted"
-    elif isinstance(error, UsageError):
-        code = USAGE
-    elif isinstance(error, MemoryError) and not isinstance(error, LtclError):
-        message = "the host has no memory left"
-    elif not isinstance(error, LtclError):
-        code = INTERNAL
-        message = f"internal error: {kind}: {message}; --verbose prints where it occurred"
-        if verbose:
-            print_line("".join(traceback.format_exception(error)))
-    print_line(f"ltcl: error: {message}")
-    failure = ErrorReport(error=message, type=kind, exit_code=code)
-    if json:
-        with suppress(FileError):
-            print_result(report.dumps(failure.document()))
-    return failure
 
 
 def note(text: str) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 from PIL import Image
 
 from ltcl.cli import compensation, loading, options, panels, pictures, scenes
-from ltcl.cli.command import Answer, Context, UsageError, command, note
+from ltcl.cli.command import Answer, Context, command, note
+from ltcl.cli.failure import UsageError
 from ltcl.cli.options import argument, option
 from ltcl.cli.reports.parts import PictureWithStd, Solve, solves
 from ltcl.cli.reports.pictures import CompensatedPicture, CompensateReport
@@ -72,7 +73,7 @@ def compensate(
     transport: options.TransportFile,
     out: options.OutFolder,
     picture: Annotated[
-        list[Path] | None, argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")
+        list[Path] | None, argument("PICTURE", "Pictures: .png, .jpg, .tif, .bmp or .exr.")
     ] = None,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
@@ -94,7 +95,7 @@ def compensate(
         # The first argument is a picture, too.
         paths = [transport, *paths]
     if not paths:
-        raise UsageError("Missing argument 'PICTURE...'.")
+        raise UsageError("Missing argument 'PICTURE'.")
     _check_sharing(context)
     if has_scenes:
         scenes.check_pictures(paths)

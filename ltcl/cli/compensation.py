@@ -46,7 +46,14 @@ Gain = Annotated[
 
 def parse_film_gain(text: str) -> float | str:
     """Return a factor, "auto" or "follow"."""
-    return text if text == "follow" else parse_gain(text)
+    if text == "follow":
+        return text
+    try:
+        return parse_gain(text)
+    except typer.BadParameter:
+        raise typer.BadParameter(
+            f"{text!r} is not a gain; write a number, auto or follow"
+        ) from None
 
 
 FilmGain = Annotated[
@@ -117,6 +124,8 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
     asked = context.options
     setup = loading.load_setup(transport, asked["calibration"])
     T = loading.load(context, transport)
+    if setup is None:
+        setup = loading.setup_of_several(T)
     if setup is not None:
         _check_setup(context, setup, T)
     settings = loading.solver_settings(context, T, compensation.RTOL)
@@ -137,6 +146,7 @@ def prepare(context: Context, transport: Path) -> CompensationJob:
             "pattern .png holds the codes of the measured projector; 'ltcl show' shows it there"
         )
         if settings["background"] is None:
+            # That of several projectors is in their T.
             settings["background"] = setup.ambient
             resolved["background"] = "measured"
             notes.append("the background is the ambient light that was measured")

@@ -24,17 +24,18 @@ def demo(
     context: Context,
     out: options.OutFolder = Path("ltcl-demo"),
     size: Annotated[
-        int, option("Patches along a wall; the projector has 3 N^2 pixels.", min=4)
-    ] = 36,
+        int, option("Patches along a wall; the projector has 8 N x 24 N pixels.", min=4)
+    ] = 32,
     device: options.DeviceName = None,
 ) -> Answer:
     """Compensate a picture in a coloured room corner: no hardware, no download, half a minute.
 
     Fills DIR with the desired picture, the look of the walls without compensation, the pattern, the
-    compensated result, the bounces of light, a convergence plot, a report and a contact sheet.
+    compensated result, the bounces of light, a report and a contact sheet; with the extra plots
+    also a plot of convergence.
     """
     opened = open_device(device)
-    # It imports OpenCV and matplotlib.
+    # It imports OpenCV.
     from ltcl import demo
 
     def show_step(step: str) -> None:

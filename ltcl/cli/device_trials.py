@@ -35,8 +35,10 @@ from ltcl.operators import (
     SubsetBasis,
     Tiles,
     Wavelet,
+    triangles,
 )
 from ltcl.operators.pyramid import hat_levels
+from ltcl.operators.relaxation import entry_arguments
 from ltcl.scenes.visibility import visibility
 from ltcl.solvers.bounded import minimise
 from ltcl.solvers.solve import METHODS, SAMPLED, solve
@@ -47,6 +49,8 @@ LIMITS = {"product": 1e-4, "solve": 0.02}
 SAMPLES = 4096
 # Right-hand sides: 4 in one launch, and 1.
 COLUMNS = 5
+# More pixels than a work-group transforms alone, by the largest groups.
+LARGE_GRID = (256, 256)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,18 +93,45 @@ def trials(device: Device) -> Iterator[Trial]:
         )
     W = Wavelet(device, scene.grid, "db2")
     yield Trial(kind="product", name="wavelet", call=lambda: W.T @ (W @ x), truth=x)
+    # A GPU makes large levels by kernels of their own.
+    large = Wavelet(device, LARGE_GRID, "haar")
+    picture = random.random((LARGE_GRID[0] * LARGE_GRID[1], COLUMNS))
+    yield Trial(
+        kind="product",
+        name="wavelet of a large picture",
+        call=lambda: large.T @ (large @ picture),
+        truth=picture,
+    )
     yield Trial(
         kind="product", name="visibility", call=partial(_visibility, device), truth=np.eye(2)
     )
-    some = SubsetBasis(device, scene.grid, [5, 0, 2], W)
+    subset = SubsetBasis(device, scene.grid, [5, 0, 2], W)
     picked = np.asarray(W @ x)[[5, 0, 2]]
-    kept = np.zeros(x.shape)
-    kept[[5, 0, 2]] = picked
+    expected = np.zeros(x.shape)
+    expected[[5, 0, 2]] = picked
     yield Trial(
         kind="product",
         name="subset of wavelets",
-        call=lambda: some.T @ (some @ x),
-        truth=W.T @ kept,
+        call=lambda: subset.T @ (subset @ x),
+        truth=W.T @ expected,
+    )
+    cells = _cells(*scene.grid)[[5, 0, 2]]
+    yield Trial(
+        kind="product",
+        name="subset of cells",
+        call=partial(
+            _both_products,
+            SubsetBasis(device, scene.grid, [5, 0, 2], Pyramid(device, scene.grid)),
+            x,
+            x[:3],
+        ),
+        truth=np.vstack([cells @ x, cells.T @ x[:3]]),
+    )
+    yield Trial(
+        kind="product",
+        name="triangles",
+        call=partial(_joined_triangles, device, S),
+        truth=np.linalg.inv(np.tril(S)),
     )
     yield from _solves(device, S, x[:, 0])
     yield _frame(scene, device)
@@ -168,6 +199,17 @@ def _hats(grid: tuple[int, int]) -> np.ndarray:
 
 def _both_products(A: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.vstack([A @ x, A.T @ y])
+
+
+def _joined_triangles(device: Device, S: np.ndarray) -> np.ndarray:
+    """The inverse of the lower triangle of S, joined from those of two halves."""
+    half = len(S) // 2
+    P = np.tril(S)
+    halves = np.vstack([np.linalg.inv(P[:half, :half]), np.linalg.inv(P[half:, half:])])
+    M = CSR(device, scipy.sparse.csr_array(S))
+    inverses = device.upload(halves)
+    entries = [entry_arguments(slab, inverses) for slab in M.slabs]
+    return triangles.join(inverses, len(S), M.slabs, entries, 1.0, is_dense=False).get()
 
 
 def _visibility(device: Device) -> np.ndarray:

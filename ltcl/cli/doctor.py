@@ -21,7 +21,8 @@ from typing import Any
 
 from ltcl import checks
 from ltcl.cli import options
-from ltcl.cli.command import FAILED, Answer, Context, command, note
+from ltcl.cli.command import Answer, Context, command, note
+from ltcl.cli.failure import FAILED
 from ltcl.cli.reports.program import Check, DoctorReport, ListedDevice
 from ltcl.cli.tables import table
 from ltcl.device import Device, discovery, open_device, pocl_cache
@@ -84,7 +85,11 @@ def _choose(present: list[Any]) -> Any:
     except DeviceError as error:
         if not present:
             raise
-        note(str(error) if name is None else f"LTCL_DEVICE={name} matches none of these")
+        if name is None:
+            text = str(error)
+        else:
+            text = f"LTCL_DEVICE={name} matches none of these"
+        note(text)
     return None
 
 
@@ -228,8 +233,8 @@ def _try_kernels(device: Device) -> Iterator[Check]:
             if entry:
                 yield Check(**entry)
     if child.ending:
-        found = f"the child process that tried it {child.ending}: {child.last_words}"
-        yield Check(check=trial, passed=False, found=found, fix=fix)
+        crash = f"the child process that tried it {child.ending}: {child.last_words}"
+        yield Check(check=trial, passed=False, found=crash, fix=fix)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,9 +267,12 @@ def _run_child(arguments: list[str], **variables: str) -> Child:
         code = -signal.SIGKILL
         ending = f"hangs for {SECONDS} s"
     lines = (child.stderr or b"").decode(errors="replace").strip().splitlines()
+    last_words = "it printed nothing"
+    if lines:
+        last_words = lines[-1]
     return Child(
         output=(child.stdout or b"").decode(errors="replace"),
-        last_words=lines[-1] if lines else "it printed nothing",
+        last_words=last_words,
         ending=ending,
         is_crash=code not in (0, 1),
     )

@@ -36,18 +36,18 @@ def export(
     scans: Annotated[
         list[Path],
         argument(
-            "SCAN...",
+            "SCAN",
             "Store or folder of 'ltcl acquire run', or folder of 'ltcl acquire import'; several of "
-            "one camera, one for each projector.",
+            "one camera, one for each projector, or the folder of all of them.",
         ),
     ],
     out: options.OutFolder,
     formats: Annotated[
         list[str] | None,
         option(
-            "maps (EXR, NPZ, OpenCV's remap), png (blend and black masks), obj (warp mesh), mpcdi "
-            "(2.0), mpcdi1 (1.0), or cube (response and colours); several, each with its own "
-            "--format. Default: all.",
+            "Kind of files: maps (EXR, NPZ, OpenCV's remap), png (blend and black masks), obj "
+            "(warp mesh), mpcdi (2.0), mpcdi1 (1.0), or cube (response and colours); several, each "
+            "with its own --format. Default: all.",
             "--format",
             parser=parse_format,
             metavar="FORMAT",
@@ -69,24 +69,25 @@ def export(
     tells the error by maps alone beside that of ltcl.
     """
     from ltcl.files import fill_folder
-    from ltcl.show.export import read_projectors
+    from ltcl.show.export import read_scans, share_light
 
-    wanted = formats or list(FORMATS)
+    chosen_formats = formats or list(FORMATS)
     context.progress("reading scans")
-    projectors = read_projectors(scans)
-    losses: list[MapLossReport | None] = [None] * len(scans)
+    sources = read_scans(scans)
+    projectors = share_light(sources)
+    losses: list[MapLossReport | None] = [None] * len(sources)
     if not no_error:
-        losses = [_measure_loss(context, path, device) for path in scans]
+        losses = [_measure_loss(context, source.store, device) for source in sources]
     remark = f"{REMARK}; {_describe_losses(losses)}"
     with fill_folder(out) as temporary:
-        files = _write_files(temporary, projectors, wanted, remark)
+        files = _write_files(temporary, projectors, chosen_formats, remark)
         text = "\n".join(_readme(projectors, remark, files)) + "\n"
         (temporary / README).write_text(text, encoding="utf-8")
     reports = []
-    for path, projector, loss in zip(scans, projectors, losses, strict=True):
+    for source, projector, loss in zip(sources, projectors, losses, strict=True):
         reports.append(
             ExportedProjectorReport(
-                scan=path,
+                scan=source.path,
                 name=projector.name,
                 grid=projector.grid,
                 seen=float(projector.seen.mean()),
@@ -103,16 +104,14 @@ def export(
     return Answer(report, [*(str(out / file) for file in report.files), remark])
 
 
-def _measure_loss(context: Context, path: Path, device: str | None) -> MapLossReport | None:
-    """Measure what static files lose; None without a square transport."""
+def _measure_loss(context: Context, path: Path | None, device: str | None) -> MapLossReport | None:
+    """Measure what static files lose of a stored transport; None if there is none, or no square."""
     from ltcl.show.export import MapLoss
-    from ltcl.show.export.projector import transport_path
 
-    source = transport_path(path)
-    if source is None:
+    if path is None:
         return None
     context.progress(f"what maps lose of {path}")
-    T = store.load(source, on_dark="mask", device=open_device(device))
+    T = store.load(path, on_dark="mask", device=open_device(device))
     if not T.is_square:
         return None
     return MapLossReport.from_attributes(MapLoss.measure(T))
@@ -136,23 +135,23 @@ def _percent(error: float) -> str:
 
 
 def _write_files(
-    folder: Path, projectors: Sequence[Any], wanted: Sequence[str], remark: str
+    folder: Path, projectors: Sequence[Any], formats: Sequence[str], remark: str
 ) -> list[str]:
     """Write all files; return their names."""
     from ltcl.show import export
 
     files: list[str] = []
     for projector in projectors:
-        if "maps" in wanted:
+        if "maps" in formats:
             files += export.write_maps(folder, projector)
-        if "png" in wanted:
+        if "png" in formats:
             files += export.write_masks(folder, projector)
-        if "obj" in wanted:
+        if "obj" in formats:
             files += export.write_mesh(folder, projector, remark)
-        if "cube" in wanted:
+        if "cube" in formats:
             files += export.write_cubes(folder, projector, remark)
     for name, version in (("mpcdi", "2.0"), ("mpcdi1", "1.0")):
-        if name in wanted:
+        if name in formats:
             files.append(f"projectors_{version}.mpcdi" if name == "mpcdi1" else "projectors.mpcdi")
             export.write_mpcdi(folder / files[-1], projectors, remark, version)
     return files

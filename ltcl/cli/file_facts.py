@@ -171,7 +171,8 @@ def _check_record(record: StoreRecord) -> None:
         return
     matrices: list[Any] = list(record.matrices)
     for matrix in matrices:
-        checks.finite("T", matrix if record.dense else matrix.data)
+        entries = matrix if record.dense else matrix.data
+        checks.finite("T", entries)
 
 
 def judge(record: StoreRecord | CompressedRecord | CombinedRecord, facts: FileFacts) -> Verdict:

@@ -13,6 +13,7 @@ from ltcl.cli.options import argument, check_writable_file, file_option, option
 from ltcl.cli.reports.pictures import FilmReport, FrameReport
 from ltcl.cli.tables import percent, table
 from ltcl.errors import InputError
+from ltcl.files import input_file
 
 FRAMES_PANEL = "Frames"
 frame_option = partial(option, panel=FRAMES_PANEL)
@@ -98,6 +99,8 @@ def film(
     from ltcl.images.frames import is_frames
 
     if not is_frames(film):
+        # One that is missing is no picture either.
+        input_file(film)
         problem = f"FILM is {film}; it must be a video or a folder"
         raise InputError(f"{problem}; 'ltcl compensate' is for pictures")
     job = compensation.prepare(context, transport)

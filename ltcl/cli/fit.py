@@ -15,11 +15,13 @@ from ltcl.cli.options import argument, file_option, option, out_option
 from ltcl.cli.reports.acquisition import FitReport
 from ltcl.cli.reports.parts import Channels
 from ltcl.cli.tables import percent
-from ltcl.errors import FileError
+from ltcl.errors import FileError, InputError
 from ltcl.store import formats
 
 # Camera pixels to a side of a projector pixel, beyond which photographs show nothing more.
 MAX_CAMERA_PIXELS = 4
+# Light below a photograph of black, to that above it, at most: more is not noise.
+MAX_NEGATIVE_SHARE = 0.2
 
 PairsFolder = Annotated[
     Path, argument("FOLDER", "Folder with patterns and photographs: folders of pictures, or films.")
@@ -27,7 +29,7 @@ PairsFolder = Annotated[
 FitGeometry = Annotated[
     Literal["aligned", "pairs"],
     option(
-        "Where the camera looks; aligned: at the projector's pixels, pairs: found from the pairs."
+        "Direction of the camera; aligned: at the projector's pixels, pairs: found from the pairs."
     ),
 ]
 # Not a tuple: typer would ask for two words.
@@ -45,7 +47,7 @@ Black = Annotated[
 ]
 
 
-@command(options.picture_options)
+@command(options.encoding_options)
 def fit(
     context: Context,
     folder: PairsFolder,
@@ -67,7 +69,7 @@ def fit(
 
     target = folder / "transport.npz" if out is None else out
     formats.find(target)
-    patterns = _read_frames(context, _find_frames(folder, "patterns"), grid)
+    patterns = _read_frames(context, _find_frames(folder, "patterns"), grid, averages=True)
     size = patterns.shape[1:3]
     path = _find_frames(folder, "photographs")
     if geometry == "pairs":
@@ -75,7 +77,7 @@ def fit(
     else:
         photographs = _read_frames(context, path, grid)
     if black is not None:
-        photographs = photographs - _read_black(context, black, photographs)
+        photographs = photographs - _read_black(context, black, path, photographs)
     result = acquisition.fit(
         patterns, photographs, geometry=geometry, device=device, progress=context.progress
     )
@@ -128,9 +130,17 @@ def _find_frames(folder: Path, name: str) -> Path:
 
 
 def _read_frames(
-    context: Context, path: Path, grid: tuple[int, int] | None, most: int | None = None
+    context: Context,
+    path: Path,
+    grid: tuple[int, int] | None,
+    most: int | None = None,
+    *,
+    averages: bool = False,
 ) -> np.ndarray:
-    """All frames as linear light, (frames, h, w[, 3]), on a grid, or with `most` pixels a side."""
+    """All frames as linear light, (frames, h, w[, 3]), on a grid, or with `most` pixels a side.
+
+    One that `averages` refuses a grid of more pixels than the frames have.
+    """
     from ltcl import images
     from ltcl.images.frames import open_frames
 
@@ -143,6 +153,11 @@ def _read_frames(
             scale = most / max(size)
             size = (max(round(size[0] * scale), 1), max(round(size[1] * scale), 1))
         if grid is not None:
+            if averages and (grid[0] > size[0] or grid[1] > size[1]):
+                raise InputError(
+                    f"--grid is {grid[0]}x{grid[1]}, but {path} has {size[0]} x {size[1]} pixels; "
+                    "it must be as many or fewer"
+                )
             size = grid
         if size != picture.shape[:2]:
             picture = images.resize(picture, size)
@@ -156,12 +171,29 @@ def _read_frames(
     return np.stack(frames)
 
 
-def _read_black(context: Context, path: Path, photographs: np.ndarray) -> np.ndarray:
-    """The photograph of black, on the pixels and in the colours of the others."""
+def _read_black(context: Context, path: Path, source: Path, photographs: np.ndarray) -> np.ndarray:
+    """The photograph of black, on the pixels and in the colours of those of `source`."""
     from ltcl import images
+    from ltcl.images.frames import open_frames
 
-    picture = images.read(path, encoding=context.options["encoding"])
+    encoding = context.options["encoding"]
+    picture = images.read(path, encoding=encoding)
+    first = next(iter(open_frames(source, encoding=encoding))).picture()
+    if picture.shape[:2] != first.shape[:2]:
+        sizes = [f"{height} x {width}" for height, width in (picture.shape[:2], first.shape[:2])]
+        raise InputError(
+            f"{path}: has {sizes[0]} pixels, the photographs {sizes[1]}; it must be a photograph "
+            "by the same camera"
+        )
     picture = images.resize(picture, photographs.shape[1:3])
     if picture.ndim < photographs.ndim - 1:
         picture = picture[..., None]
+    light = photographs.mean(axis=0) - picture
+    negative = np.minimum(light, 0.0).sum()
+    if -negative > MAX_NEGATIVE_SHARE * np.maximum(light, 0.0).sum():
+        share = (light < 0.0).mean()
+        raise InputError(
+            f"{path}: is brighter than the mean photograph at {percent(share, 2)} of the pixels; "
+            "it must be taken with the same exposure, while the projector shows black"
+        )
     return picture

@@ -37,7 +37,7 @@ def import_photographs(
     order: Annotated[
         str,
         option(
-            "Which file shows which pattern: opencv (columns, then rows, coarsest first, each "
+            "Order of the files: opencv (columns, then rows, coarsest first, each "
             "followed by its inverse; white; black), scan3d (that of Moreno and Taubin), or a TOML "
             "file.",
             metavar="opencv|scan3d|FILE",
@@ -52,8 +52,8 @@ def import_photographs(
     """Read photographs of Gray code that another program took.
 
     OUT gets map.npz, which projector pixel each camera pixel sees; and with a photograph of white
-    direct.npz, a transport of direct light alone, for blending and colours. What bounces is not in
-    it: that takes a scan.
+    direct.npz, a transport of direct light alone, for blending and colours. Light that bounces is
+    not in it: that takes a scan.
     """
     from ltcl.acquisition import import_gray_code
     from ltcl.acquisition.captures.map_file import write_map

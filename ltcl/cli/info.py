@@ -10,7 +10,8 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.cli import file_facts, options, panels
-from ltcl.cli.command import FAILED, Answer, Context, command, fail
+from ltcl.cli.command import Answer, Context, command
+from ltcl.cli.failure import FAILED, fail
 from ltcl.cli.reports.parts import VerdictReport
 from ltcl.cli.reports.transports import BadFile, FileFacts, GoodFile
 from ltcl.cli.tables import interval_text, size_text, table, verdict_lines

@@ -88,7 +88,19 @@ def load_setup(transport: Path, calibration: Path | None = None) -> Any:
     # The import takes a second.
     from ltcl.acquisition import Setup
 
-    return Setup.of(transport if calibration is None else calibration)
+    if calibration is None:
+        return Setup.of(transport)
+    return Setup.of(calibration)
+
+
+def setup_of_several(T: Transport) -> Any:
+    """Calibrations of the projectors of a combination of scans; None for any other T."""
+    if T.scene is T:
+        return None
+    # The import takes a second.
+    from ltcl.acquisition.projectors import CombinedSetup
+
+    return CombinedSetup.of(T)
 
 
 def note_lost_setup(source: Path, target: Path) -> None:
@@ -138,12 +150,15 @@ def load_inverse(context: Context, T: Transport) -> Inverse | None:
 def _load_original(context: Context, T: Transport) -> Transport:
     """Load the original of a compressed T, with the first bounce of T; refuse another one."""
     path = context.options["exact"]
+    on_dark = "raise"
+    if T.masked.any():
+        on_dark = "mask"
     exact = store.load(
         path,
         variable=context.options["variable"],
         grid=T.grid,
         first_bounce=T.first_bounce,
-        on_dark="mask" if T.masked.any() else "raise",
+        on_dark=on_dark,
         dark_threshold=0.0,
         device=T.device,
     )

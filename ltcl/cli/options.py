@@ -24,6 +24,8 @@ from ltcl.transport.first_bounce import DARK_THRESHOLD
 TRANSPORT_PANEL = "Reading the transport"
 SOLVER_PANEL = "Solving"
 PICTURES_PANEL = "Reading pictures"
+# Larger limits are printed as powers of two.
+MAX_PRINTED = 65535
 
 
 def parse_grid(text: str) -> tuple[int, int]:
@@ -96,11 +98,48 @@ def argument(metavar: str, help: str, parser: Any = parse_path, **settings: Any)
     return typer.Argument(metavar=metavar, help=help, parser=parser, **settings)
 
 
-def option(help: str, *names: str, **settings: Any) -> Any:
-    """Declare an option; `panel` is the heading in the help under which it stands."""
+def option(
+    help: str,
+    *names: str,
+    min: float | None = None,
+    max: float | None = None,
+    **settings: Any,
+) -> Any:
+    """Declare an option of numbers within a range, or of other values.
+
+    `panel` is the heading in the help under which it stands.
+    """
     if "panel" in settings:
         settings["rich_help_panel"] = settings.pop("panel")
+    if min is not None:
+        allowed = _range_in_words(min, max)
+        help = f"{help} {allowed[0].upper()}{allowed[1:]}."
+        settings["callback"] = _range_check(min, max)
     return typer.Option(*names, help=help, **settings)
+
+
+def _range_in_words(least: float, most: float | None) -> str:
+    if most is None:
+        return f"at least {least:g}"
+    highest = f"{most:g}"
+    if most > MAX_PRINTED:
+        highest = f"2^{int(most).bit_length()} - 1"
+    return f"from {least:g} to {highest}"
+
+
+def _range_check(least: float, most: float | None) -> Any:
+    """Make a callback that refuses numbers beyond a range.
+
+    Typer's own ranges print as <int range [0<=x<=18446744073709551615]>.
+    """
+
+    def check(value: Any) -> Any:
+        # None is the default of an option that may be left out.
+        if value is None or (value >= least and (most is None or value <= most)):
+            return value
+        raise typer.BadParameter(f"it must be {_range_in_words(least, most)}")
+
+    return check
 
 
 file_option = partial(option, parser=parse_path, metavar="FILE")
@@ -121,10 +160,8 @@ FORMATS = (
 )
 SHOW_DARK_HELP = "PNG of the direct light to write; pixels without it are orange."
 TransportFile = Annotated[Path, argument("TRANSPORT", FORMATS)]
-TransportFiles = Annotated[list[Path], argument("FILE...", FORMATS)]
-Pictures = Annotated[
-    list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")
-]
+TransportFiles = Annotated[list[Path], argument("FILE", FORMATS)]
+Pictures = Annotated[list[Path], argument("PICTURE", "Pictures: .png, .jpg, .tif, .bmp or .exr.")]
 OutFolder = Annotated[
     Path,
     out_option(
@@ -135,6 +172,10 @@ OutFolder = Annotated[
 ]
 Acquisition = Annotated[
     Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")
+]
+ProjectorName = Annotated[
+    str | None,
+    option("Name of the projector, of several in acquisition.toml.", "--projector", metavar="NAME"),
 ]
 DeviceName = Annotated[
     str | None,
@@ -263,8 +304,23 @@ def frame_options(
             panel=SOLVER_PANEL,
         ),
     ] = None,
+    bounces_every: Annotated[
+        int,
+        solver_option(
+            "Compute the light of bounces of every N-th frame, for the frames in between, too: "
+            "faster, and wrong by the bounces of what has changed.",
+            metavar="N",
+            min=1,
+        ),
+    ] = 1,
 ) -> None:
     """Options of frames that are prepared once."""
+
+
+PictureEncoding = Annotated[
+    Literal["auto", "srgb", "linear"],
+    picture_option("Encoding of input pictures; auto: integers are sRGB, floats linear."),
+]
 
 
 def picture_options(
@@ -275,12 +331,13 @@ def picture_options(
             "too much, add black bars, or distort them."
         ),
     ] = None,
-    encoding: Annotated[
-        Literal["auto", "srgb", "linear"],
-        picture_option("Encoding of input pictures; auto: integers are sRGB, floats linear."),
-    ] = "auto",
+    encoding: PictureEncoding = "auto",
 ) -> None:
     """Options of reading pictures."""
+
+
+def encoding_options(encoding: PictureEncoding = "auto") -> None:
+    """Options of reading pictures that are not scaled as asked for."""
 
 
 READ_OPTIONS = (file_options, transport_options)

@@ -117,8 +117,13 @@ def contact_sheet(rows: Sequence[Sequence[Image.Image]]) -> Image.Image:
     widths = []
     heights = []
     for row in rows:
-        widths.append(sum(shown.width + MARGIN for shown in row))
-        heights.append(max(shown.height for shown in row) + MARGIN)
+        width = 0
+        height = 0
+        for shown in row:
+            width += shown.width + MARGIN
+            height = max(height, shown.height + MARGIN)
+        widths.append(width)
+        heights.append(height)
     size = (max(widths) + MARGIN, sum(heights) + MARGIN)
     sheet = Image.new("RGB", size, PAPER)
     top = MARGIN

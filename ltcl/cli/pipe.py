@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -104,7 +105,7 @@ def run(context: Context, scene: Any, gain: Any, resize: str, settings: dict[str
     ):
         late = context.options["late"]
         result = pipes.pipe(projection, source, stdin, stdout, late=late, progress=context.progress)
-        note(_describe(result, projection.statistics.latency_p99))
+        note(describe_pipe(result, projection.statistics.latency_p99))
     return Answer(PlayReport(film=Path("-")), [])
 
 
@@ -123,12 +124,15 @@ def _source(context: Context, camera_grid: tuple[int, int]) -> Any:
     )
 
 
-def _describe(result: Any, computing: float) -> str:
+def describe_pipe(result: Any, computing: float) -> str:
     """Return a line on what went through."""
     line = (
         f"{result.written} frames written, {result.frames_per_second:.1f} a second, "
-        f"{result.dropped} of them repeated; 99 % computed within {1e3 * computing:.1f} ms"
+        f"{result.dropped} of them repeated"
     )
+    if not math.isnan(computing):
+        # Without a frame there is no time.
+        line += f"; 99 % computed within {1e3 * computing:.1f} ms"
     if result.is_cut_off:
         line += "; nobody reads stdout any more"
     return line

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ltcl.cli.command import fail
+from ltcl.cli.failure import fail
 from ltcl.errors import InputError
 
 # Seconds within which ranks that fail with the same error do so.
@@ -25,11 +25,9 @@ COMMON_FAILURE_SECONDS = 5.0
 def run_on_every_rank(run: Callable[[list[str]], int], words: list[str]) -> int:
     """Run the command `words` on this rank, and wait for all others."""
     try:
-        from mpi4py import MPI
-    except (ImportError, RuntimeError) as error:
-        # It is a RuntimeError if mpi4py finds no library of MPI.
-        problem = InputError(f"--mpi needs mpi4py and an MPI, pip install mpi4py mpich: {error}")
-        return fail(problem, "--json" in words).exit_code
+        MPI = _load_mpi()
+    except InputError as error:
+        return fail(error, "--json" in words).exit_code
     ranks = MPI.COMM_WORLD.Dup()
     if ranks.rank == 0:
         errors = io.StringIO()
@@ -38,6 +36,17 @@ def run_on_every_rank(run: Callable[[list[str]], int], words: list[str]) -> int:
         code, errors = _run_silently(run, words)
     _wait_for_all(ranks, code, errors.getvalue())
     return code
+
+
+def _load_mpi() -> Any:
+    # It imports NumPy.
+    from ltcl import checks
+
+    try:
+        return checks.load_extra("mpi4py.MPI", "mpi", "--mpi")
+    except RuntimeError as error:
+        advice = "python -m pip install mpich brings one"
+        raise InputError(f"--mpi finds no library of MPI ({error}); {advice}") from None
 
 
 def _run_silently(run: Callable[[list[str]], int], words: list[str]) -> tuple[int, io.StringIO]:

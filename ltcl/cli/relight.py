@@ -18,7 +18,7 @@ from ltcl.tasks import relighting
 def relight(
     context: Context,
     transport: options.TransportFile,
-    pattern: Annotated[list[Path], argument("PATTERN...", "Pictures of patterns.")],
+    pattern: Annotated[list[Path], argument("PATTERN", "Pictures of patterns.")],
     out: options.OutFolder,
     on_dark: options.OnDark = "mask",
     device: options.DeviceName = None,

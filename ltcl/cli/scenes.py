@@ -90,9 +90,12 @@ def _find_transports(pattern: str, out: Path) -> list[Path]:
         raise InputError(
             f"--transports is {pattern}: it must mean files or folders of different names"
         )
-    places = {out.resolve(), *((out / stem).resolve() for stem in stems)}
-    if any(transport.resolve() in places for transport in transports):
-        raise InputError(f"--out is {out}, where transports are; it must be another place")
+    written = {out.resolve()}
+    for stem in stems:
+        written.add((out / stem).resolve())
+    for transport in transports:
+        if transport.resolve() in written:
+            raise InputError(f"--out is {out}, where transports are; it must be another place")
     return transports
 
 

@@ -101,12 +101,15 @@ class PartsWriter:
             panel = panels.linear_panel(picture, label, self.factor)
             shown.append(panel)
             files = panels.write(folder, place, picture, panel)
+            share = None
+            if whole:
+                share = _mean(picture) / whole
             entry = LightPart(
                 part=label,
                 exr=files.exr,
                 png=files.png,
                 lowest=float(picture.min()),
-                share=_mean(picture) / whole if whole else None,
+                share=share,
                 channels=solves(solved.get(label, ())),
             )
             if label in deviations:

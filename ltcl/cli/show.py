@@ -56,6 +56,11 @@ def play(
     if context.options["pipe"] != is_stdin:
         given = "given" if context.options["pipe"] else "not given"
         raise InputError(f"FILM is {film}, but --pipe is {given}; raw video on stdin takes both")
+    if context.options["video_size"] is not None and not is_stdin:
+        raise InputError(
+            f"--video-size is {context.options['video_size']}, but --pipe is not given; they "
+            "belong together"
+        )
     if is_stdin:
         pipe.check(context, gain)
     with control.controlled(context) as asked:
@@ -70,11 +75,12 @@ def _load_scene(context: Context, transport: Path) -> tuple[Any, dict[str, Any]]
     from ltcl.viewer.answers import ViewerScene
 
     T = loading.load(context, transport)
-    setup = loading.load_setup(transport)
+    setup = loading.load_setup(transport) or loading.setup_of_several(T)
     settings: dict[str, Any] = {
         "rtol": context.options["rtol"],
         "inverse": loading.load_inverse(context, T),
         "background": None if setup is None else setup.ambient,
+        "bounces_every": context.options["bounces_every"],
     }
     return ViewerScene(T, transport.name, {}, setup), settings
 
@@ -125,7 +131,9 @@ def show(
             "'ltcl compensate'.",
         ),
     ],
-    display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
+    display: Annotated[
+        int, option("Number of the display; the first one is 0.", metavar="N", min=0)
+    ] = 1,
     every: Annotated[
         float | None,
         option("Seconds between two pictures. Default: until a key is pressed.", metavar="SECONDS"),

@@ -18,6 +18,7 @@ from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, grid_option, option
 from ltcl.cli.reports.acquisition import SimulateReport
 from ltcl.cli.reports.parts import Versions
+from ltcl.cli.side_by_side import side_by_side
 from ltcl.cli.tables import size_text
 from ltcl.errors import InputError
 from ltcl.store import CombinedRecord, StoreRecord, formats
@@ -25,6 +26,11 @@ from ltcl.tasks.report import versions
 
 SCENES = ("dihedral", "trihedral", "box")
 TEMPLATE = Path(__file__).with_name("acquisition.toml.in")
+SEVERAL_TEMPLATE = Path(__file__).with_name("projectors.toml.in")
+# Camera pixels along the side of a patch, and patches along that of a pixel of T, with several
+# projectors, whose pixels are as large as patches.
+CAMERA_PIXELS = 3
+SIDE_PATCHES = 2
 DEFAULT_SIZE = 16
 DEFAULT_ALBEDO = (0.7,)
 DEFAULT_AMBIENT = 0.01
@@ -86,6 +92,16 @@ def _rig_options(
             panel=RIG_PANEL,
         ),
     ] = None,
+    projectors: Annotated[
+        int | None,
+        option(
+            "So many projectors side by side, which overlap by a third, instead of one; of a "
+            "named scene. The camera then has three pixels along the side of a patch.",
+            panel=RIG_PANEL,
+            min=2,
+            max=8,
+        ),
+    ] = None,
     response: Annotated[
         Curve, option("Response curve of the camera, light to code.", panel=RIG_PANEL)
     ] = "srgb",
@@ -109,8 +125,8 @@ def simulate(
         str,
         argument(
             "SCENE",
-            "dihedral, trihedral, box; a transport file; or mitsuba: and one of these or an XML "
-            "file of Mitsuba.",
+            "Scene: dihedral, trihedral, box; a transport file; or mitsuba: and one of these or an "
+            "XML file of Mitsuba.",
             parser=None,
         ),
     ],
@@ -127,9 +143,12 @@ def simulate(
     asked = {name: value for name, value in context.options.items() if name != "out"}
     context.progress("scene")
     with pictures.fill(out) as folder:
-        _write_project(folder, scene, asked)
+        if asked["projectors"] is None:
+            _write_project(folder, scene, asked)
+        else:
+            _write_several(folder, scene, asked)
         # Opening the rig refuses what cannot be photographed.
-        with Project.open(folder).rig() as rig:
+        with Project.open_all(folder)[0].rig() as rig:
             report = SimulateReport(
                 folder=out,
                 command="simulate",
@@ -141,8 +160,9 @@ def simulate(
             )
         pictures.write_report(folder, report)
     size = size_text(report.projector_grid)
+    several = "" if asked["projectors"] is None else f"{asked['projectors']} projectors of "
     lines = [
-        f"{out}: {scene}, {size} projector pixels, {report.channels} channel(s)",
+        f"{out}: {scene}, {several}{size} projector pixels, {report.channels} channel(s)",
         f"what it takes: ltcl acquire plan {out}",
         f"to do it:      ltcl acquire run {out}",
     ]
@@ -171,6 +191,53 @@ def _write_project(folder: Path, scene: str, asked: dict[str, Any]) -> None:
         "strategy": asked["strategy"],
     }
     text = TEMPLATE.read_text("utf-8").format(rig=_toml(rig), acquire=_toml(settings))
+    (folder / "acquisition.toml").write_text(text, "utf-8")
+
+
+def _write_several(folder: Path, scene: str, asked: dict[str, Any]) -> None:
+    """Write acquisition.toml of several projectors, and the files that it names."""
+    if scene not in SCENES:
+        raise InputError(
+            f"--projectors is {asked['projectors']}, but SCENE is {scene}; it must be one of "
+            f"{', '.join(SCENES)}"
+        )
+    for name in ("camera_grid", "grid"):
+        if asked[name] is not None:
+            raise InputError(
+                f"--{name.replace('_', '-')} is {asked[name]}, but with --projectors the scene "
+                "decides"
+            )
+    light = _named_scene(scene, asked)
+    scene_grid = checks.grid("grid", light.grid or (1, 1))
+    camera_grid = (CAMERA_PIXELS * scene_grid[0], CAMERA_PIXELS * scene_grid[1])
+    _write_camera(folder / "camera.npz", camera_grid, scene_grid)
+    ambient = asked["ambient"]
+    rig = {
+        "kind": "virtual",
+        "camera_map": "camera.npz",
+        "camera_grid": camera_grid,
+        "ambient": DEFAULT_AMBIENT if ambient is None else ambient,
+    }
+    for name in ("response", "projector_response", "bits", "seed"):
+        rig[name] = asked[name]
+    tables = []
+    albedo = asked["albedo"] or DEFAULT_ALBEDO
+    for projector in side_by_side(asked["projectors"], scene_grid):
+        direct = projector.direct(scene_grid).toarray()
+        matrices = []
+        for T, part in zip(light.matrices, albedo, strict=True):
+            # T of a scene is S times its albedo.
+            matrices.append(np.asarray(T @ direct / part, np.float32))
+        path = f"{projector.name}.npz"
+        record = StoreRecord(tuple(matrices), grid=projector.grid, camera_grid=scene_grid)
+        formats.write(folder / path, record)
+        tables.append(f"[[projector]]\n{_toml({'name': projector.name, 'transport': path})}")
+    text = SEVERAL_TEMPLATE.read_text("utf-8").format(
+        rig=_toml(rig),
+        projectors="\n".join(tables),
+        side=SIDE_PATCHES * CAMERA_PIXELS,
+        acquire=_toml({"strategy": asked["strategy"]}),
+    )
     (folder / "acquisition.toml").write_text(text, "utf-8")
 
 

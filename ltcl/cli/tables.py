@@ -58,7 +58,12 @@ def percent(share: float | None, digits: int = 3) -> str | None:
     """Format a share in percent; None if it is unknown."""
     if share is None:
         return None
-    return f"{100 * share:.{digits}g} %"
+    value = 100 * share
+    if 1 <= value < 1000:
+        # 60 %, and not 6e+01 %.
+        whole_digits = len(str(round(value)))
+        digits = max(digits, whole_digits)
+    return f"{value:.{digits}g} %"
 
 
 def size_text(size: tuple[int, int] | None) -> str:

@@ -16,6 +16,8 @@ from ltcl.cli.streams import print_line
 from ltcl.device import open_device
 from ltcl.errors import InputError
 
+PROJECT = "acquisition.toml"
+
 address_option = partial(option, panel="Address of the page")
 
 
@@ -35,10 +37,11 @@ def address_options(
             max=65535,
         ),
     ] = 0,
-    url: Annotated[
+    origin: Annotated[
         str,
         address_option(
-            "URL of the page behind a proxy or on a forwarded port, such as http://localhost:9000."
+            "URL of the page behind a proxy or on a forwarded port, such as http://localhost:9000.",
+            metavar="URL",
         ),
     ] = "",
     no_browser: Annotated[
@@ -53,7 +56,7 @@ def address(context: Context) -> dict[str, Any]:
     return {
         "host": context.options["host"],
         "port": context.options["port"],
-        "url": context.options["url"],
+        "origin": context.options["origin"],
         "open_browser": not context.options["no_browser"],
     }
 
@@ -62,16 +65,17 @@ def address(context: Context) -> dict[str, Any]:
 def view(
     context: Context,
     transport: Annotated[
-        Path, argument("TRANSPORT", f"{options.FORMATS} Or the folder of an acquisition.")
+        Path, argument("TRANSPORT", f"{options.FORMATS} The folder of an acquisition will do, too.")
     ],
-    picture: Annotated[list[Path] | None, argument("PICTURE...", "Pictures to start with.")] = None,
+    picture: Annotated[list[Path] | None, argument("PICTURE", "Pictures to start with.")] = None,
 ) -> Answer:
     """Look at TRANSPORT in the browser: probe, bounces, relight, compensate, projector.
 
     Ctrl-C ends it.
 
     The folder of an acquisition shows, while it runs or afterwards, photographs as they come, their
-    exposure, coverage, time left and warnings; and its transport as soon as that is finished.
+    exposure, coverage, time left and warnings; and its transport as soon as that is finished. One
+    of several projectors shows them combined, once all are scanned.
     """
     from ltcl.viewer.server import Viewer
 
@@ -91,11 +95,33 @@ def _make_scene(context: Context, transport: Path, paths: list[Path]) -> Any:
     from ltcl.viewer.answers import ViewerScene
     from ltcl.viewer.scan import Scan
 
-    if not (transport / "acquisition.toml").exists():
+    if not (transport / PROJECT).exists():
         T = loading.load(context, transport)
         pictures = {path.name: images.read(path) for path in paths}
         return ViewerScene(T, transport.name, pictures, loading.load_setup(transport))
+    if _has_several(transport):
+        T = _combine(context, transport)
+        pictures = {path.name: images.read(path) for path in paths}
+        return ViewerScene(T, transport.name, pictures, None)
     if paths:
         problem = f"PICTURE is {paths[0]}, but {transport} is an acquisition"
         raise InputError(f"{problem}; it takes none")
     return Scan(transport, open_device(context.options["device"]))
+
+
+def _has_several(folder: Path) -> bool:
+    """True if an acquisition is of several projectors."""
+    from ltcl.acquisition import Project
+
+    return len(Project.open_all(folder)) > 1
+
+
+def _combine(context: Context, folder: Path) -> Any:
+    """Combine the scans of several projectors, as `ltcl combine` does."""
+    from ltcl.acquisition.projectors import combine_scans
+    from ltcl.acquisition.several import scanned_stores
+
+    stores = scanned_stores(folder)
+    device = open_device(context.options["device"])
+    context.progress("combining")
+    return combine_scans(stores, device=device)

@@ -37,7 +37,7 @@ class Demo:
 
 def run(
     out: str | os.PathLike[str] = "ltcl-demo",
-    size: int = 36,
+    size: int = 32,
     *,
     device: Any = None,
     progress: Callable[[str], object] | None = None,
@@ -49,7 +49,8 @@ def run(
     out : path
         Folder; files of an earlier run are replaced only when everything has succeeded.
     size : int
-        Patches along a wall, at least 4: the projector has 3 * size^2 pixels.
+        Patches along a wall, at least 4, of 8 x 8 pixels each: the projector has 192 * size^2
+        pixels.
     device : Device or str, optional
         A device as `open_device` takes it.
     progress : callable(step), optional

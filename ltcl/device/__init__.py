@@ -10,5 +10,16 @@ from ltcl.device.arrays import Array
 from ltcl.device.device import Device
 from ltcl.device.discovery import Description, list_devices, open_device
 from ltcl.device.kernels import Kernel, Launch
+from ltcl.device.profile import Profile, Times
 
-__all__ = ["Array", "Description", "Device", "Kernel", "Launch", "list_devices", "open_device"]
+__all__ = [
+    "Array",
+    "Description",
+    "Device",
+    "Kernel",
+    "Launch",
+    "Profile",
+    "Times",
+    "list_devices",
+    "open_device",
+]

@@ -141,8 +141,12 @@ def round_inwards(lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.nd
     >>> bool(np.float32(0.7) > 0.7 >= high), bool(low >= 0.1)
     (False, True)
     """
-    lower = np.asarray(lower, np.float64)
-    upper = np.asarray(upper, np.float64)
+    lower = np.asarray(lower)
+    upper = np.asarray(upper)
+    if lower.dtype == upper.dtype == np.float32:
+        return lower, upper
+    lower = lower.astype(np.float64)
+    upper = upper.astype(np.float64)
     nearest_low = lower.astype(np.float32)
     nearest_high = upper.astype(np.float32)
     next_above = np.nextafter(nearest_low, np.float32(np.inf))

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from ltcl import checks
 from ltcl.device import driver_errors, huge_pages, sources
 from ltcl.device.arrays import Array, rounded
 from ltcl.device.kernels import Kernel
-from ltcl.errors import MemoryLimitError
+from ltcl.device.profile import COPY, DOWNLOAD, UPLOAD, Profile
+from ltcl.errors import DeviceError, MemoryLimitError
 
 if TYPE_CHECKING:
     from ltcl.device.discovery import Description
@@ -33,12 +35,14 @@ POOL_BIN_BITS = 4
 class Session:
     """Everything that is open on an OpenCL device; several `Device`s may share it."""
 
-    def __init__(self, handle: Any) -> None:
+    def __init__(self, handle: Any, context: Any = None) -> None:
         import pyopencl as cl
         from pyopencl.tools import ImmediateAllocator, MemoryPool
 
-        self.context = cl.Context([handle])
-        self.queue = cl.CommandQueue(self.context)
+        self.handle = handle
+        # Devices of one context copy between each other.
+        self.context = cl.Context([handle]) if context is None else context
+        self.queue = cl.CommandQueue(self.context, handle)
         allocator = ImmediateAllocator(self.queue)
         self.pool = MemoryPool(allocator, leading_bits_in_bin_id=POOL_BIN_BITS)
         self.launches = Counter[str]()
@@ -47,8 +51,63 @@ class Session:
         # Plans of ltcl.device.vectors, by kernel and size.
         self.reductions: dict[tuple, Any] = {}
         self.lock = threading.RLock()
+        # Held while something is queued, as `profile` changes the queue.
+        self.queueing = threading.Lock()
+        self.profiles: list[Profile] = []
+        self._plain_queue = self.queue
+        self._timed_queue: Any = None
+        self._transfer_queues: dict[str, Any] = {}
         # Held while a program is built, for as long as a compiler takes.
         self.building = threading.RLock()
+
+    @property
+    def uploads(self) -> Any:
+        """A queue of copies from the host alone, made when it is asked for."""
+        return self._transfer_queue(UPLOAD)
+
+    @property
+    def downloads(self) -> Any:
+        """A queue of copies to the host alone, made when it is asked for."""
+        return self._transfer_queue(DOWNLOAD)
+
+    def _transfer_queue(self, direction: str) -> Any:
+        with self.lock:
+            if direction not in self._transfer_queues:
+                self._transfer_queues[direction] = self._make_timed_queue()
+            return self._transfer_queues[direction]
+
+    def _make_timed_queue(self) -> Any:
+        """A queue whose events have times."""
+        import pyopencl as cl
+
+        timed = cl.command_queue_properties.PROFILING_ENABLE
+        return cl.CommandQueue(self.context, self.handle, timed)
+
+    def begin(self, profile: Profile) -> None:
+        """Have a profile take note of all that is queued from now on."""
+        if self._timed_queue is None:
+            self._timed_queue = self._make_timed_queue()
+        with self.queueing:
+            self.profiles.append(profile)
+            self._change_queue(self._timed_queue)
+
+    def end(self, profile: Profile) -> None:
+        """Have a profile take no more notes."""
+        with self.queueing:
+            self.profiles.remove(profile)
+            if not self.profiles:
+                self._change_queue(self._plain_queue)
+
+    def _change_queue(self, queue: Any) -> None:
+        """Use another queue, in which all waits for what is queued in this one."""
+        import pyopencl as cl
+
+        if queue is self.queue:
+            return
+        queued = cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        cl.enqueue_barrier(queue, wait_for=[queued])
+        self.queue = queue
 
 
 class Device:
@@ -89,7 +148,6 @@ class Device:
                 session = Session(handle)
         self.session = session
         self.context = session.context
-        self.queue = session.queue
         self.launches = session.launches
         self.compute_units: int = handle.max_compute_units
         self.max_group: int = handle.max_work_group_size
@@ -109,12 +167,31 @@ class Device:
         return f"<ltcl device {self.description.index} {self.name}, {self.driver}>"
 
     @property
+    def queue(self) -> Any:
+        """The queue of OpenCL; `profile` changes it for a while."""
+        return self.session.queue
+
+    @property
+    def has_clock(self) -> bool:
+        """True if the device tells when a kernel began and ended."""
+        timed = self.cl.command_queue_properties.PROFILING_ENABLE
+        return bool(self.handle.queue_properties & timed)
+
+    @property
     def is_cpu(self) -> bool:
         """True if kernels should run a stream per work-item instead of an item per value."""
         return self.kind in ("cpu", "simulator")
 
+    @property
+    def subgroup(self) -> int:
+        """Work-items that a GPU runs in step, as its driver says: 32 or 64 on most."""
+        return self.kernel("vector", "vector_fill").subgroup
+
     def kernel(self, file: str, name: str, **defines: Any) -> Kernel:
-        """Kernel `name` of `kernels/<file>.cl` with `defines`; built at the first call only."""
+        """Kernel `name` of `kernels/<file>.cl` with `defines`; built at the first call only.
+
+        A `file` that ends with .cl is the path of one elsewhere.
+        """
         program, kernels = self.program(file, defines)
         with self.session.lock:
             if name not in kernels:
@@ -136,16 +213,19 @@ class Device:
         """True if a program is built."""
         return (file, *sorted(defines.items())) in self.session.programs
 
-    def launch(
-        self, name: str, handle: Any, items: tuple[int, ...], group: tuple[int, ...]
-    ) -> None:
-        """Queue a cl_kernel whose arguments are set."""
+    def launch(self, name: str, handle: Any, items: tuple[int, ...], group: tuple[int, ...]) -> Any:
+        """Queue a cl_kernel whose arguments are set; returns its event."""
         driver_errors.refuse_forked()
+        session = self.session
         try:
-            self.cl.enqueue_nd_range_kernel(self.queue, handle, items, group)
+            with session.queueing:
+                event = self.cl.enqueue_nd_range_kernel(session.queue, handle, items, group)
         except self.cl.Error as error:
             raise driver_errors.explain(f"running {name} on {self.name}", error) from error
         self.launches[name] += 1
+        for profile in session.profiles:
+            profile.add(name, event)
+        return event
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any = np.float32) -> Array:
         """Make an uninitialised array, in microseconds.
@@ -212,16 +292,106 @@ class Device:
 
     def copy(self, destination: Any, source: Any, **sizes: Any) -> None:
         """Copy between a host array and a buffer, and wait; or queue a copy of two buffers."""
-        with driver_errors.translated(f"copying on {self.name}"):
-            self.cl.enqueue_copy(self.queue, destination, source, **sizes)
+        with (
+            driver_errors.translated(f"copying on {self.name}"),
+            self._queueing_of(destination, source),
+        ):
+            event = self.cl.enqueue_copy(self.queue, destination, source, **sizes)
+        self._note_copy(event, destination, source, sizes)
 
     def queue_copy(self, destination: Any, source: Any) -> Any:
         """Queue a copy between a host array and a buffer; the host array must stay until it ends.
 
         Returns an object whose `wait` returns when it has ended.
         """
-        with driver_errors.translated(f"copying on {self.name}"):
-            return self.cl.enqueue_copy(self.queue, destination, source, is_blocking=False)
+        with driver_errors.translated(f"copying on {self.name}"), self.session.queueing:
+            event = self.cl.enqueue_copy(self.queue, destination, source, is_blocking=False)
+        self._note_copy(event, destination, source, {})
+        return event
+
+    def queue_bytes(self, destination: Any, source: Any, ready: Any, **sizes: int) -> Any:
+        """Queue a copy between buffers of two devices behind an event, start it; returns its own.
+
+        Another queue would wait forever for what was never started.
+        """
+        with driver_errors.translated(f"copying to {self.name}"), self.session.queueing:
+            event = self.cl.enqueue_copy(self.queue, destination, source, wait_for=[ready], **sizes)
+            self.queue.flush()
+        self.profile_copy(COPY, event, sizes["byte_count"])
+        return event
+
+    def _queueing_of(self, *places: Any) -> Any:
+        """The lock of what is queued; none for a copy that waits, for others would, too."""
+        if any(isinstance(place, np.ndarray) for place in places):
+            return contextlib.nullcontext()
+        return self.session.queueing
+
+    def _note_copy(self, event: Any, destination: Any, source: Any, sizes: Any) -> None:
+        """Let profiles take note of a copy."""
+        if isinstance(source, np.ndarray):
+            self.profile_copy(UPLOAD, event, source.nbytes)
+        elif isinstance(destination, np.ndarray):
+            self.profile_copy(DOWNLOAD, event, destination.nbytes)
+        else:
+            self.profile_copy(COPY, event, sizes["byte_count"])
+
+    def profile_copy(self, direction: str, event: Any, nbytes: int) -> None:
+        """Let profiles take note of a copy that was queued."""
+        for profile in self.session.profiles:
+            profile.add(direction, event, nbytes)
+
+    def mark(self) -> Any:
+        """The event at which all that is queued so far has ended, for another queue to wait for."""
+        with driver_errors.translated(f"waiting for {self.name}"), self.session.queueing:
+            event = self.cl.enqueue_marker(self.queue)
+            self.queue.flush()
+        return event
+
+    def wait_for(self, *events: Any) -> None:
+        """Let all that is queued from now on wait for events of other queues, as far as given."""
+        pending = [event for event in events if event is not None]
+        if not pending:
+            return
+        with driver_errors.translated(f"waiting for {self.name}"), self.session.queueing:
+            self.cl.enqueue_barrier(self.queue, wait_for=pending)
+
+    @contextlib.contextmanager
+    def profile(self) -> Iterator[Profile]:
+        """Time the kernels and copies of the block by the device's own clock.
+
+        The result has its numbers at the end of the block, for which it waits. What other threads
+        queue on the device counts, too; other devices of ``open_device("all")`` have profiles of
+        their own. Launches cost a little more meanwhile.
+
+        Raises
+        ------
+        DeviceError
+            The driver keeps no times.
+
+        Examples
+        --------
+        >>> import ltcl
+        >>> device = ltcl.open_device()
+        >>> x = device.empty(1000)
+        >>> with device.profile() as profile:
+        ...     x = ltcl.device.vectors.fill(x, 1.0)
+        ...     y = x.copy()
+        >>> profile.kernels["vector_fill"].launches, profile.copies["copy"].nbytes
+        (1, 4000)
+        """
+        if not self.has_clock:
+            raise DeviceError(f"{self.name} ({self.driver}) keeps no times of kernels")
+        profile = Profile()
+        with driver_errors.translated(f"profiling {self.name}"):
+            self.session.begin(profile)
+        try:
+            yield profile
+        finally:
+            try:
+                self.finish()
+            finally:
+                self.session.end(profile)
+            profile.end()
 
     def agreed(self, value: Any) -> Any:
         """A measured `value`; where processes solve in lock-step, that of the first."""

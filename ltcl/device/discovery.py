@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import signal
 import sys
 import threading
 import weakref
@@ -20,9 +21,12 @@ from typing import Any
 
 from ltcl.device import ahead, driver_errors, pocl_processor
 from ltcl.device import pocl_linker as linker
-from ltcl.device.device import Device
+from ltcl.device.device import Device, Session
 from ltcl.errors import DeviceError, InputTypeError
 
+# What opens the best device with the others of its platform, and its index then.
+ALL = "all"
+NAME_OF_SIMPLE_POCL = "basic-"
 # The best first.
 KINDS = ("gpu", "accelerator", "cpu", "simulator")
 KIND_NAMES = {"gpu": "GPU", "cpu": "CPU"}
@@ -79,7 +83,8 @@ def list_devices() -> list[Description]:
     True
     """
     driver_errors.refuse_forked()
-    import pyopencl as cl
+    with _interrupts_held():
+        import pyopencl as cl
 
     # Its caches hold pickles, and if they cannot be written no kernel starts.
     cl._PYOPENCL_NO_CACHE = True
@@ -92,6 +97,26 @@ def list_devices() -> list[Description]:
                 devices.extend(_platform_devices(number, platform))
     linker.provide(device.driver for device in devices)
     return sorted(devices, key=lambda device: device.rank)
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let Ctrl-C wait until a block is over: the native part of pyopencl aborts at one.
+
+    Only the main thread has handlers, and those of other languages cannot be put back.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: waiting.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if waiting:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _platform_devices(platform_number: int, platform: Any) -> Iterator[Description]:
@@ -156,25 +181,67 @@ def open_device(select: str | Device | None = None) -> Device:
     devices = list_devices()
     if not select:
         select = os.environ.get("LTCL_DEVICE", "")
-    if select.strip().lower() == "all":
+    if select.strip().lower() == ALL:
         return _open_all(devices)
     return _open(choose(devices, select))
 
 
 def _open_all(devices: list[Description]) -> Device:
-    """Open the best device, with the others of its platform."""
+    """Open the best device, with the others of its platform in the same context."""
     best = choose(devices, None)
     platform = best.index.partition(":")[0] + ":"
     others = []
     for description in devices:
         if description.index.startswith(platform) and description != best:
-            others.append(open_device(description.index))
-    if others:
-        best = replace(best, index="all")
-    return _open(best, tuple(others))
+            others.append(description)
+    if not others:
+        return _open(best)
+    for description in (best, *others):
+        linker.require(description.driver)
+    with _opening:
+        device = _opened.get(ALL)
+        if device is None or [other.description for other in device.others] != others:
+            device = _open_several([replace(best, index=ALL), *others])
+            for each in (device, *device.others):
+                _opened.setdefault(each.description.index, each)
+            _opened[ALL] = device
+        return device
 
 
-def _open(description: Description, others: tuple[Device, ...] = ()) -> Device:
+def _open_several(descriptions: list[Description]) -> Device:
+    """Open devices in one context, or each in its own, where they exchange through the host."""
+    # PoCL's simplest devices lock themselves up when an event of another device ends.
+    are_simple = (NAME_OF_SIMPLE_POCL in description.name for description in descriptions)
+    if not any(are_simple):
+        return open_together(descriptions)
+    device, *others = map(Device, descriptions)
+    device.others = tuple(others)
+    return device
+
+
+def open_together(descriptions: list[Description]) -> Device:
+    """Open devices in one context, in which they send each other vectors without the host.
+
+    The first one is returned, and has the others as its `others`.
+    """
+    import pyopencl as cl
+
+    # Each once: tests open one device under two names.
+    handles = [description.handle for description in descriptions]
+    handles = list(dict.fromkeys(handles))
+    with driver_errors.translated("opening several devices"):
+        context = cl.Context(handles)
+        opened = []
+        for description in descriptions:
+            opened.append(Device(description, Session(description.handle, context)))
+    device, *others = opened
+    device.others = tuple(others)
+    for each in opened:
+        ahead.begin_with_vectors(each)
+    return device
+
+
+def _open(description: Description) -> Device:
     """Open the described device, or find it if it is open."""
     linker.require(description.driver)
     with _opening:
@@ -183,7 +250,6 @@ def _open(description: Description, others: tuple[Device, ...] = ()) -> Device:
             device = Device(description)
             _opened[description.index] = device
             ahead.begin_with_vectors(device)
-        device.others = others
         return device
 
 

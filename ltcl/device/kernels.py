@@ -52,11 +52,11 @@ class Kernel:
     >>> device = ltcl.open_device("cpu")
     >>> out = device.empty(1000)
     >>> kernel = device.kernel("vector", "vector_fill")
-    >>> kernel(1000, 64, count=1000, value=2.0, out=out)  # queue it once
+    >>> event = kernel(1000, 64, count=1000, value=2.0, out=out)  # queue it once
     >>> launch = kernel.bind(1000, 64, count=1000, value=3.0, out=out)
-    >>> launch()  # queue it, again and again
+    >>> event = launch()  # queue it, again and again
     >>> launch.set(value=4.0)
-    >>> launch()
+    >>> event = launch()
     >>> out.get()[:3].tolist()
     [4.0, 4.0, 4.0]
     """
@@ -74,12 +74,14 @@ class Kernel:
             work_group_size = device.cl.kernel_work_group_info.WORK_GROUP_SIZE
             kernel_limit = handle.get_work_group_info(work_group_size, device.handle)
             self._max_group: int = min(kernel_limit, device.max_group)
+            multiple = device.cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE
+            self.subgroup: int = handle.get_work_group_info(multiple, device.handle)
             self.parameters = _parameters(device.cl.kernel_arg_info, handle)
         self.idle.append(handle)
 
-    def __call__(self, items: Size, group: Size, /, **arguments: Any) -> None:
-        """Queue a launch over `items`, rounded up to whole groups; returns at once."""
-        Launch(self, items, group, arguments)()
+    def __call__(self, items: Size, group: Size, /, **arguments: Any) -> Any:
+        """Queue a launch over `items`, rounded up to whole groups; returns its event at once."""
+        return Launch(self, items, group, arguments)()
 
     def bind(self, items: Size, group: Size, /, **arguments: Any) -> Launch:
         """Make the launch that calling the kernel would queue, to be queued again and again."""
@@ -131,10 +133,10 @@ def in_order(launches: Sequence[Queued]) -> Queued:
     """Make a function that queues all of these, one after the other."""
     if len(launches) == 1:
         return launches[0]
-    kept = tuple(launches)
+    queue = tuple(launches)
 
     def queue_all() -> None:
-        for launch in kept:
+        for launch in queue:
             launch()
 
     return queue_all
@@ -173,10 +175,11 @@ class Launch:
         self._buffers: dict[str, Any] = {}
         self.set(**arguments)
 
-    def __call__(self) -> None:
-        """Queue the launch; returns at once."""
+    def __call__(self) -> Any:
+        """Queue the launch; returns its event at once, None if it has no work-items."""
         if self._has_items:
-            self._device.launch(self._name, self._handle, self._size, self._group)
+            return self._device.launch(self._name, self._handle, self._size, self._group)
+        return None
 
     def set(self, /, **values: Any) -> None:
         """Change arguments, by name, for the launches that follow: ``launch.set(keep=0.5)``."""

@@ -40,15 +40,20 @@ def folder() -> Path:
 
 @functools.cache
 def load(name: str) -> str:
-    """Text of `kernels/<name>.cl` with its includes, ready for the compiler."""
+    """Text of `kernels/<name>.cl` with its includes, ready for the compiler.
+
+    The path of a .cl file elsewhere is a name, too; its includes are beside it or in `kernels/`.
+    """
     root = folder()
+    if name.endswith(".cl"):
+        return _expand(Path(name).resolve(), root, set())
     return _expand(root / f"{name}.cl", root, set())
 
 
 def _expand(path: Path, root: Path, included_files: set[Path]) -> str:
     """Text of a file with each include in place of its line, at its first occurrence only."""
     included_files.add(path)
-    name = path.relative_to(root).as_posix()
+    name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
     lines = [f'#line 1 "{name}"']
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         include = INCLUDE.match(line)
@@ -56,6 +61,8 @@ def _expand(path: Path, root: Path, included_files: set[Path]) -> str:
             lines.append(line)
             continue
         included = path.parent / include[1]
+        if not included.is_file():
+            included = root / include[1]
         if included not in included_files:
             lines.append(_expand(included, root, included_files))
         lines.append(f'#line {number + 1} "{name}"')
@@ -92,7 +99,8 @@ def _build(device: Device, file: str, defines: Mapping[str, Any]) -> Any:
     for name, value in sorted(defines.items()):
         options.append(f"-D{name}={value}")
     try:
-        return device.cl.Program(device.context, load(file)).build(options)
+        program = device.cl.Program(device.context, load(file))
+        return program.build(options, devices=[device.handle])
     except device.cl.Error as error:
         # pyopencl adds options and source to the log.
         log_text = str(error).partition("(options:")[0].strip()

@@ -18,7 +18,7 @@ import timeit
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import platformdirs
@@ -32,9 +32,10 @@ from ltcl.errors import DeviceError, FileError, MemoryLimitError
 if TYPE_CHECKING:
     from ltcl.device.device import Device
 
-# Speeds under LTCL_TUNE=0: seconds of a launch, bytes per second of a CPU (True) or another device,
-# operations per second of a factorization.
+# Speeds under LTCL_TUNE=0: seconds of a wait and of a launch, bytes per second of a CPU (True) or
+# another device, operations per second of a factorization.
 SECONDS = 20e-6
+LAUNCH_SECONDS = 5e-6
 BANDWIDTH = {True: 2e10, False: 2e12}
 FLOPS = 5e10
 
@@ -42,10 +43,19 @@ FLOPS = 5e10
 REPEATS = 5
 # Bytes of each of the three arrays of a triad: beyond the caches.
 TRIAD_BYTES = 1 << 26
+# Launches that are timed together.
+TIMED_LAUNCHES = 16
 # Rows of the matrix that is factorized.
 FACTORIZED_ROWS = 768
 
 log = logging.getLogger(__name__)
+
+
+class Overheads(NamedTuple):
+    """Seconds of a launch, and of a wait for its result."""
+
+    launch: float
+    wait: float
 
 
 def choose(
@@ -69,7 +79,7 @@ def choose(
     times = {}
     for name, launch in variants.items():
         try:
-            times[name] = _time(launch, device.finish)
+            times[name] = _time_work(device, launch)
         # A MemoryLimitError tells that a group needs too many registers.
         except (DeviceError, MemoryLimitError) as error:
             log.info("%s of %s fails and is left out: %s", name, file, error)
@@ -92,13 +102,37 @@ def seconds(device: Device, key: str, launch: Callable[[], object]) -> float:
     return _measured((device.name, device.driver, key), SECONDS, measure)
 
 
+def overheads(device: Device) -> Overheads:
+    """Seconds of a launch that others follow, and of a dot product of 64 numbers with its wait."""
+    if _is_off():
+        return Overheads(LAUNCH_SECONDS, SECONDS)
+    x = device.empty(64)
+
+    def fill_repeatedly() -> None:
+        for _ in range(TIMED_LAUNCHES):
+            vectors.fill(x, 0.0)
+
+    wait = seconds(device, "a wait", lambda: vectors.dot(x, x))
+    launches = seconds(device, f"{TIMED_LAUNCHES} launches", fill_repeatedly)
+    return Overheads(launches / TIMED_LAUNCHES, wait)
+
+
+def work_seconds(device: Device, key: str, launch: Callable[[], object]) -> float:
+    """Seconds that `launch` keeps `device` at work, by its own clock if it has one."""
+
+    def measure() -> float:
+        return _time_work(device, launch)
+
+    return _measured((device.name, device.driver, key, "work"), SECONDS, measure)
+
+
 def bandwidth(device: Device) -> float:
     """Bytes per second that the device moves at best: a triad a b + c y reads two, writes one."""
     nbytes = min(TRIAD_BYTES, device.max_allocation // 4)
 
     def measure() -> float:
         b, c, out = (vectors.fill(device.empty(nbytes // 4), 1.0) for _ in range(3))
-        triad_seconds = _time(lambda: vectors.axpby(0.5, b, 1.0, c, out), device.finish)
+        triad_seconds = _time_work(device, lambda: vectors.axpby(0.5, b, 1.0, c, out))
         return 3 * nbytes / triad_seconds
 
     key = (device.name, device.driver, f"bandwidth by {nbytes} bytes")
@@ -132,6 +166,25 @@ def _measured(key: tuple[str, ...], default: float, measure: Callable[[], float]
         value = measure()
         remember("|".join(key), value)
     return value
+
+
+def _time_work(device: Device, run: Callable[[], object]) -> float:
+    """Best of a few runs, in seconds on the device.
+
+    The host's clock is noise below some 30 us; it counts where the device has none, or `run` queues
+    nothing.
+    """
+    if not device.has_clock:
+        return _time(run, device.finish)
+    spent = []
+    # The first run builds kernels.
+    for _ in range(1 + REPEATS):
+        with device.profile() as profile:
+            run()
+        if not profile.busy > 0.0:
+            return _time(run, device.finish)
+        spent.append(profile.busy)
+    return min(spent[1:])
 
 
 def _time(run: Callable[[], object], wait: Callable[[], object]) -> float:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Frames of a folder of pictures or of a video, as linear light; videos written.
 
-Videos have 8 bits a channel. Frames that cannot be decoded are missing, so frames are counted: the
+Videos are read with the bits that they have, and written with 8 bits a channel. Frames that cannot
+be decoded are missing, so frames are counted: the
 formats of `COUNTED_EXTENSIONS` store their number, and a missing frame is an error; others, as
 Matroska, store a duration, which sound may stretch, and a missing frame is a warning.
 """
@@ -27,7 +28,7 @@ from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.images.encoding import ENCODINGS, Encoding, from_linear, to_linear
 from ltcl.images.pictures import BITS, as_picture, read, read_srgb
-from ltcl.images.video import Video
+from ltcl.images.video import Video, load_av
 
 # Videos that store the number of their frames.
 COUNTED_EXTENSIONS = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
@@ -71,15 +72,18 @@ class Frame:
     name : str
         Name of the picture file, or of the video with the number.
     stored : Path or ndarray
-        The picture file, or the BGR codes of a video, uint8, (h, w, 3).
+        The picture file, or the BGR codes of a video, uint8 or uint16, (h, w, 3).
     encoding : "auto", "srgb" or "linear"
         Encoding of the codes.
+    seconds : float, optional
+        Time from the first frame of a video, by its own time stamps.
     """
 
     number: int
     name: str
     stored: Path | np.ndarray
     encoding: Encoding
+    seconds: float | None = None
 
     def digest(self) -> str:
         """SHA-256 of the file or, in a video, of the pixels, in hexadecimal digits."""
@@ -151,8 +155,8 @@ class Source:
 
     def _video_frames(self, video: Video) -> Iterator[Frame]:
         number = 0
-        for number, codes in enumerate(video, start=1):
-            yield Frame(number, f"{self.path.name}:{number}", codes, self.encoding)
+        for number, (codes, seconds) in enumerate(video, start=1):
+            yield Frame(number, f"{self.path.name}:{number}", codes, self.encoding, seconds)
         self._check_count(number)
 
     def _check_count(self, decoded: int) -> None:
@@ -206,13 +210,17 @@ def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") ->
 
 
 def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
-    """Refuse a video by its extension, or by an odd height or width, which MPEG-4 cannot hold."""
+    """Refuse a video by its extension, by an odd height or width, or for want of its writer.
+
+    MPEG-4 cannot hold odd sizes.
+    """
     path = as_path(path)
     if path.suffix.lower() not in CODECS:
         raise FileError(f"{path}: {unknown_extension(path)}; a video must be {', '.join(CODECS)}")
     h, w = grid
     if h % 2 or w % 2:
         raise InputError(f"{path}: frames are {h} x {w} pixels; those of a video must be even")
+    load_av(str(path))
 
 
 def write_video(
@@ -241,12 +249,10 @@ def write_video(
     FileError
         The extension is unknown, or the file cannot be written.
     """
-    # The import takes a while.
-    from av.error import FFmpegError
-
     path = as_path(path)
     fps = checks.number("fps", fps, above=0.0)
     check_video(path, (0, 0))
+    FFmpegError = load_av(str(path)).error.FFmpegError
     with replace_file(path) as temporary:
         try:
             count = _encode_video(path, temporary, pictures, fps)
@@ -259,8 +265,7 @@ def write_video(
 
 def _encode_video(path: Path, temporary: Path, pictures: Iterable[np.ndarray], fps: float) -> int:
     """Encode pictures into the file `temporary`, which is for `path`; their number."""
-    import av
-
+    av = load_av(str(path))
     codec = CODECS[path.suffix.lower()]
     count = 0
     shape: tuple[int, ...] = ()

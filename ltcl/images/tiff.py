@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import TiffImagePlugin
@@ -85,15 +85,36 @@ CURE = "save it as RGB or grey of 8 or 16 bits or float32, uncompressed or with 
 Directory = Any
 
 
+class _Layout(NamedTuple):
+    """Bytes of the header and of an entry, `struct` types of offsets and of the entry count."""
+
+    header_size: int
+    entry_size: int
+    offset_type: str
+    count_type: str
+
+    @property
+    def start_place(self) -> int:
+        """Place in the header of the offset of the first directory."""
+        return self.header_size - struct.calcsize(f"={self.offset_type}")
+
+
+CLASSIC_TIFF = _Layout(header_size=8, entry_size=12, offset_type="I", count_type="H")
+BIG_TIFF = _Layout(header_size=16, entry_size=20, offset_type="Q", count_type="Q")
+
+
+def _find_layout(data: bytes) -> _Layout:
+    return BIG_TIFF if data[2:3] == b"+" else CLASSIC_TIFF
+
+
 def read_directory(data: bytes) -> Directory:
     """The tags of a file of one picture.
 
     Pillow reads the directory alone: it would refuse float RGB, and write to stderr.
     """
     file = io.BytesIO(data)
-    is_big_tiff = data[2:3] == b"+"
-    header_size = 16 if is_big_tiff else 8
-    directory = TiffImagePlugin.ImageFileDirectory_v2(file.read(header_size))
+    header = file.read(_find_layout(data).header_size)
+    directory = TiffImagePlugin.ImageFileDirectory_v2(header)
     file.seek(directory.next)
     directory.load(file)
     if directory.next:
@@ -155,26 +176,23 @@ def with_alpha(data: bytes, directory: Directory) -> bytes:
     if directory.get(EXTRA_SAMPLES) in ((UNSPECIFIED,), (ALPHA,)):
         return data
     order = "<" if data.startswith(b"II") else ">"
-    is_big_tiff = data[2:3] == b"+"
-    place = 8 if is_big_tiff else 4
-    # Types of offsets and values, and of the number of entries.
-    offset_type = "Q" if is_big_tiff else "I"
-    count_type = "Q" if is_big_tiff else "H"
-    entry_size = 20 if is_big_tiff else 12
-    (start,) = struct.unpack_from(order + offset_type, data, place)
-    (count,) = struct.unpack_from(order + count_type, data, start)
-    first = start + struct.calcsize(count_type)
+    layout = _find_layout(data)
+    entry_size = layout.entry_size
+    (start,) = struct.unpack_from(order + layout.offset_type, data, layout.start_place)
+    (count,) = struct.unpack_from(order + layout.count_type, data, start)
+    first = start + struct.calcsize(layout.count_type)
     entries = {}
     for number in range(count):
-        entry = data[first + number * entry_size :][:entry_size]
+        entry_start = first + number * entry_size
+        entry = data[entry_start : entry_start + entry_size]
         (tag,) = struct.unpack_from(order + "H", entry)
         entries[tag] = entry
-    alpha = struct.pack(f"{order}HH{offset_type}H", EXTRA_SAMPLES, SHORT, 1, ALPHA)
+    alpha = struct.pack(f"{order}HH{layout.offset_type}H", EXTRA_SAMPLES, SHORT, 1, ALPHA)
     entries[EXTRA_SAMPLES] = alpha.ljust(entry_size, b"\0")
     sorted_entries = b"".join(entries[tag] for tag in sorted(entries))
     # Directories begin at an even byte.
     padded = data + b"\0" * (len(data) % 2)
-    header = padded[:place] + struct.pack(order + offset_type, len(padded))
-    size = struct.pack(order + count_type, len(entries))
-    last = struct.pack(order + offset_type, 0)
+    header = padded[: layout.start_place] + struct.pack(order + layout.offset_type, len(padded))
+    size = struct.pack(order + layout.count_type, len(entries))
+    last = struct.pack(order + layout.offset_type, 0)
     return header + padded[len(header) :] + size + sorted_entries + last

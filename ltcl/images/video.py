@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Frames of a video file as codes of 8 bits, upright, decoded by FFmpeg (PyAV).
+"""Frames of a video file as codes, upright, with their times, decoded by FFmpeg (PyAV).
+
+Codes have 8 bits, or 16 where those of the file have more than 8, such as 10 or 12.
 
 The display matrix (x y) of the container moves a stored pixel (p q):
 
@@ -23,6 +25,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.errors import FileError, LtclError
 from ltcl.files import input_file
 
@@ -39,7 +42,16 @@ WIDE_PRIMARIES = {9: "BT.2020", 11: "DCI-P3", 12: "Display P3"}
 REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 NO_BITS = 0xFFFFFFFF
 
+# Bits of a component up to which codes have 8, and their largest.
+BITS = 8
+WHITE = 255
+
 _logger = logging.getLogger(__name__)
+
+
+def load_av(user: str) -> Any:
+    """Load PyAV, which brings all of FFmpeg: for videos alone."""
+    return checks.load_extra("av", "film", user, FileError)
 
 
 class Video:
@@ -74,8 +86,11 @@ class Video:
             return "linear"
         return "auto"
 
-    def __iter__(self) -> Iterator[np.ndarray]:
-        """BGR codes of all frames that can be decoded, (h, w, 3) uint8."""
+    def __iter__(self) -> Iterator[tuple[np.ndarray, float | None]]:
+        """BGR codes of all frames that can be decoded, (h, w, 3) uint8 or uint16, and their times.
+
+        A time is in seconds from the first frame; None where the file has none.
+        """
         if self._gamut is not None:
             _logger.warning(
                 "%s: has the primaries of %s; its red, green and blue are taken as those of sRGB",
@@ -84,8 +99,14 @@ class Video:
             )
         with _decoding(input_file(self.path)), _open(self.path) as container:
             converter = _Converter()
+            first: float | None = None
             for frame in _Decoder(self.path, container):
-                yield converter.codes(frame)
+                seconds = frame.time
+                if first is None:
+                    first = seconds
+                if seconds is not None and first is not None:
+                    seconds -= first
+                yield converter.codes(frame), seconds
 
 
 class _Converter:
@@ -98,17 +119,23 @@ class _Converter:
         self._interpolation = Interpolation.BICUBIC
 
     def codes(self, frame: Any) -> np.ndarray:
-        """BGR codes, (h, w, 3) uint8; FileError for a frame that is transparent or sheared."""
+        """BGR codes, (h, w, 3) uint8, or uint16 of a frame of more than 8 bits.
+
+        FileError for a frame that is transparent or sheared.
+        """
         components = frame.format.components
+        is_deep = max(component.bits for component in components) > BITS
         if frame.format.has_palette or any(channel.is_alpha for channel in components):
-            alpha = self._convert(frame, "bgra")[..., 3]
-            transparent = np.count_nonzero(alpha != 255)
+            alpha = self._convert(frame, "rgba64le" if is_deep else "bgra")[..., 3]
+            transparent = np.count_nonzero(alpha < _opaque(components, alpha.dtype))
             if transparent:
                 raise FileError(
                     f"has {transparent} transparent pixel(s) in a frame, whose light is not known; "
                     "make them opaque"
                 )
         matrix = frame.side_data.get("DISPLAYMATRIX")
+        if is_deep:
+            return _turn_upright(self._convert(frame, "rgb48le")[..., ::-1], matrix)
         return _turn_upright(self._convert(frame, "bgr24"), matrix)
 
     def _convert(self, frame: Any, format: str) -> np.ndarray:
@@ -116,6 +143,16 @@ class _Converter:
             frame, format=format, interpolation=self._interpolation
         )
         return converted.to_ndarray()
+
+
+def _opaque(components: Any, dtype: np.dtype) -> int:
+    """The least code of alpha that is the largest one of the file, after its conversion."""
+    largest = np.iinfo(dtype).max
+    if largest <= WHITE:
+        return largest
+    bits = max(component.bits for component in components)
+    # FFmpeg shifts codes to the left, and may leave zeros below.
+    return largest + 1 - (1 << (16 - bits))
 
 
 def _turn_upright(codes: np.ndarray, matrix: Any) -> np.ndarray:
@@ -153,9 +190,7 @@ def _decoding(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[Any]:
-    # PyAV brings all of FFmpeg: it is loaded for videos alone.
-    import av
-
+    av = load_av("a video")
     # An open file, as FFmpeg takes names in UTF-8 alone.
     with (
         path.open("rb") as file,

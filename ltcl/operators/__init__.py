@@ -25,6 +25,7 @@ from ltcl.operators.knowledge import Norms
 from ltcl.operators.multi_device import MultiDevice
 from ltcl.operators.out_of_core import Streamed
 from ltcl.operators.parts import Parts
+from ltcl.operators.patch_hats import PatchHats
 from ltcl.operators.product import Product
 from ltcl.operators.pyramid import Hats, Pyramid
 from ltcl.operators.scaled_columns import ScaledColumns
@@ -49,6 +50,7 @@ __all__ = [
     "Norms",
     "Operator",
     "Parts",
+    "PatchHats",
     "Planes",
     "Product",
     "Pyramid",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import functools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ import scipy.sparse.linalg
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.interop.calls import Differentiable
 from ltcl.operators.epilogue import PLAIN, Epilogue
 from ltcl.operators.knowledge import (
     Float64Form,
@@ -28,15 +30,35 @@ from ltcl.operators.knowledge import (
     Product,
     RowSumRange,
 )
+from ltcl.operators.product_derivative import ProductDerivative
 from ltcl.operators.stepper import Stepper
 
 if TYPE_CHECKING:
     from ltcl.operators.bases import Basis
+    from ltcl.operators.shared_vector import RowShares
 
 # Columns of a product that computes entries.
 ENTRY_COLUMNS = 64
 # Bytes up to which a product in float64 on the host takes no longer than a few waits for a device.
 CHEAP_PRODUCT_BYTES = 4 << 20
+
+
+def _derivative_of_dot(self: Operator, x: Any) -> ProductDerivative:
+    return ProductDerivative(self, x, is_vector=x.ndim == 1)
+
+
+def _derivative_of_vectors(self: Operator, x: Any) -> ProductDerivative:
+    # SciPy takes (N, 1) for one column.
+    return ProductDerivative(self, x, is_vector=tuple(x.shape) != (self.shape[1], 1))
+
+
+def _derivative_of_matrices(self: Operator, X: Any) -> ProductDerivative:
+    return ProductDerivative(self, X, is_vector=False)
+
+
+_OF_DOT = Differentiable(("x",), _derivative_of_dot)
+_OF_VECTORS = Differentiable(("x",), _derivative_of_vectors)
+_OF_MATRICES = Differentiable(("X",), _derivative_of_matrices)
 
 
 class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
@@ -213,6 +235,11 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
         """
         return Stepper(self, x, r, slots, a, c)
 
+    def row_shares(self, a: float = 1.0, c: float = 0.0) -> RowShares | None:
+        """S = a A + c I in shares of rows on several devices; None if A is not in such shares."""
+        del a, c
+        return None
+
     def _check_operand(self, x: Array, epilogue: Epilogue) -> None:
         rows, columns = self.shape
         if x.shape[0] != columns or len(x.shape) > 2:
@@ -349,18 +376,43 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
 
     # The methods that SciPy asks for: NumPy in, NumPy out. It derives the other products from them.
 
+    @checks.takes_arrays("x", differentiable=_OF_DOT)
     def dot(self, x: Any) -> Any:
         """A x for an array or an operator; masked values, which SciPy would fill, are refused."""
         checks.unmasked("x", x)
         return super().dot(x)
+
+    @checks.takes_arrays("x", differentiable=_OF_VECTORS)
+    def matvec(self, x: Any) -> Any:
+        """A x of a vector (N,); of (..., N) from SciPy 1.18 on."""
+        return super().matvec(x)
+
+    @checks.takes_arrays("X", differentiable=_OF_MATRICES)
+    def matmat(self, X: Any) -> Any:
+        """A X of columns (N, k); of (..., N, k) from SciPy 1.18 on."""
+        return super().matmat(X)
+
+    @checks.takes_arrays("x")
+    def rmatvec(self, x: Any) -> Any:
+        """A^T x, as `matvec`."""
+        return super().rmatvec(x)
+
+    @checks.takes_arrays("X")
+    def rmatmat(self, X: Any) -> Any:
+        """A^T X, as `matmat`."""
+        return super().rmatmat(X)
 
     def _rdot(self, x: Any) -> Any:
         checks.unmasked("x", x)
         return super()._rdot(x)
 
     def _matmat(self, X: np.ndarray) -> np.ndarray:
-        operand = self.device.upload(checks.real("x", X))
-        return self.apply(operand).get()
+        # (..., N, k): all columns in one product.
+        columns = np.moveaxis(checks.real("x", X), -2, 0)
+        count = math.prod(columns.shape[1:])
+        operand = self.device.upload(columns.reshape(len(columns), count))
+        product = self.apply(operand).get()
+        return np.moveaxis(product.reshape(len(product), *columns.shape[1:]), 0, -2)
 
     def _transpose(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
         return Transposed(self)
@@ -376,6 +428,9 @@ class Transposed(Operator):
     def __init__(self, base: Operator) -> None:
         rows, columns = base.shape
         super().__init__(base.device, (columns, rows), base)
+        if base.known.transposed is None:
+            base.known.transposed = self.known
+        self.known = base.known.transposed
         self.base = base
         self.error = base.error
         # The estimate is one of A alone.
@@ -389,7 +444,9 @@ class Transposed(Operator):
     def norm_bound(self) -> NormBound:
         """The bound of A."""
         bound = self.base.norm_bound()
-        return bound if bound.is_bound else super().norm_bound()
+        if bound.is_bound:
+            return bound
+        return super().norm_bound()
 
     def matrix_float64(self) -> tuple[np.ndarray, bool]:
         """The transpose of A as (N, N) float64, and whether its numbers are those given."""

@@ -25,8 +25,16 @@ from ltcl.operators.epilogue import PLAIN, Epilogue, widest_launch
 PIXELS = "pixels"
 # Work-items side by side on a GPU.
 GROUP_ITEMS = 64
-# Items along the second and third dimension, in which kernels stride: GPUs take 65535 groups.
+# Items of a CPU along a dimension in which kernels stride.
 MAX_STRIDING_ITEMS = 1 << 14
+# Groups of a GPU along its second and third dimension, in which kernels stride.
+MAX_GROUPS = 65535
+# Sides of the group of a GPU that does several levels of a picture alone.
+LEVELS_GROUP = (32, 32)
+# Pixels of a level up to which one launch does all the levels from it on: on a CPU, and for each
+# item of the largest group on a GPU, where a launch takes longer than a few turns of a group.
+SMALL_LEVEL_PIXELS = 4096
+SMALL_LEVEL_ITEM_PIXELS = 8
 # Share of the coefficients in the support beyond which restricting to it gains little.
 MAX_SUPPORT_SHARE = 0.5
 
@@ -63,10 +71,8 @@ class Basis(Operator):
         super().__init__(device, (coefficients, h * w), *parts)
 
     @abc.abstractmethod
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
-        """The launches of out = a (W x) + b y, or with W^T; y is not read if b is 0."""
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
+        """The launches of out = a (W x) + b y, or with W^T; c of the epilogue is 0."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Arrays that a file can hold, from which `ltcl.operators.stored` makes the basis again."""
@@ -79,42 +85,85 @@ class Basis(Operator):
         epilogue = epilogue.without_shift(x)
         launches: list[Queued] = []
         if out.size:
-            y = epilogue.operand(x)
-            launches.append(self._bind_transform(x, out, epilogue.a, epilogue.b, y, transpose))
+            unshifted = Epilogue(a=epilogue.a, b=epilogue.b, y=epilogue.y)
+            launches.append(self._bind_transform(x, out, unshifted, transpose))
         if epilogue.c:
             launches.append(vectors.bind_axpby(epilogue.c, x, 1.0, out, out))
         return in_order(launches)
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
-        """A kernel for k right-hand sides, and the number of pieces in which it takes them."""
-        lanes = widest_launch(k)
+        """A kernel for k right-hand sides, and the number of pieces in which it takes them.
+
+        An item of a GPU takes one, beside items that take the others: few registers, many items.
+        """
+        lanes = widest_launch(k) if self.device.is_cpu else 1
         kernel = self.device.kernel(file, f"{file}_{name}", K=lanes, **defines)
         return kernel, -(-k // lanes)
 
+    def bind_ordered(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool, order: Array
+    ) -> Queued | None:
+        """The launches of out = a (P W x) + b y, or with its transpose, without a gather.
 
-def bind_grid(kernel: Kernel, pieces: int, grid: tuple[int, int], **arguments: Any) -> Launch:
+        P puts coefficient i into row ``order[i]``, or nowhere if that is negative. None if the
+        basis has no such launches.
+        """
+        return None
+
+
+def small_level_pixels(device: Device) -> int:
+    """Pixels of a level up to which one launch does all the levels from it on."""
+    if device.is_cpu:
+        return SMALL_LEVEL_PIXELS
+    return SMALL_LEVEL_ITEM_PIXELS * device.max_group
+
+
+def bind_grid(
+    kernel: Kernel, pieces: int, grid: tuple[int, int], pictures: int = 1, **arguments: Any
+) -> Launch:
     """The launch of a kernel that strides through rows and columns.
 
     A CPU has an item for each row of `grid`, a GPU one for each place.
     """
     rows, columns = grid
     if kernel.device.is_cpu:
-        across = 1
-        group = 1
+        items = (pieces * pictures, 1, min(rows, MAX_STRIDING_ITEMS))
+        return kernel.bind(items, (1, 1, 1), **arguments)
+    group = (*_group_of_places(kernel, pieces), 1)
+    across = min(columns, MAX_GROUPS * group[1])
+    items = (pieces * pictures, across, min(rows, MAX_GROUPS))
+    return kernel.bind(items, group, **arguments)
+
+
+def bind_line(kernel: Kernel, pieces: int, count: int, **arguments: Any) -> Launch:
+    """The launch of a kernel that strides through `count` places in a line."""
+    if kernel.device.is_cpu:
+        group = (1, GROUP_ITEMS)
+        most = MAX_STRIDING_ITEMS
     else:
-        across = min(columns, MAX_STRIDING_ITEMS)
-        group = GROUP_ITEMS
-    items = (pieces, across, min(rows, MAX_STRIDING_ITEMS))
-    return kernel.bind(items, (1, group, 1), **arguments)
+        group = _group_of_places(kernel, pieces)
+        most = MAX_GROUPS * group[1]
+    return kernel.bind((pieces, min(count, most)), group, **arguments)
 
 
 def bind_group(kernel: Kernel, pieces: int, **arguments: Any) -> Launch:
-    """The launch of a kernel of which one group does all.
+    """The launch of a kernel of which one group does all of a piece.
 
-    The group is one item on a CPU, and up to 16 x 16 on a GPU.
+    The group is one item on a CPU, and as large as it may be on a GPU.
     """
-    group = (1, 1, 1) if kernel.device.is_cpu else kernel.group((1, 16, 16))
+    if kernel.device.is_cpu:
+        group = (1, 1, 1)
+    else:
+        group = kernel.group((1, *LEVELS_GROUP))
     return kernel.bind((pieces, *group[1:]), group, **arguments)
+
+
+def _group_of_places(kernel: Kernel, pieces: int) -> tuple[int, int]:
+    """A group of a GPU: all pieces of some places, whose numbers lie side by side, if they fit."""
+    group = kernel.group((pieces, max(1, GROUP_ITEMS // pieces)))
+    if pieces % group[0]:
+        return kernel.group((1, GROUP_ITEMS))
+    return group
 
 
 class SubsetBasis(Basis):
@@ -172,46 +221,46 @@ class SubsetBasis(Basis):
             return {**self.of.to_arrays(), "places": self.places}
         return {**super().to_arrays(), "places": self.places}
 
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         if self.of is None:
-            return self._bind_gather(x, out, a, b, y, transpose)
+            return self._bind_gather(x, out, epilogue, transpose)
+        ordered = self.of.bind_ordered(x, out, epilogue, transpose, self._inverse_order)
+        if ordered is not None:
+            return ordered
         coefficients = self.device.empty((self.of.shape[0], *x.shape[1:]))
         if transpose:
             # The places of a subset never change: the others stay 0.
             vectors.fill(coefficients, 0.0)
             scatter = self._bind_scatter(x, coefficients)
-            synthesis = self.of._bind_product(coefficients, out, Epilogue(a, b, y), True)
+            synthesis = self.of._bind_product(coefficients, out, epilogue, True)
             return in_order([scatter, synthesis])
         analysis = self.of._bind_product(x, coefficients, PLAIN, False)
-        return in_order([analysis, self._bind_gather(coefficients, out, a, b, y, transpose)])
+        gather = self._bind_gather(coefficients, out, epilogue, transpose)
+        return in_order([analysis, gather])
 
     def _bind_scatter(self, x: Array, out: Array) -> Launch:
         """The launch that writes x to its places in `out`, and nothing else."""
         kernel, pieces = self._kernel("ordered", "scatter", x.columns)
         count = self._order.size
-        items = (pieces, min(count, MAX_STRIDING_ITEMS))
-        group = (1, GROUP_ITEMS)
-        return kernel.bind(items, group, rows=count, k=x.columns, order=self._order, x=x, out=out)
+        return bind_line(
+            kernel, pieces, count, rows=count, k=x.columns, order=self._order, x=x, out=out
+        )
 
-    def _bind_gather(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Launch:
+    def _bind_gather(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Launch:
         """The launch of out = a (P x) + b y, or with P^T."""
         order = self._inverse_order if transpose else self._order
         kernel, pieces = self._kernel("ordered", "gather", x.columns)
-        items = (pieces, min(order.size, MAX_STRIDING_ITEMS))
-        return kernel.bind(
-            items,
-            (1, GROUP_ITEMS),
+        return bind_line(
+            kernel,
+            pieces,
+            order.size,
             rows=order.size,
             k=x.columns,
-            a=a,
-            b=b,
+            a=epilogue.a,
+            b=epilogue.b,
             order=order,
             x=x,
-            y=y,
+            y=epilogue.operand(x),
             out=out,
         )
 
@@ -250,21 +299,20 @@ class ScaledBasis(Basis):
         """The arrays of W, and the scale."""
         return {**self.of.to_arrays(), "scale": self.scale}
 
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         if transpose:
             product = self.device.empty(out.shape)
-            return in_order(
-                [
-                    self.of._bind_product(x, product, PLAIN, True),
-                    vectors.bind_scale_rows(self._scale, product, product),
-                    vectors.bind_axpby(a, product, b, y if b else product, out),
-                ]
-            )
+            synthesis = self.of._bind_product(x, product, PLAIN, True)
+            scale = vectors.bind_scale_rows(self._scale, product, product)
+            y = product
+            if epilogue.b and epilogue.y is not None:
+                y = epilogue.y
+            add = vectors.bind_axpby(epilogue.a, product, epilogue.b, y, out)
+            return in_order([synthesis, scale, add])
         scaled = x.like()
         scale = vectors.bind_scale_rows(self._scale, x, scaled)
-        return in_order([scale, self.of._bind_product(scaled, out, Epilogue(a, b, y), False)])
+        analysis = self.of._bind_product(scaled, out, epilogue, False)
+        return in_order([scale, analysis])
 
 
 def _count_coefficients(grid: tuple[int, int], of: Basis | None) -> int:

@@ -108,7 +108,9 @@ class Compressed(Operator):
 
     def on_coefficients(self) -> Operator:
         """The core C, where R = W^T C W in an isometric basis."""
-        return self.core if self.two_sided else super().on_coefficients()
+        if self.two_sided:
+            return self.core
+        return super().on_coefficients()
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()

@@ -87,7 +87,8 @@ class BlockDiagonal(Operator):
         """The largest bound of the blocks."""
         bounds = [block.norm_bound() for block in self.blocks]
         largest = max(bound.value for bound in bounds)
-        return NormBound(largest, is_bound=all(bound.is_bound for bound in bounds))
+        are_bounds = all(bound.is_bound for bound in bounds)
+        return NormBound(largest, is_bound=are_bounds)
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()
@@ -203,12 +204,9 @@ class Planes(Basis):
         self.orthonormal = of.orthonormal
         self.isometric = of.isometric
 
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         if isinstance(self.of, Wavelet) and x.columns == 1:
-            return self.of.bind_planes(x, out, a, b, y, transpose, self.count)
-        epilogue = Epilogue(a, b, y)
+            return self.of.bind_planes(x, out, epilogue, transpose, self.count)
         launches = []
         height, width = self.of.shape
         if transpose:
@@ -218,6 +216,14 @@ class Planes(Basis):
             launches.append(_bind_copies(self.of, place, x, out, epilogue, transpose))
         return in_order(launches)
 
+    def bind_ordered(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool, order: Array
+    ) -> Queued | None:
+        """The launches of wavelets that take the order of coefficients, for one right-hand side."""
+        if not isinstance(self.of, Wavelet) or not self.of.takes_order or x.columns > 1:
+            return None
+        return self.of.bind_planes(x, out, epilogue, transpose, self.count, order)
+
 
 def planes(bases: Sequence[Basis]) -> Basis | None:
     """Bases of pictures one below the other; None where they have nothing in common.
@@ -226,23 +232,38 @@ def planes(bases: Sequence[Basis]) -> Basis | None:
     """
     first = bases[0]
     count = len(bases)
-    if not isinstance(first, SubsetBasis):
-        return Planes(first, count) if all(is_same(W, first) for W in bases) else None
-    subsets = [W for W in bases if isinstance(W, SubsetBasis)]
-    if len(subsets) < count or any(W.grid != first.grid for W in bases):
-        return None
+    if isinstance(first, SubsetBasis):
+        return _subset_of_planes(first, bases)
+    for W in bases:
+        if not is_same(W, first):
+            return None
+    return Planes(first, count)
+
+
+def _subset_of_planes(first: SubsetBasis, bases: Sequence[Basis]) -> SubsetBasis | None:
+    """Subsets of one basis, or of pixels, one below the other; None for other bases."""
+    count = len(bases)
     of = None
     coefficients = first.shape[1]
     if first.of is not None:
-        if any(W.of is None or not is_same(W.of, first.of) for W in subsets):
-            return None
         of = Planes(first.of, count)
         coefficients = first.of.shape[0]
-    elif any(W.of is not None for W in subsets):
-        return None
-    places = [W.places + number * coefficients for number, W in enumerate(subsets)]
-    grid = (count * first.grid[0], first.grid[1])
-    return SubsetBasis(first.device, grid, np.concatenate(places), of)
+    places = []
+    for number, W in enumerate(bases):
+        if not isinstance(W, SubsetBasis) or not _have_same_whole(W, first):
+            return None
+        places.append(W.places + number * coefficients)
+    height, width = first.grid
+    return SubsetBasis(first.device, (count * height, width), np.concatenate(places), of)
+
+
+def _have_same_whole(a: SubsetBasis, b: SubsetBasis) -> bool:
+    """True if two subsets are of the same coefficients, or of the same pixels."""
+    if a.grid != b.grid:
+        return False
+    if a.of is None or b.of is None:
+        return a.of is b.of
+    return is_same(a.of, b.of)
 
 
 def is_same(a: Basis, b: Basis) -> bool:
@@ -264,7 +285,8 @@ def _join_systems(blocks: Sequence[Operator]) -> Operator | None:
     signs = {system.sign for system in systems}
     if len(systems) != len(blocks) or len(signs) != 1:
         return None
-    joined = IdentityPlus(block_diagonal([system.R for system in systems]), signs.pop())
+    R = block_diagonal([system.R for system in systems])
+    joined = IdentityPlus(R, signs.pop())
     _take_over_facts(joined, systems)
     return joined
 
@@ -274,14 +296,17 @@ def _join_scaled(blocks: Sequence[Operator]) -> Operator | None:
     scaled = [block for block in blocks if isinstance(block, ScaledColumns)]
     if len(scaled) != len(blocks):
         return None
-    A = block_diagonal([block.A for block in scaled])
+    matrices = []
+    scales = []
     shifts = []
     for block in scaled:
+        matrices.append(block.A)
+        scales.append(block.d)
         shifts.append(np.broadcast_to(block.shift, block.shape[:1]))
     shift: Any = np.concatenate(shifts)
     if not shift.any():
         shift = 0.0
-    return ScaledColumns(A, np.concatenate([block.d for block in scaled]), shift)
+    return ScaledColumns(joined_once(matrices), np.concatenate(scales), shift)
 
 
 def _join_compressed(blocks: Sequence[Operator]) -> Operator | None:
@@ -367,19 +392,19 @@ def _bind_rows(
 def _bind_copies(
     block: Operator, place: Place, x: Array, out: Array, epilogue: Epilogue, transpose: bool
 ) -> Queued:
-    """The product of a block with copies of its part of x and out."""
+    """The product of a block with copies of its rows of x and out."""
     height, width = block.shape
     if transpose:
         height, width = width, height
-    part = block.device.empty((width, *x.shape[1:]))
+    operand = block.device.empty((width, *x.shape[1:]))
     product = block.device.empty((height, *x.shape[1:]))
     a, b, y, c = epilogue
     # What is not added must not be read: it may be no number.
     added = product if b else None
-    bound = block._bind_product(part, product, Epilogue(a, b, added, c), transpose)
+    bound = block._bind_product(operand, product, Epilogue(a, b, added, c), transpose)
 
     def multiply() -> None:
-        x.copy_rows(place.of_x, part)
+        x.copy_rows(place.of_x, operand)
         if b and y is not None:
             y.copy_rows(place.of_out, product)
         bound()

@@ -133,7 +133,10 @@ def together(comm: Any, make: Callable[[], Any]) -> Any:
     for rank, rank_error in enumerate(errors):
         if rank_error is not None:
             kind, text = rank_error
-            raise kind(text if are_equal else f"rank {rank}: {text}")
+            message = text
+            if not are_equal:
+                message = f"rank {rank}: {text}"
+            raise kind(message)
     return result
 
 

@@ -17,6 +17,7 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.knowledge import Float64Form, NormBound
+from ltcl.operators.shared_vector import RowShares
 from ltcl.operators.stepper import Stepper
 
 
@@ -98,6 +99,10 @@ class IdentityPlus(Operator):
     ) -> Stepper:
         """Steps of R with the identity in the same launch; see `Operator.stepper`."""
         return self.R.stepper(x, r, slots, a * self.sign, c + a)
+
+    def row_shares(self, a: float = 1.0, c: float = 0.0) -> RowShares | None:
+        """Shares of R with the identity added; see `Operator.row_shares`."""
+        return self.R.row_shares(a * self.sign, c + a)
 
     def _dense(self) -> np.ndarray:
         dense = self.R.to_dense()

@@ -148,7 +148,12 @@ def _interreflection(
         matrix = Host(device, matrix)
     # One number joins the epilogue of the product.
     shift = 1.0 if lit.all() else lit
-    return ScaledColumns(matrix, 1.0 / divisor, shift)
+    scale = 1.0 / divisor
+    if isinstance(matrix, ScaledColumns) and not matrix.shift.any():
+        # Columns that are scaled twice would take a pass over all pixels more.
+        scale = scale * matrix.d
+        matrix = matrix.A
+    return ScaledColumns(matrix, scale, shift)
 
 
 def _check_first_bounce(T: Any, F: np.ndarray) -> None:

@@ -125,6 +125,10 @@ class Knowledge:
         Block inverses and windows of `ltcl.operators.relaxation`.
     walk_tables : dict
         Alias tables of `ltcl.operators.walks`.
+    is_quicker_in_shares : dict
+        By columns: whether vectors are better kept in shares of several devices than on one.
+    transposed : Knowledge
+        Facts about the transpose, of which each use makes a new operator.
     """
 
     row_sums: np.ndarray | None = None
@@ -138,3 +142,5 @@ class Knowledge:
     joined: tuple[tuple[weakref.ref[Operator], ...], Operator] | None = None
     relaxations: dict[tuple[Any, ...], Any] = field(default_factory=dict)
     walk_tables: dict[str, Any] = field(default_factory=dict)
+    is_quicker_in_shares: dict[int, bool] = field(default_factory=dict)
+    transposed: Knowledge | None = None

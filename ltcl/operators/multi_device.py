@@ -2,7 +2,7 @@
 """A matrix on several devices of a platform, which multiply at the same time.
 
 Each device has as many rows as it is fast: a dense product is timed once per device, and the time
-is remembered.
+is remembered. `ltcl.operators.shares` says how vectors go between them.
 """
 
 from __future__ import annotations
@@ -14,13 +14,17 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Array, Device, tuning
+from ltcl.device import Array, Device, exchange, tuning
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import Pattern, RowBlocks
 from ltcl.operators.dense import Dense, Filled, is_filled
+from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.knowledge import Float64Form
-from ltcl.operators.parts import Parts, upload_part
+from ltcl.operators.parts import upload_part
 from ltcl.operators.rows import ReadableRows, RowOperator
+from ltcl.operators.shared_vector import RowShares
+from ltcl.operators.shares import Share, SharedStepper, bind_product, bind_transpose
+from ltcl.operators.stepper import Stepper
 
 # Rows and columns of the product by which devices are compared: beyond the caches.
 TIMED_ROWS = 4096
@@ -29,7 +33,7 @@ TIMED_ROWS = 4096
 ChangeRows = Callable[[int, Any], Any]
 
 
-class MultiDevice(Parts, ReadableRows):
+class MultiDevice(ReadableRows):
     """Rows of a matrix on several devices, whose products run at the same time.
 
     Parameters
@@ -49,15 +53,21 @@ class MultiDevice(Parts, ReadableRows):
     [3.0, 3.0]
     """
 
+    # Methods that read rows on one device refuse it, and say this.
     where = "on several devices"
 
     def __init__(self, device: Device, parts: Sequence[RowOperator]) -> None:
-        self.parts: list[tuple[int, RowOperator]] = []
+        self.shares: list[Share] = []
         first = 0
         for rows in parts:
-            self.parts.append((first, rows))
+            self.shares.append(Share(first, rows))
             first += rows.shape[0]
         super().__init__(device, (first, parts[0].shape[1]), *parts)
+
+    @property
+    def parts(self) -> list[tuple[int, RowOperator]]:
+        """(first row, rows) of each device."""
+        return [(share.first, share.rows) for share in self.shares]
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """(first row, rows) of all parts."""
@@ -65,21 +75,34 @@ class MultiDevice(Parts, ReadableRows):
             for first, rows in operator.blocks():
                 yield start + first, rows
 
-    def _host_product(self, x: Array, transpose: bool) -> np.ndarray:
-        operand = x.get()
-        products = []
-        for first, rows in self.parts:
-            if transpose:
-                own_rows = rows.device.upload(operand[first : first + rows.shape[0]])
-                products.append(rows.T.apply(own_rows))
-            else:
-                products.append(rows.apply(rows.device.upload(operand)))
-            # The device starts before the next one is asked.
-            rows.device.flush()
-        results = [product.get() for product in products]
-        if transpose:
-            return np.sum(results, axis=0)
-        return np.concatenate(results)
+    def stepper(
+        self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0
+    ) -> Stepper:
+        """Steps that exchange the rows of one vector; see `Operator.stepper`."""
+        if all(share.device is not self.device for share in self.shares):
+            return super().stepper(x, r, slots, a, c)
+        return SharedStepper(self.shares, x, r, slots, a, c)
+
+    def row_shares(self, a: float = 1.0, c: float = 0.0) -> RowShares | None:
+        """Rows of devices that copy among themselves; see `Operator.row_shares`.
+
+        Through the host each exchange of a few sums would wait, several times a product.
+        """
+        devices = {share.device for share in self.shares}
+        are_near = all(exchange.are_near(self.device, device) for device in devices)
+        has_one_share_each = self.device in devices and len(devices) == len(self.shares)
+        if not (are_near and has_one_share_each):
+            return None
+        return RowShares(self.device, tuple(self.shares), a, c)
+
+    def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self._bind_product(x, out, epilogue, transpose)()
+
+    def _bind_product(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool
+    ) -> Callable[[], object]:
+        bind = bind_transpose if transpose else bind_product
+        return bind(self.device, self.shares, x, out, epilogue)
 
 
 def upload_matrix(
@@ -160,13 +183,17 @@ def split_over_devices(
     devices = [device, *device.others]
     speeds = np.array([1.0 / _product_seconds(part_device) for part_device in devices])
     ends = np.rint(rows * np.cumsum(speeds) / speeds.sum()).astype(int).tolist()
+    # The device of the vectors takes part in steps.
+    ends[0] = max(ends[0], 1)
     parts = []
     start = 0
     for part_device, end in zip(devices, ends, strict=True):
         if end > start:
             parts.append(upload_rows(part_device, slice(start, end)))
         start = end
-    return parts[0] if len(parts) == 1 else MultiDevice(device, parts)
+    if len(parts) == 1:
+        return parts[0]
+    return MultiDevice(device, parts)
 
 
 def _product_seconds(device: Device) -> float:
@@ -174,4 +201,4 @@ def _product_seconds(device: Device) -> float:
     n = min(TIMED_ROWS, int((device.max_allocation // 8) ** 0.5))
     A = Dense(device, np.ones((n, n), np.float32))
     name = f"dense product of {n} rows, {device.compute_units} units"
-    return tuning.seconds(device, name, A.bind(device.empty(n), device.empty(n)))
+    return tuning.work_seconds(device, name, A.bind(device.empty(n), device.empty(n)))

@@ -118,9 +118,9 @@ def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
     try:
         _check_room(matrices, device)
     except MemoryLimitError as error:
-        size = checks.size(sum(matrix.nbytes for matrix in matrices))
+        nbytes = sum(matrix.nbytes for matrix in matrices)
         getLogger(__name__).warning(
-            "T of %s stays on the disk and is read at each product: %s", size, error
+            "T of %s stays on the disk and is read at each product: %s", checks.size(nbytes), error
         )
         return True
     return False

@@ -12,12 +12,12 @@ from typing import Any, ClassVar
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.device.kernels import Queued, in_order
+from ltcl.operators import bases
 from ltcl.operators.bases import Basis, bind_grid, bind_group
+from ltcl.operators.epilogue import Epilogue
 
 PYRAMID = "pyramid"
 HATS = "hats"
-# Sums of a level up to which one launch does all the levels from it on.
-SMALL_LEVEL_PIXELS = 4096
 
 
 class MultiscaleSums(Basis):
@@ -42,9 +42,7 @@ class MultiscaleSums(Basis):
         self._sizes = [rows * columns for rows, columns in levels]
         super().__init__(device, grid, self.file, sum(self._sizes))
 
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         """The launches of all levels: large ones one by one, the others in one.
 
         Sums are gathered from the finest level on, and spread from the coarsest on.
@@ -57,17 +55,18 @@ class MultiscaleSums(Basis):
             "height": height,
             "width": width,
             "k": x.columns,
-            "a": a,
-            "b": b,
+            "a": epilogue.a,
+            "b": epilogue.b,
             "x": x,
             # Wide loads reach a spare sum behind each level.
             "sums": self.device.empty((sum(self._sizes) + count) * x.columns),
-            "y": y,
+            "y": epilogue.operand(x),
             "out": out,
         }
         if transpose:
             arguments["levels"] = count
-        large = sum(size > SMALL_LEVEL_PIXELS for size in self._sizes)
+        small = bases.small_level_pixels(self.device)
+        large = sum(size > small for size in self._sizes)
         launches: list[Queued] = []
         for level in range(large):
             levels = {"first_level": level, "end_level": level + 1}

@@ -5,7 +5,7 @@ Sweeps are those of `kernels/relax.cl`, steps those of `kernels/southwell.cl`.
 
 A sweep is a blocked forward substitution, x_B += P_BB^-1 (b - S x)_B with the x of the moment: a
 CPU takes many small blocks in one launch and substitutes by rows; a GPU takes two launches a block
-and keeps P_BB^-1.
+and keeps P_BB^-1, of blocks that are as large as pays (`ltcl.operators.triangles`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import scipy.sparse
 from ltcl.device import Array, Device
 from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
+from ltcl.operators import triangles
 from ltcl.operators.base import Operator
 from ltcl.operators.csr import CSR
-from ltcl.operators.dense import GPU_STRIPS, Dense
+from ltcl.operators.dense import Dense
 from ltcl.operators.epilogue import widths
 from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.rows import Slab
@@ -169,8 +170,8 @@ class Relaxation:
         Rows of one launch.
     inverses : bool
         Whether `weights` are inverses of blocks, else 1 / S_ii.
-    weights : list of Array
-        A CPU reads one array, a GPU one for each block.
+    weights : Array
+        (n, block) inverses of blocks below each other, or (n,).
     windows : list
         One for each slab: the places where `kernels/relax.cl` splits its sparse rows.
     """
@@ -187,6 +188,8 @@ class Relaxation:
         self.scale = rows.scale
         self.omega = omega
         self.inverses = omega is None or not self.device.is_cpu
+        self.is_triangle = omega is not None
+        self.is_joined = self.inverses and self.is_triangle and not block
         self.block = self._block_rows(M.nbytes, block)
         self.panel = self._panel_rows(M.nbytes)
         self.weights = self._upload_weights(rows, method)
@@ -197,6 +200,8 @@ class Relaxation:
 
     def _block_rows(self, nbytes: int, block: int | None) -> int:
         n = max(1, self.n)
+        if self.is_joined:
+            return triangles.best_block(self.device, n, min(DEFAULT_BLOCK_ROWS, n))
         if not block and self.inverses:
             block = DEFAULT_BLOCK_ROWS
         elif not block:
@@ -212,21 +217,21 @@ class Relaxation:
             panels = n
         return self.block * -(-n // (self.block * panels))
 
-    def _upload_weights(self, rows: RelaxationRows, method: str) -> list[Array]:
+    def _upload_weights(self, rows: RelaxationRows, method: str) -> Array:
+        size = min(DEFAULT_BLOCK_ROWS, self.block) if self.is_joined else self.block
         # A sweep with Inf ends as divergence, and says so.
         with np.errstate(over="ignore"):
             if self.inverses:
-                weights = rows.inverse_blocks(self.block, self.omega, method)
+                weights = rows.inverse_blocks(size, self.omega, method)
             else:
                 weights = rows.inverse_diagonal(method)
-            weights = weights.astype(np.float32)
-        if self.device.is_cpu:
-            return [self.device.upload(weights)]
-        arrays = []
-        for start in range(0, max(1, self.n), self.block):
-            inverse = weights[start : start + self.block]
-            arrays.append(self.device.upload(inverse[..., : len(inverse)]))
-        return arrays
+            weights = self.device.upload(weights.astype(np.float32))
+        if not self.is_joined:
+            return weights
+        entries = [entry_arguments(slab, weights) for slab in self.slabs]
+        return triangles.join(
+            weights, self.block, self.slabs, entries, self.scale, is_dense=self.is_dense
+        )
 
     def _split_windows(self, slab: Slab) -> Array:
         """The entries at which sparse rows of a slab are split, (rows, 2), by binary searches."""
@@ -257,7 +262,7 @@ def _kernel(device: Device, file: str, name: str, is_dense: bool, **defines: int
     return device.kernel(file, name, **defines)
 
 
-def _entries(slab: Slab, unread: Array) -> dict[str, Any]:
+def entry_arguments(slab: Slab, unread: Array) -> dict[str, Any]:
     """The entries of a slab of either format; `unread` stands for the arrays that it lacks."""
     arguments = slab.arguments
     if "pointers" in arguments:
@@ -281,7 +286,8 @@ class Sweeps:
         self.group = GROUP_ITEMS
         self.before = x.like()
         self.s = x.like()
-        self.carry = x.like()
+        # The residual that the first sweep tells from it is not read.
+        self.carry = x.like().copy_from(b)
         strips = relaxation.panel // relaxation.block
         self._arrivals = x.device.upload(np.zeros(strips + 1), np.int32)
 
@@ -333,7 +339,7 @@ class Sweeps:
             "s": self.s,
             "r": self.r,
             "carry": self.carry,
-            **_entries(slab, windows),
+            **entry_arguments(slab, windows),
         }
 
     def _queue_strips(self, start: int, offset: int, defines: dict[str, int]) -> None:
@@ -342,7 +348,6 @@ class Sweeps:
         kernel = relaxation.kernel("relax_strips", **defines)
         block = relaxation.block
         omega = 1.0 if relaxation.omega is None else relaxation.omega
-        (weights,) = relaxation.weights
         for number, begin, end in self._panel_slabs(start):
             strips = -(-end // block) - begin // block
             kernel(
@@ -353,7 +358,7 @@ class Sweeps:
                 block=block,
                 by_inverses=int(relaxation.inverses),
                 omega=omega,
-                weights=weights,
+                weights=relaxation.weights,
                 arrivals=self._arrivals,
                 before=self.before,
                 **self._arguments(number, begin, end, start, offset),
@@ -363,7 +368,7 @@ class Sweeps:
         """Queue one block on a GPU: s_B, then x_B += P_BB^-1 s_B."""
         relaxation = self.relaxation
         sums = relaxation.kernel("relax_rows", **defines)
-        correct = sums.device.kernel("dense", "dense_matvec_group", **GPU_STRIPS, **defines)
+        correct = relaxation.kernel("relax_correct", **defines)
         group = min(sums.group(self.group), correct.group(self.group))
         local = self.x.device.local(2 * defines["K"] * group)
         for number, begin, end in self._panel_slabs(start):
@@ -374,17 +379,14 @@ class Sweeps:
             rows * group,
             group,
             rows=rows,
-            first=0,
+            start=start,
+            block=relaxation.block,
+            is_triangle=int(relaxation.is_triangle),
             stride=self.x.columns,
-            offset=start * self.x.columns + offset,
-            a=1.0,
-            b=1.0,
-            c=0.0,
-            x=self.s,
-            y=self.x,
-            out=self.x,
-            width=rows,
-            matrix=relaxation.weights[start // relaxation.block],
+            offset=offset,
+            weights=relaxation.weights,
+            s=self.s,
+            x=self.x,
             scratch=local,
         )
 
@@ -402,7 +404,9 @@ class Steps:
         self._pending = 0
         self._inverse = device.upload(rows.inverse_diagonal(method))
         # A step reads columns of M.
-        columns = rows.M.transposed_copy() if isinstance(rows.M, CSR) else rows.M
+        columns = rows.M
+        if isinstance(rows.M, CSR):
+            columns = rows.M.transposed_copy()
         self._slabs = columns.slabs
         shape = (parts, x.columns)
         self._picked = (device.empty(shape, np.int32), device.empty(shape))
@@ -447,7 +451,7 @@ class Steps:
                 next_picked=next_picked,
                 next_delta=next_delta,
                 places=self.x.device.local(group),
-                **_entries(slab, self._inverse),
+                **entry_arguments(slab, self._inverse),
             )
         self._picked, self._next = self._next, self._picked
         self._pending = self.parts if picks else 0

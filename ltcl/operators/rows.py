@@ -20,7 +20,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.device import Array, Device, ahead, tuning, vectors
 from ltcl.device.device import SPARE_BYTES
-from ltcl.device.kernels import Kernel, Launch, in_order
+from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import MemoryLimitError
 from ltcl.operators.base import Operator
 from ltcl.operators.epilogue import PLAIN, Epilogue, widths
@@ -33,9 +33,13 @@ MAX_SQUARED_NORM = 1e18
 MIN_SQUARED_ENTRY = 2.0**-63
 # Rounding of that sum.
 NORM_MARGIN = 1.01
-# Rows of a work-group on a GPU, and items of each: short rows leave no item idle, and fewer groups
-# start and leave fewer partial sums.
-GROUPS_OF_ROWS = ((4, 32), (8, 16))
+# Sub-groups of a work-group on a GPU, which has several short rows: no item is idle, and fewer
+# groups start and leave fewer partial sums. Long rows have up to MAX_ROW_ITEMS.
+SUBGROUPS_OF_GROUP = 4
+MAX_ROW_ITEMS = 256
+MIN_ROW_ITEMS = 4
+# Turns of the loop of an item, in the order in which variants are tried.
+TURNS_OF_ITEM = (2, 4, 1, 8)
 # Kernels count the elements of a slab in 32 bits, also a work-group beyond the end of a row.
 MAX_SLAB_ELEMENTS = (1 << 31) - 4096
 # Bytes of a matrix beside whose upload programs are built.
@@ -192,12 +196,15 @@ class RowOperator(ReadableRows):
         Stem of the kernel file.
     numbers : str
         The argument of a slab that holds the entries.
+    entries_of_turn : int
+        Entries that an item of a group takes in one turn of its loop.
     unit : float
         Unit of the numbers in the slabs.
     """
 
     file: ClassVar[str]
     numbers: ClassVar[str]
+    entries_of_turn: int = 4
     defines: dict[str, Any]
     unit: float = 1.0
     slabs: list[Slab]
@@ -260,13 +267,15 @@ class RowOperator(ReadableRows):
         """The kernels and work-groups that can make a product here, the default first."""
         if self.device.is_cpu:
             return {"item": Variant("", 16, shared=False)}
+        limit = power_of_two(min(MAX_ROW_ITEMS, self.device.max_group))
+        group = min(limit, power_of_two(SUBGROUPS_OF_GROUP * self.device.subgroup))
+        numbers = sum(slab.arguments[self.numbers].size for slab in self.slabs)
+        row_turns = numbers // max(1, self.shape[0]) // self.entries_of_turn
         variants = {}
-        for rows, items in GROUPS_OF_ROWS:
-            if rows * items <= self.device.max_group:
-                variants[f"{rows} rows by {items}"] = Variant("_group", rows * items, True, rows)
-        for group in (32, 64, 128, 256):
-            if group <= self.device.max_group:
-                variants[f"group{group}"] = Variant("_group", group, shared=True)
+        for turns in TURNS_OF_ITEM:
+            items = min(limit, max(MIN_ROW_ITEMS, power_of_two(row_turns // turns)))
+            rows = max(1, group // items)
+            variants[f"{rows} rows by {items}"] = Variant("_group", rows * items, True, rows)
         variants["item"] = Variant("", 64, shared=False)
         return variants
 
@@ -337,11 +346,19 @@ class RowOperator(ReadableRows):
     ) -> Callable[[], object]:
         if transpose:
             return self._bind_transpose(x, out, epilogue)
+        return self.bind_rows(0, x, out, epilogue)
+
+    def bind_rows(self, start: int, x: Array, out: Array, epilogue: Epilogue) -> Queued:
+        """A function that queues the product into the rows of `out` from `start` on.
+
+        These are then rows of a larger matrix; x, y and `out` belong to all of it.
+        """
         launches = []
         for offset, width in widths(x.columns):
             variant = self.fastest(x, width)
             for slab in self.slabs:
-                launch = self._bind_slab(slab, (offset, width), x, out, epilogue, variant)
+                moved = dataclasses.replace(slab, first=start + slab.first)
+                launch = self._bind_slab(moved, (offset, width), x, out, epilogue, variant)
                 launches.append(launch)
         return in_order(launches)
 
@@ -399,9 +416,27 @@ class StepPiece:
 
 
 class RowStepper(Stepper):
-    """Steps of one launch for each slab and each eight right-hand sides."""
+    """Steps of one launch for each slab and each eight right-hand sides.
+
+    A is all of the matrix, or its rows from `start` on: the step then changes these rows alone of
+    x, r and d.
+    """
 
     A: RowOperator
+
+    def __init__(
+        self,
+        A: RowOperator,
+        x: Array,
+        r: Array,
+        slots: int,
+        a: float,
+        c: float,
+        *,
+        start: int = 0,
+    ) -> None:
+        self._start = start
+        super().__init__(A, x, r, slots, a, c)
 
     def _prepare(self) -> None:
         pieces = self._step_pieces()
@@ -456,7 +491,7 @@ class RowStepper(Stepper):
                 piece.items,
                 piece.group,
                 rows=piece.slab.rows,
-                first=piece.slab.first,
+                first=self._start + piece.slab.first,
                 stride=self.x.columns,
                 offset=piece.offset,
                 a=self._a,
@@ -484,6 +519,15 @@ class RowStepper(Stepper):
         self._turns.reverse()
         self.d, self.spare = self.spare, self.d
         self.waiting += 1
+
+
+def power_of_two(n: int) -> int:
+    """The largest power of two up to n, at least 1.
+
+    >>> [power_of_two(n) for n in (0, 1, 63, 64)]
+    [1, 1, 32, 64]
+    """
+    return 1 << (max(1, n).bit_length() - 1)
 
 
 def cut(

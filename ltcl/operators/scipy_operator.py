@@ -23,7 +23,8 @@ class Host(Operator):
         self.operator = scipy.sparse.linalg.aslinearoperator(operator)
         self._name = type(operator).__name__
         # Complex numbers are refused.
-        checks.real(self._name, np.zeros(0, self.operator.dtype))
+        empty = _namespace(self.operator).empty(0, dtype=self.operator.dtype)
+        checks.real(self._name, empty)
         super().__init__(device, self.operator.shape)
 
     def diagonal(self) -> np.ndarray:
@@ -36,9 +37,10 @@ class Host(Operator):
     def product(self, x: np.ndarray, transpose: bool = False) -> np.ndarray:
         """A x or A^T x on the host, x (N, k) float64; results that are not finite are refused."""
         operator = self.operator.T if transpose else self.operator
+        operand = _namespace(operator).asarray(x)
         try:
             # `matvec` would drop masks.
-            product = operator.matmat(x)
+            product = operator.matmat(operand)
         except (NotImplementedError, TypeError) as error:
             # SciPy raises either if there is no rmatvec, the second for several columns.
             if not transpose:
@@ -63,3 +65,8 @@ class Host(Operator):
         if y is not None:
             total = total + b * y.get()
         out.set(total)
+
+
+def _namespace(operator: Any) -> Any:
+    """The namespace of the arrays that an operator takes: NumPy before SciPy 1.18."""
+    return getattr(operator, "_xp", np)

@@ -51,6 +51,10 @@ class Stepper:
         )
         self.waiting += 1
 
+    def finish(self) -> None:
+        """Leave the steps in `x` and `r`, and forget the norms that wait; does not wait."""
+        self.waiting = 0
+
     def norms(self) -> np.ndarray:
         """Norms (waiting, k) float64 of the residuals since the last call, newest last.
 

@@ -32,6 +32,7 @@ from ltcl.operators.compressed import Compressed
 from ltcl.operators.csr import CSR, Pattern, plain_arrays
 from ltcl.operators.dense import Dense
 from ltcl.operators.identity_plus import IdentityPlus
+from ltcl.operators.patch_hats import PATCH_HATS, PatchHats
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet, basis
 
@@ -207,10 +208,12 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
     name = str(arrays["name"])
     grid = tuple(np.ravel(arrays["grid"]).tolist())
     levels = arrays.get("levels")
-    if levels is None:
-        W = basis(device, grid, name)
-    else:
+    if levels is not None:
         W = Wavelet(device, grid, name, np.asarray(levels).tolist())
+    elif name == PATCH_HATS:
+        W = PatchHats(device, grid, int(arrays["walls"]), int(arrays["detail"]))
+    else:
+        W = basis(device, grid, name)
     if "places" in arrays:
         return SubsetBasis(device, grid, arrays["places"], W)
     if W is not None and "scale" in arrays:

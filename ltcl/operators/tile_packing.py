@@ -144,7 +144,8 @@ def joined_diagonally(blocks: Sequence[Packed]) -> Packed:
     """
     first = blocks[0]
     unit = max(packed.unit for packed in blocks)
-    frobenius = float(np.linalg.norm([packed.difference[0] for packed in blocks]))
+    differences = [packed.difference[0] for packed in blocks]
+    frobenius = float(np.linalg.norm(differences))
     difference = (frobenius, max(packed.difference[1] for packed in blocks))
     formats = {(packed.width, packed.precision) for packed in blocks}
     scaled = [_in_unit(packed, unit) for packed in blocks]
@@ -180,13 +181,19 @@ def joined_diagonally(blocks: Sequence[Packed]) -> Packed:
 
 def _packed_anew(blocks: Sequence[Packed], unit: float, difference: tuple[float, float]) -> Packed:
     """The same in the narrowest tiles of the blocks, and without scales."""
-    precisions = {PRECISION_WITHOUT_SCALES[packed.precision] for packed in blocks}
-    precision = "float32" if "float32" in precisions else "float16"
-    matrices: list[Any] = [packed.matrix() for packed in blocks]
+    matrices: list[Any] = []
+    width = blocks[0].width
+    precision = "float16"
+    common_unit: float | None = unit
+    for packed in blocks:
+        matrices.append(packed.matrix())
+        width = min(width, packed.width)
+        if PRECISION_WITHOUT_SCALES[packed.precision] == "float32":
+            precision = "float32"
+            common_unit = None
     matrix = scipy.sparse.csr_array(scipy.sparse.block_diag(matrices, format="csr"))
-    width = min(packed.width for packed in blocks)
-    packed = _pack(_nonzeros(matrix), width, precision, unit if precision == "float16" else None)
-    return dataclasses.replace(packed, difference=difference)
+    joined = _pack(_nonzeros(matrix), width, precision, common_unit)
+    return dataclasses.replace(joined, difference=difference)
 
 
 def _in_unit(packed: Packed, unit: float) -> tuple[np.ndarray, np.ndarray] | None:

@@ -78,6 +78,8 @@ class Tiles(SparseRows):
         self.width = packed.width
         self.precision = packed.precision
         self.unit = packed.unit
+        # A tile, whose numbers are one load.
+        self.entries_of_turn = self.width
         self.defines = {
             "WIDTH": self.width,
             "VALUES": list(PRECISIONS).index(self.precision),

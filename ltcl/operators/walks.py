@@ -151,8 +151,8 @@ class Walker:
         sums = np.zeros((len(pixels), b.columns, 2))
         chunks = -(-samples // CHUNK)
         launch_chunks = max(1, min(MAX_LAUNCH_CHUNKS, self._launch_walks() // CHUNK))
-        for some in _slices(len(pixels), max(1, launch_chunks // chunks)):
-            chosen = self.tables.device.upload(pixels[some], np.uint32)
+        for chunk_pixels in _slices(len(pixels), max(1, launch_chunks // chunks)):
+            chosen = self.tables.device.upload(pixels[chunk_pixels], np.uint32)
             for chunk_range in _slices(chunks, max(1, launch_chunks // chosen.size)):
                 for offset, width in widths(b.columns // self.tables.channels):
                     columns = slice(
@@ -162,8 +162,8 @@ class Walker:
                         b, chosen, steps, samples, chunk_range, columns, stream
                     )
                     # One chunk after the other, so that no split changes a bit.
-                    terms = np.concatenate([sums[some, None, columns], partial], axis=1)
-                    sums[some, columns] = np.add.accumulate(terms, axis=1)[:, -1]
+                    terms = np.concatenate([sums[chunk_pixels, None, columns], partial], axis=1)
+                    sums[chunk_pixels, columns] = np.add.accumulate(terms, axis=1)[:, -1]
                     self.watch()
         both = np.moveaxis(sums, -1, 0).reshape(2, len(pixels), *b.shape[1:])
         return Sums(samples, both[0], both[1])

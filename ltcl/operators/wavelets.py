@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Orthonormal 2-D wavelets, periodized, on grids of any size (`kernels/wavelet.cl`).
 
+A launch makes one large level. The small ones take one launch together: a GPU makes them in the
+local memory of a work-group for each right-hand side (`kernels/wavelet_tail.cl`).
+
 Coefficients stand as PyWavelets arranges them (`coeffs_to_array`); if all sides halve evenly they
 equal those of its ``wavedec2(..., mode="periodization")``. If one does not, PyWavelets repeats the
 last sample; here it stands for fewer pixels than the others and passes by the filters into the
@@ -18,7 +21,9 @@ from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.device.kernels import Queued, in_order
 from ltcl.errors import InputError
+from ltcl.operators import bases
 from ltcl.operators.bases import PIXELS, Basis, bind_grid, bind_group
+from ltcl.operators.epilogue import Epilogue
 from ltcl.operators.pyramid import HATS, PYRAMID, Hats, Pyramid
 
 # Wavelets that are compared where no basis is named, the best one first.
@@ -27,8 +32,6 @@ EXAMPLES = ", ".join(COMPARED_WAVELETS)
 WAVELET_NAME = f"an orthonormal wavelet of PyWavelets, such as {EXAMPLES}"
 # Compiled, so that no type checker knows its names.
 _pywt: Any = pywt
-# Pixels of a level up to which one launch does all the levels from it on.
-SMALL_LEVEL_PIXELS = 4096
 # Deviation from orthonormality: that of dmey is 2e-3.
 MAX_FILTER_DEVIATION = 1e-7
 # Pairs of coefficients that a CPU computes in one wide load.
@@ -75,7 +78,9 @@ class Wavelet(Basis):
         for level in range(self.levels + 1):
             rows, columns = self._sides(level)
             sizes.append(rows * columns)
-        self._large_levels = sum(size > SMALL_LEVEL_PIXELS for size in sizes[:-1])
+        self._large_levels = _count_large_levels(device, sizes)
+        # Numbers that the small levels keep in the local memory of a GPU.
+        self._local_numbers = _local_numbers(sizes, self._large_levels)
         # The approximations of levels 1, 2, ... stand one behind the other; wide loads reach a
         # spare pixel between.
         approximation_sizes = [size + 1 for size in sizes[1:]]
@@ -93,41 +98,54 @@ class Wavelet(Basis):
         size = 2**level
         return -(-h // size), -(-w // size)
 
-    def _bind_transform(
-        self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool
-    ) -> Queued:
-        return self.bind_planes(x, out, a, b, y, transpose, planes=1)
+    def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
+        return self.bind_planes(x, out, epilogue, transpose, planes=1)
+
+    def bind_ordered(
+        self, x: Array, out: Array, epilogue: Epilogue, transpose: bool, order: Array
+    ) -> Queued | None:
+        """The launches on a GPU, which reads and writes coefficients in any order."""
+        if not self.takes_order:
+            return None
+        return self.bind_planes(x, out, epilogue, transpose, 1, order)
+
+    @property
+    def takes_order(self) -> bool:
+        """True if its launches read and write coefficients in any order."""
+        return self.levels > 0 and not self.device.is_cpu
 
     def bind_planes(
         self,
         x: Array,
         out: Array,
-        a: float,
-        b: float,
-        y: Array,
+        epilogue: Epilogue,
         transpose: bool,
         planes: int,
+        order: Array | None = None,
     ) -> Queued:
         """The launches of out = a (W x) + b y, or with W^T.
 
         With several `planes`, x and out (planes N,) are pictures one below the other, each of which
-        is transformed.
+        is transformed. A GPU takes an `order` as `bind_ordered` does, of all planes.
         """
+        y = epilogue.operand(x)
         if self.levels == 0:
-            return vectors.bind_axpby(a, x, b, y, out)
+            return vectors.bind_axpby(epilogue.a, x, epilogue.b, y, out)
         name = "join" if transpose else "split"
         k = x.columns
         pairs = CPU_PAIRS if k == 1 and self.device.is_cpu else 1
         taps = self._taps.shape[1]
-        kernel, pieces = self._kernel("wavelet", name, k, TAPS=taps, PAIRS=pairs)
+        defines = {"TAPS": taps, "PAIRS": pairs}
+        if order is not None:
+            defines["ORDERED"] = 1
         height, width = self.grid
         arguments = {
             "height": height,
             "width": width,
             "levels": self.levels,
             "k": k,
-            "scale": a,
-            "add_scale": b,
+            "scale": epilogue.a,
+            "add_scale": epilogue.b,
             "starts": self._starts,
             "taps": self._taps,
             "x": x,
@@ -135,16 +153,24 @@ class Wavelet(Basis):
             "add": y,
             "out": out,
         }
+        if order is not None:
+            arguments["order"] = order
         level_ranges = self._level_ranges()
         if transpose:
             level_ranges.reverse()
         launches = []
         for first, end in level_ranges:
-            levels = {"first_level": first, "end_level": end}
-            if end <= self._large_levels:
-                launch = bind_grid(kernel, pieces * planes, self._sides(end), **levels, **arguments)
+            levels = {"first_level": first, "end_level": end, **arguments}
+            is_small = end > self._large_levels
+            file = "wavelet"
+            if is_small and not self.device.is_cpu:
+                file = "wavelet_tail"
+                levels["space"] = self.device.local(self._local_numbers)
+            kernel, pieces = self._kernel(file, name, k, **defines)
+            if is_small:
+                launch = bind_group(kernel, pieces * planes, **levels)
             else:
-                launch = bind_group(kernel, pieces * planes, **levels, **arguments)
+                launch = bind_grid(kernel, pieces, self._sides(end), planes, **levels)
             launches.append(launch)
         return in_order(launches)
 
@@ -154,6 +180,25 @@ class Wavelet(Basis):
         if self._large_levels < self.levels:
             launches.append((self._large_levels, self.levels))
         return launches
+
+
+def _count_large_levels(device: Device, sizes: list[int]) -> int:
+    """The number of levels, of so many pixels each, before those that one launch makes together.
+
+    A GPU makes together what its work-groups turn over quickly and its local memory holds.
+    """
+    small = bases.small_level_pixels(device)
+    levels = len(sizes) - 1
+    for level in range(levels):
+        fits = device.is_cpu or 4 * _local_numbers(sizes, level) <= device.local_memory
+        if sizes[level] <= small and fits:
+            return level
+    return levels
+
+
+def _local_numbers(sizes: list[int], first_level: int) -> int:
+    """Numbers of the levels from `first_level` on that a work-group keeps at a time."""
+    return sum(sizes[first_level : first_level + 3])
 
 
 def filters(name: Any) -> np.ndarray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from ltcl import checks
 from ltcl.errors import InputError
 from ltcl.files import replace_file
 
@@ -37,6 +38,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 def figure_of(width: int, height: int) -> ShownFigure:
     """An empty page of so many pixels, drawn by Agg."""
+    checks.load_extra("matplotlib", "plots", "a plot")
     from ltcl.plots.shown_figure import ShownFigure
 
     return ShownFigure(width, height, DPI, PAPER)

@@ -326,10 +326,10 @@ def _stokes(first: np.ndarray, second: np.ndarray, points: int) -> np.ndarray:
     terms = product[pair, a, b]
     step = max(1, EDGE_POINTS_AT_ONCE // points)
     for start in range(0, len(pair), step):
-        some = slice(start, start + step)
-        edges = first[pair[some], a[some]]
-        other_edges = second[pair[some], b[some]]
-        terms[some] *= _mean_log(edges, other_edges, points)
+        chunk = slice(start, start + step)
+        edges = first[pair[chunk], a[chunk]]
+        other_edges = second[pair[chunk], b[chunk]]
+        terms[chunk] *= _mean_log(edges, other_edges, points)
     # Patches that hardly see each other may come out a rounding error below zero.
     total = np.bincount(pair, terms, len(first))
     return np.maximum(total, 0) / (2 * np.pi)

@@ -41,6 +41,7 @@ from ltcl.scenes.patches import (
     scaled,
     squared_size,
 )
+from ltcl.scenes.refined import RefinedScene
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import box_corners, check_albedo, finite_floats
@@ -139,10 +140,13 @@ class FormFactor(Operator):
         self._components = (*geometry, self._albedo, self._area, self._near)
 
     @classmethod
-    def of(cls, scene: Scene, device: Device | str | None = None) -> tuple[FormFactor, ...]:
+    def of(
+        cls, scene: Scene | RefinedScene, device: Device | str | None = None
+    ) -> tuple[FormFactor, ...]:
         """Bounce in a scene of `box`, `dihedral` or `trihedral`, one operator per channel.
 
-        They are computed from the scene's walls and blocks, not from its matrix of form factors.
+        They are computed from the scene's walls and blocks, not from its matrix of form factors:
+        those of a `RefinedScene` are the exact ones of all its pixels.
 
         Raises
         ------
@@ -201,6 +205,9 @@ class FormFactor(Operator):
             )
             for first in range(0, count, rows_per_launch):
                 rows = min(rows_per_launch, count - first)
+                added = y
+                if y is None:
+                    added = out
                 matvec(
                     rows,
                     group,
@@ -212,7 +219,7 @@ class FormFactor(Operator):
                     b=b,
                     c=c,
                     x=x,
-                    y=out if y is None else y,
+                    y=added,
                     out=out,
                     pitch=pitch,
                     geometry=self._geometry,

@@ -5,11 +5,11 @@
 takes messages for it:
 
     /ltcl/gain G            brightness of the target, or "follow"
-    /ltcl/bounds LOW HIGH   darkest and brightest light of the projector; takes effect with a pause
+    /ltcl/bounds LOW HIGH   darkest and brightest light of the projector
     /ltcl/picture NAME      a picture of the folder in place of the film; without NAME the film
     /ltcl/blackout 1        black, or 0
     /ltcl/freeze 1          the codes of the last frame stay, or 0
-    /ltcl/projector N 1     projector N, counted from 1, is on, or 0
+    /ltcl/projector N 1     projector N of a combination, counted from 1, is on, or 0
     /ltcl/statistics [PORT] asks for these, at the port of the sender or at PORT
 
 and answers, to the sender,
@@ -38,17 +38,15 @@ from ltcl.errors import InputError, LtclError
 from ltcl.tasks.compensation import FrameStatistics
 
 PREFIX = "/ltcl/"
+MAX_PORT = 65535
 FOLLOW = "follow"
-# Projectors of a show.
-PROJECTORS = 1
-EXTRA = 'OSC needs python-osc; python -m pip install "ltcl[show]" brings it'
 
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShowState:
-    """What is asked for.
+    """State that the operator of a show asks for.
 
     Attributes
     ----------
@@ -57,7 +55,9 @@ class ShowState:
     bounds : (float, float) or None
     picture : ndarray or None
         Shown in place of the film.
-    is_black, is_frozen, is_on : bool
+    is_black, is_frozen : bool
+    off : frozenset of int
+        Projectors that get black, counted from 1.
     """
 
     gain: float | str | None = None
@@ -65,11 +65,11 @@ class ShowState:
     picture: np.ndarray | None = None
     is_black: bool = False
     is_frozen: bool = False
-    is_on: bool = True
+    off: frozenset[int] = frozenset()
 
 
 class ShowControl:
-    """What is asked of a running show; any thread may call it.
+    """Requests to a running show; any thread may call it.
 
     Parameters
     ----------
@@ -89,6 +89,8 @@ class ShowControl:
         self._pictures = pictures
         self._lock = threading.Lock()
         self.state = ShowState()
+        # Projectors of the show; None before it has begun.
+        self.projectors: int | None = None
         # The show says here what it has done, and tells errors there.
         self.read_statistics: Callable[[], FrameStatistics] | None = None
         self.on_error: Callable[[str], None] = _logger.warning
@@ -105,9 +107,11 @@ class ShowControl:
 
     def show_picture(self, name: str | None) -> None:
         """Show a picture of the folder in place of the film; None shows the film."""
-        if not name:
+        if name is None or name == "":
             self._update(picture=None)
             return
+        if not isinstance(name, str):
+            raise InputError(f"picture is {name!r}; it must be the name of a picture")
         if self._pictures is None:
             raise InputError(f"picture is {name!r}, but there is no folder of pictures")
         if Path(name).name != name or name.startswith("."):
@@ -124,8 +128,17 @@ class ShowControl:
 
     def set_projector(self, number: int, is_on: bool) -> None:
         """Switch a projector on or off; one that is off gets black."""
-        checks.count("projector", number, most=PROJECTORS)
-        self._update(is_on=is_on)
+        checks.count("projector", number)
+        if self.projectors is None and number > 1:
+            raise InputError(
+                f"projector is {number}, but the show has not begun; its projectors are not known "
+                "yet"
+            )
+        checks.count("projector", number, most=self.projectors)
+        with self._lock:
+            others = self.state.off - {number}
+            off = others if is_on else others | {number}
+            self.state = replace(self.state, off=off)
 
     def statistics(self) -> FrameStatistics:
         """Numbers of the show so far; InputError before it has begun."""
@@ -161,11 +174,10 @@ class OscServer(contextlib.AbstractContextManager):
     """
 
     def __init__(self, control: ShowControl, port: int, host: str = "127.0.0.1") -> None:
-        try:
-            from pythonosc.dispatcher import Dispatcher
-            from pythonosc.osc_server import BlockingOSCUDPServer
-        except ImportError as error:
-            raise InputError(EXTRA) from error
+        checks.load_extra("pythonosc", "show", "OSC")
+        from pythonosc.dispatcher import Dispatcher
+        from pythonosc.osc_server import BlockingOSCUDPServer
+
         self._control = control
         # Of the last message.
         self._sender: tuple[str, int] | None = None
@@ -206,7 +218,7 @@ class OscServer(contextlib.AbstractContextManager):
         elif name == "bounds":
             control.set_bounds(*_counted(values, 2))
         elif name == "picture":
-            control.show_picture(str(values[0]) if values else None)
+            control.show_picture(_counted(values, 1)[0] if values else None)
         elif name == "blackout":
             control.set_black(_flag(*_counted(values, 1)))
         elif name == "freeze":
@@ -215,7 +227,9 @@ class OscServer(contextlib.AbstractContextManager):
             number, is_on = _counted(values, 2)
             control.set_projector(number, _flag(is_on))
         elif name == "statistics":
-            port = int(values[0]) if values else sender[1]
+            port = sender[1]
+            if values:
+                port = checks.count("port", *_counted(values, 1), most=MAX_PORT)
             self._send_statistics((sender[0], port))
         else:
             raise InputError("is no address of a show")

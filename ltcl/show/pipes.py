@@ -54,7 +54,7 @@ class Writable(Protocol):
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """How a pixel lies in the bytes of a frame.
+    """Layout of a pixel in the bytes of a frame.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ def parse_video_size(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class PipeStatistics:
-    """What went through a pipe.
+    """Statistics of the frames that went through a pipe.
 
     Attributes
     ----------

@@ -87,6 +87,7 @@ def play(
     title = window.title
     for frame in film:
         begun_at = time.monotonic()
+        timing.place(frame.number, frame.seconds)
         if timing.is_too_late(frame.number, begun_at):
             continue
         codes = projection.codes(frame.srgb())
@@ -113,10 +114,13 @@ class _Timing:
 
     # Seconds from one frame of the film to the next.
     period: float
+    # By how much the time of the film is ahead of its rate.
+    offset: float = 0.0
     # When frame 0 was due.
     start: float = 0.0
-    # When the last frame was sent, its number, and how many were shown.
+    # When the last frame was sent and was due, its number, and how many were shown.
     sent_at: float = 0.0
+    sent_due: float = 0.0
     number: int = 0
     shown: int = 0
     # Seconds of the last frames, and of all frames.
@@ -124,9 +128,15 @@ class _Timing:
     drawing: deque[float] = field(default_factory=lambda: deque([0.0], TIMED_FRAMES))
     latencies: list[float] = field(default_factory=list)
 
+    def place(self, number: int, seconds: float | None) -> None:
+        """Take note of the time of a frame by its own time stamp: a film may have no one rate."""
+        if seconds is not None:
+            # Frames are numbered from 1.
+            self.offset = seconds - (number - 1) * self.period
+
     def due_at(self, number: int) -> float:
-        """Return when a frame is due."""
-        return self.start + number * self.period
+        """Return when a frame is due, at the time stamps so far."""
+        return self.start + number * self.period + self.offset
 
     def is_too_late(self, number: int, now: float) -> bool:
         """True if the next frame will be due before this one can be there."""
@@ -146,12 +156,13 @@ class _Timing:
         """Take note of a frame that was sent when the window had drawn the one before."""
         has_waited = time.monotonic() - asked_at >= PAUSE_SECONDS
         if self.shown and not has_waited:
-            self.latencies.append(drawn_at - self.due_at(self.number))
+            self.latencies.append(drawn_at - self.sent_due)
             self.drawing.append(drawn_at - self.sent_at)
         else:
             # The film waited for a window.
-            self.start = time.monotonic() - number * self.period
+            self.start = time.monotonic() - number * self.period - self.offset
         self.sent_at = time.monotonic()
+        self.sent_due = self.due_at(number)
         self.number = number
         self.shown += 1
 

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ltcl.errors import InputError, LtclError
 from ltcl.images.encoding import to_linear
 from ltcl.show.control import ShowControl, ShowState
 from ltcl.tasks.compensation import Compensator, FrameStatistics
+from ltcl.transport.projectors import CombinedTransport
 from ltcl.viewer.answers import ViewerScene
 
 # Share of the time from frame to frame that projected steps may take, where light cannot be undone.
@@ -56,8 +58,9 @@ class Projection:
         self._resize = resize
         self._decode = settings.get("decode", "auto")
         settings["gain"] = gain
+        self._dtype = np.dtype(settings.get("dtype", "uint8"))
         if self._setup is not None:
-            settings["encode"] = self._setup.calibration.projector
+            self._take_response(settings)
         if gain == "auto":
             settings["film"] = [self._on_camera(picture) for picture in film]
         self._fps = fps
@@ -66,8 +69,16 @@ class Projection:
         # Codes of the last frame.
         self._last: Future[np.ndarray | None] | None = None
         self._control = ShowControl() if control is None else control
+        self._control.projectors = self.projectors
         self._control.read_statistics = lambda: self.statistics
         self._applied = ShowState()
+
+    def _take_response(self, settings: dict[str, Any]) -> None:
+        """Let codes be those of the measured projector; with several each has its own curve."""
+        settings["encode"] = self._setup.response
+        if self._setup.response is None:
+            settings["encode"] = "linear"
+            settings["dtype"] = "float32"
 
     def _prepare(self, settings: dict[str, Any]) -> Compensator:
         # For a camera of other pixels light is found only within the bounds.
@@ -84,12 +95,19 @@ class Projection:
     def grid(self) -> tuple[int, int]:
         """Height and width of the codes."""
         if self._setup is not None:
-            return self._setup.blocks.pixels
+            return self._setup.pixels
         return self._T.grid
 
     @property
+    def projectors(self) -> int:
+        """Projectors whose codes stand side by side."""
+        if isinstance(self._T, CombinedTransport):
+            return len(self._T.transports)
+        return 1
+
+    @property
     def statistics(self) -> FrameStatistics:
-        """Numbers of the frames so far, since bounds were changed."""
+        """Numbers of the frames so far, since the compensation was prepared."""
         return self._compensator.statistics
 
     def codes(self, picture: np.ndarray) -> np.ndarray:
@@ -105,7 +123,7 @@ class Projection:
             self._apply(state)
         if state.is_frozen and self._last is not None:
             return self._last
-        if state.is_black or not state.is_on:
+        if state.is_black or len(state.off) == self.projectors:
             future: Future[np.ndarray | None] = Future()
             future.set_result(self._black())
             self._last = future
@@ -113,6 +131,8 @@ class Projection:
         if state.picture is not None:
             picture = self._coded(state.picture)
         self._last = self._compensator.submit(self._on_camera(picture))
+        if state.off:
+            self._last = _then(self._last, partial(self._darkened, off=state.off))
         return self._last
 
     def _apply(self, state: ShowState) -> None:
@@ -121,21 +141,36 @@ class Projection:
         self._applied = state
         if (state.gain, state.bounds) == (before.gain, before.bounds):
             return
-        settings = dict(self._settings)
-        settings.pop("film", None)
-        settings["gain"] = self._compensator.gain if state.gain is None else state.gain
-        needs_others = state.bounds != before.bounds
-        if needs_others:
-            settings["bounds"] = state.bounds
-        if not needs_others and not isinstance(settings["gain"], str):
-            self._compensator.follows_gain = False
-            self._compensator.gain = settings["gain"]
-            return
         try:
-            compensator = self._prepare(settings)
+            if state.bounds is not None and state.bounds != before.bounds:
+                self._take_bounds(state.bounds)
+            if state.gain is not None and state.gain != before.gain:
+                self._take_gain(state.gain)
         except LtclError as error:
             self._control.on_error(str(error))
-            return
+
+    def _take_bounds(self, bounds: tuple[float, float]) -> None:
+        try:
+            self._compensator.bounds = bounds
+            self._settings["bounds"] = bounds
+        except InputError:
+            # Perhaps these bounds need projected steps, which were left out.
+            gain = self._compensator.gain
+            if self._compensator.follows_gain:
+                gain = "follow"
+            self._prepare_anew({**self._settings, "bounds": bounds, "gain": gain})
+
+    def _take_gain(self, gain: float | str) -> None:
+        if isinstance(gain, str):
+            self._prepare_anew({**self._settings, "gain": gain})
+        else:
+            self._compensator.follows_gain = False
+            self._compensator.gain = gain
+
+    def _prepare_anew(self, settings: dict[str, Any]) -> None:
+        """Go on with other settings, for which the show pauses."""
+        settings.pop("film", None)
+        compensator = self._prepare(settings)
         self._compensator.close()
         self._compensator = compensator
         self._settings = settings
@@ -144,13 +179,30 @@ class Projection:
         """The codes of a black projector."""
         return np.zeros((*self._T.grid, 3), self._settings.get("dtype", "uint8"))
 
+    def _darkened(self, codes: np.ndarray, off: frozenset[int]) -> np.ndarray:
+        """A copy of codes on the pixels of T with the patterns of projectors `off` black."""
+        assert isinstance(self._T, CombinedTransport)  # noqa: S101 - else all are off
+        montage = self._T.montage
+        patterns = list(montage.split(codes))
+        for number in off:
+            patterns[number - 1][:] = 0
+        return montage.join(patterns)
+
     def _coded(self, light: np.ndarray) -> np.ndarray:
         """Linear light in the encoding of frames."""
         return images.to_srgb(light) if self._decode == "srgb" else light
 
     def enlarged(self, codes: np.ndarray) -> np.ndarray:
         """Bring codes from the pixels of T to those of the projector."""
-        return codes if self._setup is None else self._setup.blocks.enlarged(codes)
+        if self._setup is None:
+            return codes
+        if self._setup.response is not None:
+            return self._setup.blocks.enlarged(codes)
+        # They are light, of which several projectors make codes.
+        shown = self._setup.codes(codes)
+        if self._dtype.kind == "f":
+            return shown
+        return np.rint(np.iinfo(self._dtype).max * shown).astype(self._dtype)
 
     def close(self) -> None:
         """Wait for the frames on their way."""
@@ -164,3 +216,20 @@ class Projection:
         light = images.resize(to_linear(picture, self._decode), grid, self._resize)
         # The compensator would take floats for codes.
         return self._coded(light)
+
+
+def _then(
+    future: Future[np.ndarray | None], change: Callable[[np.ndarray], np.ndarray]
+) -> Future[np.ndarray | None]:
+    """A future of the changed codes of another one, dropped frames and errors as they are."""
+    changed: Future[np.ndarray | None] = Future()
+
+    def take(done: Future[np.ndarray | None]) -> None:
+        try:
+            codes = done.result()
+            changed.set_result(None if codes is None else change(codes))
+        except Exception as error:  # noqa: BLE001 - the one who asks for codes raises it
+            changed.set_exception(error)
+
+    future.add_done_callback(take)
+    return changed

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -84,6 +84,65 @@ class Bounded(Solution):
         return text if self.converged else f"{text}: {self.status.value}"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BoxProblem:
+    """min ||w (A x - b)|| over lower <= x <= upper, for some A.
+
+    Attributes
+    ----------
+    b, weights : (M, k)
+        The weights w are at least 0; ones when None.
+    lower, upper : (N,)
+        Finite bounds.
+    x0 : (N, k)
+        The start, which is moved within the bounds.
+    """
+
+    b: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    x0: np.ndarray
+    weights: np.ndarray | None = None
+
+    def in_units(self) -> _ScaledProblem:
+        """The problem in units in which squares stay within float32."""
+        # A x is about as large as the x nearest to 0, however dark the target is.
+        darkest = np.clip(0.0, self.lower, self.upper)
+        largest = max(float(np.max(np.abs(self.b))), float(np.max(np.abs(darkest))))
+        if largest == 0.0:
+            largest = float(np.max(np.abs([self.lower, self.upper])))
+        unit = power_of_two(largest)
+        weight_unit = 1.0
+        weights = self.weights
+        if weights is not None:
+            weight_unit = power_of_two(float(np.max(weights)))
+            weights = weights / weight_unit
+        with np.errstate(over="ignore"):
+            lower = np.clip(self.lower / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
+            upper = np.clip(self.upper / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
+        box = round_inwards(lower, upper)
+        return _ScaledProblem(
+            unit=unit,
+            weight_unit=weight_unit,
+            b=self.b / unit,
+            weights=weights,
+            box=box,
+            first=_clip((self.x0 / unit).astype(np.float32), box),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ScaledProblem:
+    """A `BoxProblem` in units; `first` is the start within the bounds."""
+
+    unit: float
+    weight_unit: float
+    b: np.ndarray
+    weights: np.ndarray | None
+    box: Box
+    first: np.ndarray
+
+
 def minimise(
     A: Operator,
     b: np.ndarray,
@@ -116,45 +175,86 @@ def minimise(
     callback : callable(iteration, relative gap), optional
         Called after each step.
     """
+    problem = BoxProblem(b=b, lower=lower, upper=upper, x0=x0, weights=weights)
+    solved = minimise_each(A, [problem], rtol=rtol, atol=atol, maxiter=maxiter, callback=callback)
+    return solved[0]
+
+
+def minimise_each(
+    A: Operator,
+    problems: Sequence[BoxProblem],
+    *,
+    rtol: float = 1e-2,
+    atol: float = 0.0,
+    maxiter: int = 1000,
+    callback: Callable[[int, float], object] | None = None,
+) -> tuple[Bounded, ...]:
+    """Solve several problems at the same time, as `minimise` solves one.
+
+    Parameters
+    ----------
+    A : Operator
+        diag(A_1, ..., A_c) of the matrices of all problems, as `ltcl.operators.block_diagonal`
+        makes it.
+    problems : sequence of BoxProblem
+        Several have one column each, equal shapes, and weights all or none.
+    """
     start = time.perf_counter()
-    largest = float(np.max(np.abs(b)))
-    if largest == 0.0:
-        largest = float(np.max(np.abs([lower, upper])))
-    unit = power_of_two(largest)
-    weight_unit = 1.0
-    if weights is not None:
-        weight_unit = power_of_two(float(np.max(weights)))
-        weights = weights / weight_unit
-
-    scaled_lower = np.clip(np.asarray(lower, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
-    scaled_upper = np.clip(np.asarray(upper, np.float64) / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
-    box = round_inwards(scaled_lower, scaled_upper)
-    first = _clip((x0 / unit).astype(np.float32), box)
+    scaled = [problem.in_units() for problem in problems]
+    weights = None
+    all_weights = [each.weights for each in scaled if each.weights is not None]
+    if all_weights:
+        weights = np.concatenate(all_weights)
+    lower = np.concatenate([each.box[0] for each in scaled])
+    upper = np.concatenate([each.box[1] for each in scaled])
+    b = np.concatenate([each.b for each in scaled])
     columns = b.shape[1]
-    descent = Descent(A, columns, weights, box)
-    descent.b.set(b / unit)
-    descent.x.set(first)
+    descent = Descent(A, columns, weights, (lower, upper), planes=len(problems))
+    descent.b.set(b)
+    descent.x.set(np.concatenate([each.first for each in scaled]))
     descent.begin()
-    search = Search(descent, rtol, atol / (unit * weight_unit), maxiter, callback)
-    status = search.run()
+    error_units = np.array([each.unit * each.weight_unit for each in scaled])
+    search = Search(descent, rtol, atol / error_units, maxiter, callback)
+    search.run()
     search.fall_back()
+    seconds = time.perf_counter() - start
+    solved = []
+    for number in range(len(problems)):
+        end = search.of_plane(number)
+        x = np.where(end.is_worse, scaled[number].first, end.x) * scaled[number].unit
+        box = round_inwards(problems[number].lower, problems[number].upper)
+        solved.append(
+            Bounded(
+                x=_clip(x.astype(np.float32), box),
+                status=end.status,
+                iterations=len(search.history) - 1,
+                products=descent.products,
+                residuals=end.residuals,
+                seconds=seconds,
+                method="bounded",
+                errors=end.errors * error_units[number],
+                least=end.least * error_units[number],
+                saturated=end.saturated,
+                gap=end.gap,
+            )
+        )
+    return tuple(solved)
 
-    x = np.where(search.worse_columns, first, search.x) * unit
-    x = _clip(x.astype(np.float32), round_inwards(lower, upper))
-    error_unit = unit * weight_unit
-    return Bounded(
-        x=x,
-        status=status,
-        iterations=len(search.residuals) - 1,
-        products=descent.products,
-        residuals=tuple(search.residuals),
-        seconds=time.perf_counter() - start,
-        method="bounded",
-        errors=search.errors * error_unit,
-        least=np.maximum(search.least - search.hidden, 0.0) * error_unit,
-        saturated=search.saturated,
-        gap=float(np.max(search.excess / search.scale)),
-    )
+
+class SearchEnd(NamedTuple):
+    """The end of a search in one plane, or in all columns where there is one plane; in its units.
+
+    x and saturated are (N, k); is_worse, errors and least are (k,).
+    """
+
+    x: np.ndarray
+    saturated: np.ndarray
+    is_worse: np.ndarray
+    errors: np.ndarray
+    least: np.ndarray
+    residuals: tuple[float, ...]
+    gap: float
+    status: Status
 
 
 class Search:
@@ -163,14 +263,16 @@ class Search:
     With a `deadline`, a time of `time.perf_counter`, it ends where another step would be late.
 
     Attributes, of the last iterate and by columns: `errors`, the bound `least` on the least error,
-    `hidden`, what rounding hides of the errors, and `excess`, the error above the least one.
+    `hidden`, what rounding hides of the errors, `excess`, the error above the least one,
+    `unsolved`, where that is above the tolerance, and `is_stagnant`, where rounding hides any
+    further gain. `history` has the relative errors of all steps.
     """
 
     def __init__(
         self,
         descent: Descent,
         rtol: float,
-        atol: float = 0.0,
+        atol: float | np.ndarray = 0.0,
         maxiter: int = 1000,
         callback: Callable[[int, float], object] | None = None,
         deadline: float = math.inf,
@@ -187,19 +289,22 @@ class Search:
         self.least = np.zeros_like(self.scale)
         self.excess = self.initial
         self.hidden = descent.rounding()
-        self.residuals: list[float] = []
-        self._lowest = np.inf
-        self._lowest_at = 0
+        self.unsolved = np.ones(len(self.scale), bool)
+        self.status = Status.MAXITER
+        self.history: list[np.ndarray] = []
+        self.is_stagnant = np.zeros(len(self.scale), bool)
+        self._lowest = np.full(len(self.scale), np.inf)
+        self._lowest_at = np.zeros(len(self.scale), int)
         self._last_time = time.perf_counter()
         self._step_seconds = 0.0
 
-    def run(self) -> Status:
+    def run(self) -> None:
         """Take steps until the search ends; its end is said of a residual computed from x alone."""
         descent = self.descent
         while True:
             self._measure()
-            unsolved = self.excess > self.tolerance
-            status = self._judge(unsolved)
+            self.unsolved = self.excess > self.tolerance
+            status = self._judge()
             is_certain = descent.has_true_residual or self._is_late()
             if status is not None and not is_certain:
                 descent.refresh()
@@ -207,8 +312,9 @@ class Search:
                 continue
             self._record()
             if status is not None:
-                return status
-            descent.step(unsolved)
+                self.status = status
+                return
+            descent.step(self.unsolved & ~self.is_stagnant)
 
     def _is_late(self) -> bool:
         """True if there is no time for as long a step as the last one."""
@@ -229,14 +335,14 @@ class Search:
         excess = errors - self.least + 2.0 * self.hidden
         return np.maximum(excess, ROUNDING_SHARE * self.scale)
 
-    def _judge(self, unsolved: np.ndarray) -> Status | None:
+    def _judge(self) -> Status | None:
         """Return how the search ends, or None while it goes on."""
-        steps = len(self.residuals)
-        if not unsolved.any():
+        steps = len(self.history)
+        if not self.unsolved.any():
             return Status.CONVERGED
         if steps >= self.maxiter or self._is_late():
             return Status.MAXITER
-        if steps - self._lowest_at > PATIENCE:
+        if self.is_stagnant[self.unsolved].all():
             return Status.STAGNATED
         return None
 
@@ -245,14 +351,15 @@ class Search:
         now = time.perf_counter()
         self._step_seconds = now - self._last_time
         self._last_time = now
-        steps = len(self.residuals)
-        relative_excess = float(np.max(self.excess / self.scale))
-        if relative_excess < self._lowest:
-            self._lowest = relative_excess
-            self._lowest_at = steps
+        steps = len(self.history)
+        relative_excess = self.excess / self.scale
+        is_lower = relative_excess < self._lowest
+        self._lowest[is_lower] = relative_excess[is_lower]
+        self._lowest_at[is_lower] = steps
+        self.is_stagnant |= steps - self._lowest_at >= PATIENCE
         if self.callback is not None:
-            self.callback(steps, relative_excess)
-        self.residuals.append(float(np.max(self.errors / self.scale)))
+            self.callback(steps, float(np.max(relative_excess)))
+        self.history.append(self.errors / self.scale)
 
     @property
     def is_worse(self) -> np.ndarray:
@@ -264,11 +371,37 @@ class Search:
         self.x = self.descent.x.get()
         is_worse = self.is_worse
         saturated = self.descent.saturated(self.x)
-        self.saturated = np.where(is_worse, False, saturated)
+        self.saturated = saturated & ~self.descent.along_x(is_worse)
         initial_excess = self._excess_above_least(self.initial)
         self.excess = np.where(is_worse, initial_excess, self.excess)
         self.worse_columns = is_worse
         self.errors = np.where(is_worse, self.initial, self.errors)
+
+    def of_plane(self, number: int) -> SearchEnd:
+        """The facts of one plane, after `fall_back`."""
+        planes = self.descent.planes
+        columns = slice(None)
+        if planes > 1:
+            columns = slice(number, number + 1)
+        status = self.status
+        if not self.unsolved[columns].any():
+            # Other planes decided how the search ended.
+            status = Status.CONVERGED
+        elif self.is_stagnant[columns].all():
+            status = Status.STAGNATED
+        least = np.maximum(self.least - self.hidden, 0.0)
+        relative_excess = self.excess / self.scale
+        residuals = [float(np.max(errors[columns])) for errors in self.history]
+        return SearchEnd(
+            x=np.split(self.x, planes)[number],
+            saturated=np.split(self.saturated, planes)[number],
+            is_worse=self.worse_columns[columns],
+            errors=self.errors[columns],
+            least=least[columns],
+            residuals=tuple(residuals),
+            gap=float(np.max(relative_excess[columns])),
+            status=status,
+        )
 
 
 class Target(NamedTuple):
@@ -285,6 +418,9 @@ class Descent:
     The caller writes b (M, k) and x (N, k), within the bounds, on the device, and begins; this may
     be done again and again.
 
+    With several planes A is the diagonal of as many matrices, and b and x have one column; each
+    plane of it is solved as a column of its own. Numbers of columns are then those of planes.
+
     Attributes
     ----------
     b, x : Array
@@ -294,24 +430,27 @@ class Descent:
         Whether r was computed from x itself.
     """
 
-    def __init__(self, A: Operator, columns: int, w: np.ndarray | None, box: Box) -> None:
+    def __init__(
+        self, A: Operator, columns: int, w: np.ndarray | None, box: Box, planes: int = 1
+    ) -> None:
         device = A.device
         rows, width = A.shape
         self.A = A
+        self.planes = planes
         self.products = 0
         self.has_true_residual = False
         self._box = box
         self.b = device.empty((rows, columns))
         self.x = device.empty((width, columns))
         self.r = self.b.like()
-        self.norms = np.zeros(columns)
+        self.norms = np.zeros(columns * planes)
         if w is None:
-            self._largest_weight = 1.0
+            self._largest_weights = np.ones(1)
             self._u = self.r
             # The kernels do not read them.
             self._weights = self.r
         else:
-            self._largest_weight = float(np.max(w))
+            self._largest_weights = w.reshape(planes, -1).max(axis=1)
             self._u = self.r.like()
             self._weights = device.upload(np.square(w))
         self.g = self.x.like()
@@ -324,7 +463,8 @@ class Descent:
     def _allocate(self) -> None:
         """Allocate the vectors and numbers that stay on the device."""
         device = self.A.device
-        self._columns = ColumnReductions(self.x, _DIRECTION, _DOTS, _MOVE, _LOOK)
+        kernels = (_DIRECTION, _DOTS, _MOVE, _LOOK)
+        self._columns = ColumnReductions(self.x, *kernels, planes=self.planes)
         k = self._columns.k
         self._slices = self._columns.slices
         self._is_resting = np.zeros(k, bool)
@@ -354,7 +494,7 @@ class Descent:
         self._launches = (
             self._bind_direction(),
             self.A.bind(self._d, self._Ad),
-            self._bind_squares(self._Ad),
+            self._bind_squares(self._Ad, self._is_weighted),
             self._bind_move(slices=self._slices),
             self.A.bind(self._u, self._q, transpose=True),
             self._bind_look(restart=0),
@@ -375,18 +515,18 @@ class Descent:
             **self._limits,
         )
 
-    def _bind_squares(self, picture: Array) -> Launch:
-        """Bind the sums of w^2 picture^2, for a picture (M, k)."""
+    def _bind_squares(self, values: Array, is_weighted: bool) -> Launch:
+        """Bind the sums of the squares of values, (N, k) or (M, k); with w^2, of a picture."""
         return self._columns.bind(
             _DOTS,
-            rows=self.b.shape[0],
+            rows=values.shape[0] // self.planes,
             first=0,
             pairs=0,
-            weighted=int(self._is_weighted),
+            weighted=int(is_weighted),
             weights=self._weights,
-            a=picture,
-            b=picture,
-            c=picture,
+            a=values,
+            b=values,
+            c=values,
             partials=self._curvatures,
         )
 
@@ -395,7 +535,7 @@ class Descent:
         return self._columns.bind(
             _MOVE,
             extra=4,
-            height=self.b.shape[0],
+            height=self.b.shape[0] // self.planes,
             slices=slices,
             weighted=int(self._is_weighted),
             numbers=self._numbers,
@@ -423,6 +563,12 @@ class Descent:
             **self._limits,
         )
 
+    def set_box(self, box: Box) -> None:
+        """Take other bounds, within which the caller writes x before it begins."""
+        self._box = box
+        self._limits["lower"].set(box[0])
+        self._limits["upper"].set(box[1])
+
     def begin(self) -> None:
         """Start anew from b and x as they are on the device; waits."""
         for launch in self._zeros:
@@ -433,9 +579,12 @@ class Descent:
 
     def norm_of(self, picture: Array) -> np.ndarray:
         """||w picture|| of a picture (M, k) on the device, (k,); waits."""
-        self._bind_squares(picture)()
-        squares = self._curvatures.get().astype(np.float64)
-        return np.sqrt(squares.sum(axis=0)).ravel()
+        return self._norm_by(self._bind_squares(picture, self._is_weighted))
+
+    def _norm_by(self, squares: Launch) -> np.ndarray:
+        squares()
+        sums = self._curvatures.get().astype(np.float64)
+        return np.sqrt(sums.sum(axis=0)).ravel()
 
     def measure(self) -> np.ndarray:
         """||w (b - A x)|| of x as it is on the device, (k,), by one product; waits."""
@@ -496,13 +645,19 @@ class Descent:
 
     def rounding(self) -> np.ndarray:
         """Return what rounding hides of the errors, if columns of A have size 1 at most."""
-        size = np.asarray(vectors.norm(self.x))
-        return ROUNDING_SHARE * self._largest_weight * size
+        size = self._norm_by(self._bind_squares(self.x, is_weighted=False))
+        return ROUNDING_SHARE * self._largest_weights * size
+
+    def along_x(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers of columns as an array that broadcasts to x."""
+        if self.planes == 1:
+            return numbers
+        return np.repeat(numbers, self.x.shape[0] // self.planes)[:, None]
 
     def saturated(self, x: np.ndarray) -> np.ndarray:
         """Return the entries that a step along -g takes beyond a bound, touched or not."""
         lower, upper = _as_columns(self._box)
-        stepped = x - self._alpha * self.g.get()
+        stepped = x - self.along_x(self._alpha) * self.g.get()
         return (lower < upper) & ((stepped < lower) | (stepped > upper))
 
 

@@ -10,13 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ltcl.device import Array, vectors
 from ltcl.device.kernels import Kernel, Launch
+from ltcl.operators import Operator
+from ltcl.operators.shared_vector import SharedVector, Vector
 from ltcl.solvers import krylov_state
 from ltcl.solvers.krylov_state import STATE_ROWS
+from ltcl.solvers.shared_columns import SharedColumns
 from ltcl.solvers.stopping import SLOTS
 
 # Values that an item should have before there are more groups.
@@ -49,16 +53,22 @@ class StepReadings:
 
 
 class ColumnReductions:
-    """Kernels of files that include `common/columns.h`, for arrays like `x`, (N,) or (N, k)."""
+    """Kernels of files that include `common/columns.h`, for arrays like `x`, (N,) or (N, k).
 
-    def __init__(self, x: Array, *kernels: str) -> None:
+    With several planes x is (planes N, 1), and each plane of N rows counts as a column.
+    """
+
+    def __init__(self, x: Array, *kernels: str, planes: int = 1) -> None:
         self.device = x.device
-        self.k = x.columns
-        self.rows = x.shape[0]
+        self.k = x.columns * planes
+        self.rows = x.shape[0] // planes
+        of_planes = {}
+        if planes > 1:
+            of_planes["PLANES"] = 1
         self._kernels: dict[str, Kernel] = {}
         for name in kernels:
             file = name.partition("_")[0]
-            defines = DEFINES.get(file, {})
+            defines = DEFINES.get(file, {}) | of_planes
             self._kernels[name] = vectors.kernel_of(self.device, name, **defines)
         if self.device.is_cpu:
             items = 16 if self.k <= 16 else 64
@@ -81,6 +91,25 @@ class ColumnReductions:
             self.items(across), (self.group, 1, 1), **(shared | arguments)
         )
 
+    def bind_product(self, S: Operator, x: Array, out: Array) -> Callable[[], object]:
+        """Bind out = S x."""
+        return S.bind(x, out)
+
+    def apply_transpose(self, S: Operator, x: Array, out: Array) -> np.ndarray:
+        """Compute out = S^T x; return the squares (k,) of the norms of its columns."""
+        S.apply_transpose(x, out)
+        return vectors.dot(out, out)
+
+    @property
+    def max_totals(self) -> int:
+        """Most totals of a column that a work-group holds."""
+        room = self.device.local_memory // 4 - self.group
+        return room // min(self.k, self.group)
+
+    def resize(self, dots: Launch, across: int) -> None:
+        """Change how many inner products a launch makes."""
+        dots.resize(self.items(across))
+
     def items(self, across: int) -> tuple[int, int, int]:
         """Return the work-items of a launch, `across` times."""
         groups_of_columns = -(-self.k // self.group)
@@ -89,6 +118,24 @@ class ColumnReductions:
     def sums(self, count: int) -> Array:
         """Allocate room for `count` partial sums of each column."""
         return self.device.empty((self.slices * count, self.k))
+
+    def numbers(self, rows: int) -> Array:
+        """Allocate rows of a number for each column."""
+        return self.device.empty((rows, self.k))
+
+    def upload(self, values: np.ndarray, dtype: Any = np.float32) -> Array:
+        """Copy numbers to the device."""
+        return self.device.upload(values, dtype)
+
+    def zeros(self, x: Array) -> Array:
+        """Allocate a vector like `x`, all 0."""
+        return vectors.fill(x.like(), 0.0)
+
+    def directions(self, count: int, purpose: str) -> Array:
+        """Allocate `count` vectors, each in a row; refuse `purpose` if there is no room."""
+        size = self.rows * self.k
+        self.device.require(4 * count * size, purpose)
+        return self.device.empty((count, size))
 
     def state(self) -> Array:
         """Allocate rows of numbers, all 0, and room for the squared residuals of `SLOTS` steps."""
@@ -106,12 +153,30 @@ class ColumnReductions:
 
         `updates` are those of the launches that need the number of the step.
         """
+        self.queue_steps(launches, updates, steps)
+        return self.read(state, steps)
+
+    @staticmethod
+    def queue_steps(
+        launches: Sequence[Callable[[], object]], updates: Sequence[Any], steps: range
+    ) -> None:
+        """Queue these steps; see `run`."""
         for step in steps:
             for update in updates:
                 update.set(iteration=step)
             for launch in launches:
                 launch()
+
+    def read(self, state: Array, steps: range) -> StepReadings:
+        """Read the state after these steps, which waits."""
         numbers = state.get().astype(np.float64)
         partial_squares = numbers[STATE_ROWS:].reshape(SLOTS, self.slices, self.k)
         squares = partial_squares[np.asarray(steps) % SLOTS].sum(axis=1)
         return StepReadings(state=numbers[:STATE_ROWS], norms=np.sqrt(squares))
+
+
+def column_reductions(x: Vector, *kernels: str) -> Any:
+    """Sums over columns of vectors like `x`, an array of one device or in shares of several."""
+    if isinstance(x, SharedVector):
+        return SharedColumns(x, [ColumnReductions(part, *kernels) for part in x.parts])
+    return ColumnReductions(x, *kernels)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ltcl.errors import ConvergenceError
 from ltcl.operators import Operator
 from ltcl.solvers.column_reductions import safe_ratio
 
@@ -69,34 +70,91 @@ def least_squares(
 ) -> np.ndarray:
     """Find the x (N, ...), 0 but where `free`, for which w A x is nearest to w b (M, ...).
 
-    Conjugate gradients on the normal equations (Saad, Iterative Methods for Sparse Linear Systems,
-    2nd ed., algorithm 8.4, whose names these are). Each column has free entries and weights of its
-    own, which broadcast to x and b. Done when the gradient of every column is at most rtol times
-    the first one, or after `maxiter` steps of two products.
+    Each column has free entries and weights of its own, which broadcast to x and b. Done when the
+    gradient of every column is at most rtol times the first one, or after `maxiter` steps of two
+    products.
     """
 
-    def product(matrix: Any, a: np.ndarray) -> np.ndarray:
-        columns = a.reshape(len(a), -1).astype(np.float32)
-        return (matrix @ columns).reshape(-1, *b.shape[1:])
+    def gradient(Ax: np.ndarray) -> np.ndarray:
+        return free * _product(A.T, weights**2 * (b - Ax))
 
-    x = np.zeros((A.shape[1], *b.shape[1:]))
+    x, _, _ = _conjugate_gradients(A, gradient, b.shape, weights, rtol=rtol, maxiter=maxiter)
+    return x
+
+
+def normal_equations(
+    A: Operator,
+    v: np.ndarray,
+    free: np.ndarray,
+    weights: np.ndarray,
+    *,
+    rtol: float,
+    maxiter: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve P A^T w^2 A x = P v for an x (N, k) that is 0 but where P, `free`, lets it be.
+
+    Returns x and A x, (M, k). v, free and w are of each column. ConvergenceError if `maxiter` steps
+    of two products are not enough for `rtol`.
+    """
+
+    def gradient(Ax: np.ndarray) -> np.ndarray:
+        if not Ax.any():
+            return free * v
+        return free * (v - _product(A.T, weights**2 * Ax))
+
+    shape = (A.shape[0], *v.shape[1:])
+    x, Ax, reached = _conjugate_gradients(A, gradient, shape, weights, rtol=rtol, maxiter=maxiter)
+    if not reached <= rtol:
+        raise ConvergenceError(
+            f"the derivative reached a relative residual of {reached:.2g} in {maxiter} steps; "
+            f"rtol is {rtol:g}: free pixels may not be told apart by what the camera sees",
+            None,
+        )
+    return x, Ax
+
+
+def _conjugate_gradients(
+    A: Operator,
+    gradient: Callable[[np.ndarray], np.ndarray],
+    shape: tuple[int, ...],
+    weights: np.ndarray,
+    *,
+    rtol: float,
+    maxiter: int,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Conjugate gradients on normal equations, whose gradient (N, ...) follows from A x.
+
+    Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 8.4, whose names these
+    are. Returns x, A x, of that shape, and the largest relative gradient.
+    """
+    x = np.zeros((A.shape[1], *shape[1:]))
+    Ax = np.zeros(shape)
     p = x
-    r = b
-    z_squared = np.ones(b.shape[1:])
+    z_squared = np.ones(shape[1:])
     first_squared = z_squared
-    for step in range(maxiter):
-        z = free * product(A.T, weights**2 * r)
+    reached = np.inf
+    for step in range(maxiter + 1):
+        z = gradient(Ax)
         previous = z_squared
         z_squared = np.sum(z**2, axis=0)
         if step == 0:
             first_squared = z_squared
-        if (z_squared <= rtol**2 * first_squared).all():
+        ratio = safe_ratio(z_squared, first_squared, first_squared > 0.0)
+        reached = float(np.sqrt(np.max(ratio)))
+        if reached <= rtol or step == maxiter:
             break
         beta = safe_ratio(z_squared, previous, previous > 0.0)
         p = z + beta * p
-        w = product(A, p)
+        w = _product(A, p)
         curvature = np.sum((weights * w) ** 2, axis=0)
         alpha = safe_ratio(z_squared, curvature, curvature > 0.0)
         x = x + alpha * p
-        r = r - alpha * w
-    return x
+        Ax = Ax + alpha * w
+    return x, Ax, reached
+
+
+def _product(matrix: Any, a: np.ndarray) -> np.ndarray:
+    """A product on the device with columns (N, ...)."""
+    columns = a.reshape(len(a), -1).astype(np.float32)
+    product = matrix @ columns
+    return product.reshape(len(product), *a.shape[1:])

@@ -62,18 +62,21 @@ def solve_joined(
     solution = solve_automatically(LinearProblem.from_arrays(S, b, shared))
     if not solution.converged or solution.rest is None:
         return None
-    parts = zip(np.split(solution.x, len(sides)), np.split(solution.rest, len(sides)), strict=True)
+    xs = np.split(solution.x, len(sides))
+    residual_vectors = np.split(solution.rest, len(sides))
     solutions = []
-    for (x, rest), side, size in zip(parts, sides, sizes, strict=True):
+    for x, r, side, size in zip(xs, residual_vectors, sides, sizes, strict=True):
         # Relative to ||b|| of this channel, which is 1 in the joined system.
-        residual = float(np.linalg.norm(rest))
-        residuals = (*solution.residuals[:-1], residual)
+        residual = float(np.linalg.norm(r))
+        rest = None
+        if settings.with_residual:
+            rest = np.reshape(size * r, np.shape(side))
         solutions.append(
             dataclasses.replace(
                 solution,
                 x=np.reshape(size * x, np.shape(side)).astype(x.dtype, copy=False),
-                rest=np.reshape(size * rest, np.shape(side)) if settings.with_residual else None,
-                residuals=residuals,
+                rest=rest,
+                residuals=(*solution.residuals[:-1], residual),
                 lowest=None,
             )
         )

@@ -16,11 +16,11 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.device.kernels import Launch
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.operators import Operator
+from ltcl.operators.shared_vector import Vector, share_vectors
 from ltcl.solvers import krylov_state
-from ltcl.solvers.column_reductions import ColumnReductions
+from ltcl.solvers.column_reductions import column_reductions
 from ltcl.solvers.krylov_space import krylov_cycle
 from ltcl.solvers.krylov_state import (
     PHASE_BROKEN,
@@ -67,30 +67,31 @@ class CG(IterativeMethod):
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends the solve."""
-        iteration = _CGIteration(system, x, r, monitor, self.inner_weights(system.S))
-        iteration.run()
+        with share_vectors(system.S, x, r) as (x, r):
+            iteration = _CGIteration(system, x, r, monitor, self.inner_weights(system.S))
+            iteration.run()
 
 
 class _CGIteration:
     """The state of one solve with CG: w = S r, directions p, q = S p."""
 
     def __init__(
-        self, system: CountedOperator, x: Array, r: Array, monitor: Monitor, weights: Any
+        self, system: CountedOperator, x: Vector, r: Vector, monitor: Monitor, weights: Any
     ) -> None:
         self.system = system
         self.monitor = monitor
         self.x = x
         self.r = r
-        columns = ColumnReductions(r, "vector_dots", "krylov_cg")
+        columns = column_reductions(r, "vector_dots", "krylov_cg")
         self.columns = columns
         w = r.like()
-        p = vectors.fill(r.like(), 0.0)
-        q = vectors.fill(r.like(), 0.0)
+        p = columns.zeros(r)
+        q = columns.zeros(r)
         self.state = columns.state()
         sums = columns.sums(2)
         self.unsolved = monitor.unsolved
         # Columns that rest, since they are solved.
-        self.resting = r.device.upload(~self.unsolved, np.int32)
+        self.resting = columns.upload(~self.unsolved, np.int32)
 
         # Without weights the kernel does not read them.
         on_device = r
@@ -126,16 +127,16 @@ class _CGIteration:
         )
         # Not a method of this object: device memory is freed by reference counting alone.
         keep_direction = functools.partial(self.update.set, restart=0)
-        self.launches = [system.S.bind(r, w), dots, self.update, keep_direction]
+        self.launches = [columns.bind_product(system.S, r, w), dots, self.update, keep_direction]
 
-    def _upload_weights(self, weights: Any) -> Array:
+    def _upload_weights(self, weights: Any) -> Vector:
         """Upload the weights in units of the largest one, repeated for all columns."""
         r = self.r
         weights = np.asarray(weights, np.float64)
         weights = checks.shape("weights", weights, self.system.b.shape[:1])
         shape = (-1, *[1] * (len(r.shape) - 1))
         relative = (weights / weights.max()).reshape(shape)
-        return r.device.upload(np.broadcast_to(relative, r.shape))
+        return r.like().set(np.broadcast_to(relative, r.shape))
 
     def run(self) -> None:
         """Take steps until the monitor ends the solve, or no column has a next step."""
@@ -174,20 +175,21 @@ class BiCGStab(IterativeMethod):
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends the solve."""
-        iteration = _BiCGStabIteration(system, x, r, monitor)
-        iteration.run()
+        with share_vectors(system.S, x, r) as (x, r):
+            iteration = _BiCGStabIteration(system, x, r, monitor)
+            iteration.run()
 
 
 class _BiCGStabIteration:
     """The state of one solve with BiCGStab; in Saad's names shadow is r*, half is s; g = S^T r*."""
 
-    def __init__(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
+    def __init__(self, system: CountedOperator, x: Vector, r: Vector, monitor: Monitor) -> None:
         self.system = system
         self.monitor = monitor
         self.x = x
         self.r = r
         S = system.S
-        columns = ColumnReductions(r, "vector_dots", "krylov_half", "krylov_bicgstab")
+        columns = column_reductions(r, "vector_dots", "krylov_half", "krylov_bicgstab")
         self.columns = columns
         self.shadow = r.like()
         self.p = r.like()
@@ -209,6 +211,7 @@ class _BiCGStabIteration:
         to_next = columns.bind(
             "krylov_bicgstab",
             extra=5,
+            first=0,
             partials=five_sums,
             next_partials=two_sums,
             g=self.g,
@@ -220,14 +223,16 @@ class _BiCGStabIteration:
         )
         self.updates = [to_half, to_next]
         # 4. to 9.
-        self.launches = [S.bind(self.p, v), to_half, S.bind(half, t), dots_of_t, to_next]
+        to_v = columns.bind_product(S, self.p, v)
+        to_t = columns.bind_product(S, half, t)
+        self.launches = [to_v, to_half, to_t, dots_of_t, to_next]
 
         self.numbers = np.zeros((krylov_state.STATE_ROWS, r.columns))
         self.phase = np.full(r.columns, PHASE_WAITS)
         self.step = 0
         self.has_transpose = True
 
-    def _bind_dots(self, sums: Array, pairs: str, *, a: Array, b: Array, c: Array) -> Launch:
+    def _bind_dots(self, sums: Any, pairs: str, *, a: Vector, b: Vector, c: Vector) -> Any:
         """Bind inner products of pairs of the arrays, as "ab bb"."""
         names = pairs.split()
         return self.columns.bind(
@@ -283,33 +288,40 @@ class _BiCGStabIteration:
             for row in (rho_row, krylov_state.BICGSTAB_SHADOW):
                 changed[row] = np.where(restarts, squares, changed[row])
             changed[krylov_state.BICGSTAB_AGAINST] = changed[krylov_state.BICGSTAB_SHADOW]
-            if self.has_transpose and self._apply_transpose():
-                changed[krylov_state.BICGSTAB_AGAINST] = vectors.dot(self.g, self.g)
+            against = self._apply_transpose()
+            if against is not None:
+                changed[krylov_state.BICGSTAB_AGAINST] = against
         if not np.array_equal(changed, self.numbers):
-            self.state.set_rows(0, self.r.device.upload(changed))
+            self.state.set_rows(0, self.columns.upload(changed))
         if restarts.any() and self.has_transpose:
             self.dots_of_g()
 
     def _restart_vectors(self, restarts: np.ndarray) -> None:
         """Set r* and p to r in the columns that restart."""
+        # All are in the same shares.
+        r: Any = self.r
         # 1. and 2.
         for vector in (self.shadow, self.p):
             if self.step == 0:
-                vector.copy_from(self.r)
+                vector.copy_from(r)
             else:
-                mixed = np.where(restarts, self.r.get(), vector.get())
-                vector.copy_from(self.r.device.upload(mixed))
+                vector.set(np.where(restarts, r.get(), vector.get()))
 
-    def _apply_transpose(self) -> bool:
-        """Compute g = S^T r*; if S has no transpose, or no memory for it, queue <r*, v> instead."""
+    def _apply_transpose(self) -> np.ndarray | None:
+        """Compute g = S^T r*; return |g|^2 of each column.
+
+        If S has no transpose, or no memory for it, queue <r*, v> instead from then on.
+        """
+        if not self.has_transpose:
+            return None
         try:
-            self.system.S.apply_transpose(self.shadow, self.g)
+            squares = self.columns.apply_transpose(self.system.S, self.shadow, self.g)
         except (InputError, MemoryLimitError):
             self.has_transpose = False
             self.launches.insert(1, self.dots_of_v)
-            return False
+            return None
         self.system.products += 1
-        return True
+        return squares
 
 
 @dataclass(frozen=True)
@@ -330,11 +342,12 @@ class GMRES(IterativeMethod):
 
     def iterate(self, system: CountedOperator, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends the solve."""
-        while monitor.status is None:
-            space = krylov_cycle(system, x, r, monitor, self.restart)
-            unsolved = monitor.unsolved
-            if monitor.status is None and unsolved.any() and space.complete[unsolved].all():
-                monitor.status = Status.BREAKDOWN
+        with share_vectors(system.S, x, r) as (x, r):
+            while monitor.status is None:
+                space = krylov_cycle(system, x, r, monitor, self.restart)
+                unsolved = monitor.unsolved
+                if monitor.status is None and unsolved.any() and space.complete[unsolved].all():
+                    monitor.status = Status.BREAKDOWN
 
 
 METHODS = (CG, GMRES, BiCGStab)

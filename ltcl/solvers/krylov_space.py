@@ -8,11 +8,13 @@ orthogonality to rounding (Giraud, Langou, Rozloznik, Comput. Math. Appl. 50, 20
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from ltcl.device import Array
 from ltcl.operators import Operator
-from ltcl.solvers.column_reductions import ColumnReductions, safe_ratio
+from ltcl.operators.shared_vector import Vector
+from ltcl.solvers.column_reductions import column_reductions, safe_ratio
 from ltcl.solvers.stopping import CountedOperator, Monitor
 
 # A cycle in float32 has to start again from the true residual below this part of the first one.
@@ -28,6 +30,7 @@ class KrylovSpace:
     Attributes
     ----------
     V : (steps + 1, N k), on the device
+        If r is a shared vector, each device has its rows.
     H : (k, steps + 1, steps) float64
         Hessenberg matrix of each column.
     steps, count : int
@@ -38,21 +41,17 @@ class KrylovSpace:
         Columns whose space is invariant under S and contains no solution.
     """
 
-    def __init__(self, S: Operator, r: Array, beta: np.ndarray, steps: int) -> None:
-        device = r.device
-        self._columns = ColumnReductions(r, "vector_dots", "krylov_subtract")
-        k = self._columns.k
+    def __init__(self, S: Operator, r: Vector, beta: np.ndarray, steps: int) -> None:
+        columns = column_reductions(r, "vector_dots", "krylov_subtract")
+        self._columns = columns
         # A work-group holds the coefficients of its columns.
-        group = self._columns.group
-        room = (device.local_memory // 4 - group) // min(k, group)
-        self.steps = min(steps, room - 3)
+        self.steps = min(steps, columns.max_totals - 3)
         self.count = -1
         rows = self.steps + 1
-        device.require(
-            rows * r.nbytes, f"restart={steps}, {rows} directions of {r.size} values each,"
+        size = math.prod(r.shape)
+        self.V = columns.directions(
+            rows, f"restart={steps}, {rows} directions of {size} values each,"
         )
-
-        self.V = device.empty((rows, r.size))
         self.H = np.zeros((r.columns, rows, rows - 1))
         self.complete = np.zeros(r.columns, bool)
         self._beta = np.asarray(beta, np.float64)
@@ -64,15 +63,15 @@ class KrylovSpace:
         self._bind(S, r, rows)
         self._orthogonalize()
 
-    def _bind(self, S: Operator, r: Array, rows: int) -> None:
+    def _bind(self, S: Operator, r: Vector, rows: int) -> None:
         """Bind the product, the inner products and the two passes of Gram-Schmidt."""
         columns = self._columns
         v = r.like()
         w = r.copy()
         sums = columns.sums(rows + 1)
-        self._first_h = columns.device.empty((rows + 1, columns.k))
-        self._h = columns.device.empty((rows + 1, columns.k))
-        self._product = S.bind(v, w)
+        self._first_h = columns.numbers(rows + 1)
+        self._h = columns.numbers(rows + 1)
+        self._product = columns.bind_product(S, v, w)
         # <v_j, w> of all directions, and <w, w>.
         self._dots = columns.bind(
             "vector_dots",
@@ -128,7 +127,7 @@ class KrylovSpace:
         self._is_step[:, j] = is_step
         return active & (below == 0.0)
 
-    def improve(self, x: Array, r: Array) -> np.ndarray:
+    def improve(self, x: Vector, r: Vector) -> np.ndarray:
         """Move x to the least residual in the space, and r with it; return how far, (k,)."""
         steps = self.count
         H = self.H[:, : steps + 1, :steps]
@@ -157,11 +156,11 @@ class KrylovSpace:
             values.append(np.linalg.eigvals(H[:steps, :steps]))
         return np.concatenate(values)
 
-    def _add_combination(self, x: Array, y: np.ndarray) -> None:
+    def _add_combination(self, x: Vector, y: np.ndarray) -> None:
         """Add sum_j y_j v_j to x, with y (k, j)."""
         count = y.shape[1]
         # The kernel subtracts what sums of one slice say; the last of these is <w, w>, not used.
-        minus_y = x.device.upload(np.pad(-y.T, ((0, 1), (0, 0))))
+        minus_y = self._columns.upload(np.pad(-y.T, ((0, 1), (0, 0))))
         subtract = self._columns.bind(
             "krylov_subtract",
             extra=count + 2,
@@ -181,7 +180,7 @@ class KrylovSpace:
     def _orthogonalize(self) -> None:
         """Make the next direction of the last product."""
         self.count += 1
-        self._dots.resize(self._columns.items(self.count + 1))
+        self._columns.resize(self._dots, self.count + 1)
         # The first direction is r itself, and has nothing to be orthogonal to.
         passes = self._passes if self.count else self._passes[1:]
         for subtract in passes:
@@ -191,7 +190,7 @@ class KrylovSpace:
 
 
 def krylov_cycle(
-    system: CountedOperator, x: Array, r: Array, monitor: Monitor, steps: int
+    system: CountedOperator, x: Vector, r: Vector, monitor: Monitor, steps: int
 ) -> KrylovSpace:
     """Improve `x` and its residual `r`, whose norms the monitor knows, by a few steps of GMRES."""
     beta = monitor.norms

@@ -87,10 +87,13 @@ class IterativeMethod(Method):
         result = self.run(S, r, StoppingRule(rtol=tolerance, maxiter=maxiter))
         monitor = result.monitor
         is_useful = monitor.lowest <= USEFUL_REDUCTION
+        failure = monitor.status
+        if is_useful:
+            failure = None
         return Correction(
             step=result.x.get(),
             products=monitor.system.products,
-            failure=None if is_useful else monitor.status,
+            failure=failure,
         )
 
     def run(

@@ -131,7 +131,8 @@ class MonteCarlo(Sampler):
         lengths = Lengths.geometric(q, -sign, from_b=self.adjoint)
         walker = Walker(tables, lengths, self.seed, watch)
         # (N, columns * channels)
-        light = np.stack([channel.r for channel in channels], axis=-1).reshape(n, -1)
+        sides = [channel.r for channel in channels]
+        light = np.stack(sides, axis=-1).reshape(n, -1)
         square = _mean_square_after_first_step(step, lengths)
         pixels = np.arange(n)
         if self.adjoint:

@@ -130,9 +130,12 @@ class LinearProblem:
             x0 = np.where(np.any(b, axis=0), x0 / unit, 0.0)
 
         atol = float(settings.atol)
+        scaled_atol = 0.0
+        if atol:
+            scaled_atol = atol / unit
         rule = StoppingRule(
             rtol=float(settings.rtol),
-            atol=atol / unit if atol else 0.0,
+            atol=scaled_atol,
             maxiter=int(settings.maxiter),
             callback=settings.callback,
         )

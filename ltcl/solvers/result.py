@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -108,6 +109,12 @@ class Solution:
             return finite[-1]
         return min(finite) if self.lowest is None else self.lowest
 
+    def with_arrays(self, give: Callable[[np.ndarray], Any]) -> Solution:
+        """The same result with arrays of another kind."""
+        optional = {"standard_error": self.standard_error, "rest": self.rest}
+        arrays = {name: give(array) for name, array in optional.items() if array is not None}
+        return dataclasses.replace(self, x=give(self.x), **arrays)
+
     def __str__(self) -> str:
         if self.error is not None:
             return f"{self.method}: relative error at most {self.error:.2g}: {self.status.value}"
@@ -153,26 +160,43 @@ class Solution:
 
 def join_channels(channels: Sequence[Solution]) -> Solution:
     """Join three channels that were sampled together into one solution, x (3, N) or (3, N, k)."""
+    first = channels[0]
+    x = []
+    standard_errors = []
     reasons: list[str] = []
-    errors: list[np.ndarray] = []
+    status = Status.CONVERGED
+    iterations = 0
+    products = 0
+    residuals = np.zeros(len(first.residuals))
+    lowest = 0.0
     for channel in channels:
-        reasons += [text for text in channel.reason.split("; ") if text]
+        x.append(channel.x)
         if channel.standard_error is not None:
-            errors.append(channel.standard_error)
+            standard_errors.append(channel.standard_error)
+        reasons += channel.reason.split("; ")
+        if not channel.converged:
+            status = Status.SAMPLED
+        iterations = max(iterations, channel.iterations)
+        products += channel.products
+        residuals = np.maximum(residuals, channel.residuals)
+        lowest = max(lowest, channel.residual)
 
-    status = Status.SAMPLED
-    if all(channel.converged for channel in channels):
-        status = Status.CONVERGED
-    residuals = np.max([channel.residuals for channel in channels], axis=0)
-    return dataclasses.replace(
-        channels[0],
-        x=np.stack([channel.x for channel in channels]),
+    joined = dataclasses.replace(
+        first,
+        x=np.stack(x),
         status=status,
-        iterations=max(channel.iterations for channel in channels),
-        products=sum(channel.products for channel in channels),
+        iterations=iterations,
+        products=products,
         residuals=tuple(residuals.tolist()),
-        # Text that all channels have in common stands there once.
-        reason="; ".join(dict.fromkeys(reasons)),
-        lowest=max(channel.residual for channel in channels),
-        standard_error=np.stack(errors) if errors else None,
+        reason=_join_reasons(reasons),
+        lowest=lowest,
+        standard_error=None,
     )
+    if not standard_errors:
+        return joined
+    return dataclasses.replace(joined, standard_error=np.stack(standard_errors))
+
+
+def _join_reasons(reasons: Sequence[str]) -> str:
+    """The reasons, each once; empty ones are left out."""
+    return "; ".join(filter(None, dict.fromkeys(reasons)))

@@ -16,9 +16,11 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.interop.calls import Differentiable
 from ltcl.operators import Operator
 from ltcl.solvers import chebyshev, krylov, relaxation, stationary
 from ltcl.solvers.auto import solve_automatically
+from ltcl.solvers.derivative import SolutionDerivative
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.hybrid import Hybrid
 from ltcl.solvers.joined import may_join, solve_joined
@@ -48,10 +50,20 @@ def _option_names(kind: Any) -> list[str]:
 OPTIONS = {name: _option_names(kind) for name, kind in KINDS.items()}
 
 
+def _derivative(S: Any, b: Any, method: str, **options: Any) -> SolutionDerivative:
+    if isinstance(KINDS.get(method), type) and issubclass(KINDS[method], Sampler):
+        raise InputTypeError(
+            f"method is {method!r}, which samples and has no derivative; take another one for b "
+            "whose derivative is asked for"
+        )
+    return SolutionDerivative(S, b, solve, method, options)
+
+
+@checks.takes_arrays("b", "x0", differentiable=Differentiable(("b",), _derivative))
 def solve(
     S: Any,
     b: Any,
-    method: str = "auto",
+    method: str | Method = "auto",
     *,
     rtol: float = SolveSettings.rtol,
     atol: float = SolveSettings.atol,
@@ -71,7 +83,8 @@ def solve(
         a T in colour these are three Operators, which "monte_carlo" and "hybrid" take together.
     b : (N,) or (N, k), or (3, N) or (3, N, k) for three S
         k right-hand sides are solved together, each to its own tolerance.
-    method : str
+    method : str or Method
+        A name of the table below, or a method of your own (`examples/solver.py`).
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column. The numbers that were
         given decide, in float64 if the array is float64.
@@ -143,10 +156,12 @@ def solve(
     >>> s.converged, s.x.round(1).tolist()
     (True, [1.0, 0.0])
     """
+    if maxiter is None:
+        maxiter = SolveSettings.maxiter
     settings = SolveSettings(
         rtol=rtol,
         atol=atol,
-        maxiter=SolveSettings.maxiter if maxiter is None else maxiter,
+        maxiter=maxiter,
         callback=callback,
         throw=throw,
     )
@@ -197,10 +212,12 @@ def solve_each(
     >>> [solution.x.tolist() for solution in solutions]
     [[0.5], [0.25]]
     """
+    if maxiter is None:
+        maxiter = SolveSettings.maxiter
     settings = SolveSettings(
         rtol=rtol,
         atol=atol,
-        maxiter=SolveSettings.maxiter if maxiter is None else maxiter,
+        maxiter=maxiter,
         callback=callback,
         throw=throw,
         with_residual=with_residual,
@@ -224,8 +241,15 @@ def solve_each(
     return tuple(solutions)
 
 
-def choose_method(name: str, options: dict[str, Any]) -> Method | None:
+def choose_method(name: str | Method, options: dict[str, Any]) -> Method | None:
     """Return the method with its options, checked; None for "auto", which has none."""
+    if isinstance(name, Method):
+        if options:
+            own_options = ", ".join(options)
+            raise InputTypeError(
+                f"options of a method of your own are its fields; got {own_options}"
+            )
+        return name
     checks.one_of("method", name, METHODS)
     for option in options:
         owners = [owner for owner, names in OPTIONS.items() if option in names]
@@ -263,7 +287,10 @@ def _solve_one(
     # Numbers that leave their range end the solve with a status.
     with np.errstate(all="ignore"):
         problem = LinearProblem.from_arrays(S, b, settings, x0=x0, exact=exact)
-        solution = solve_automatically(problem) if method is None else method.solve(problem)
+        if method is None:
+            solution = solve_automatically(problem)
+        else:
+            solution = method.solve(problem)
     solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
     if settings.throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
         raise ConvergenceError(str(solution), solution)

@@ -19,6 +19,7 @@ import numpy as np
 from ltcl.device import Array, vectors
 from ltcl.operators import Operator
 from ltcl.operators.knowledge import Product
+from ltcl.operators.shared_vector import SharedVector
 from ltcl.solvers import precision
 from ltcl.solvers.result import Solution, Status
 
@@ -98,21 +99,26 @@ class CountedOperator:
             return None
         return self.S.product_float64()
 
-    def residual(self, x: Any, r: Array) -> np.ndarray:
+    def residual(self, x: Any, r: Any) -> np.ndarray:
         """Compute r = b - S x by one product; return its norms (k,)."""
+        if isinstance(x, SharedVector):
+            norms = self.residual(x.gather(), r.whole)
+            r.hand_out()
+            return norms
         self.products += 1
         if self.in_float64:
             return self.exact_residual(x, r)
         on_device = x if isinstance(x, Array) else self.S.device.upload(x)
         return vectors.norm(self.S.apply(on_device, r, scale=-1.0, add=self.b))
 
-    def exact_residual(self, x: Any, r: Array) -> np.ndarray:
+    def exact_residual(self, x: Any, r: Any) -> np.ndarray:
         """Compute the same in float64, with b and S as they were given."""
         product = self.product_float64
         assert product is not None  # noqa: S101 - asked for by the callers
         b = self.b.get() if self.host is None else self.host
         b = np.asarray(b, np.float64)
-        x = x.get() if isinstance(x, Array) else x
+        if not isinstance(x, np.ndarray):
+            x = x.get()
         columns = x.astype(np.float64).reshape(len(b), -1)
         residual = b - product(columns).reshape(b.shape)
         if np.all(np.abs(residual) <= np.finfo(np.float32).max):
@@ -181,13 +187,13 @@ class Monitor:
         half = int((max_steps + 1.0) / 2.0)
         return max(1, min(half, done))
 
-    def check(self, x: Any, r: Array, norms: np.ndarray, travelled: Any = None) -> bool:
+    def check(self, x: Any, r: Any, norms: np.ndarray, travelled: Any = None) -> bool:
         """Return whether the solve ends with the iterate `x`, and set `status` if it does.
 
         Parameters
         ----------
         x, r
-            The iterate and its residual.
+            The iterate and its residual: arrays of the host or the device, or shared vectors.
         norms : (m, k)
             Norms of the residuals of the m steps since the last check, the newest last.
         travelled : None or (k,)
@@ -260,7 +266,11 @@ class Monitor:
 
     def result(self, x: Any) -> Any:
         """Return the last iterate if it solves the system, else the best one."""
-        return x if self.status is Status.CONVERGED or self.best is None else self.best
+        if self.status is Status.CONVERGED or self.best is None:
+            return x
+        if isinstance(self.best, SharedVector):
+            return self.best.gather()
+        return self.best
 
     def solution(self, x: np.ndarray, method: str, residual: np.ndarray | None = None) -> Solution:
         """Return the solution x by `method` with the history of this solve."""
@@ -295,7 +305,7 @@ class Monitor:
             return digits / -np.log(factor)
 
     def confirm(
-        self, x: Any, r: Array, norms: np.ndarray, *, is_last: bool = False
+        self, x: Any, r: Any, norms: np.ndarray, *, is_last: bool = False
     ) -> tuple[np.ndarray, bool]:
         """Return norms (k,) of the newest residual, as exact as needed, and whether x solves.
 
@@ -347,7 +357,7 @@ class Monitor:
         norm = self.system.S.norm_bound()
         if self._recursion_steps and not norm.is_bound:
             return False
-        size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
+        size = _column_norms(x)
         # Each product rounds by UNIT ||S|| times what it multiplies: x itself when r was computed,
         # and since then steps whose lengths add up to the way of x.
         way = size + self._travelled
@@ -398,3 +408,12 @@ class Monitor:
 def relative_residual(residual_norms: np.ndarray, norms: np.ndarray) -> float:
     """Return the largest residual relative to its right-hand side; absolute where that is dark."""
     return float(np.max(residual_norms / np.where(norms > 0.0, norms, 1.0), initial=0.0))
+
+
+def _column_norms(x: Any) -> np.ndarray:
+    """Return the norms of the columns of x, wherever it is."""
+    if isinstance(x, SharedVector):
+        return x.norms()
+    if isinstance(x, Array):
+        return vectors.norm(x)
+    return np.linalg.norm(x, axis=0)

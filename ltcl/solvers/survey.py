@@ -120,7 +120,9 @@ def _self_adjoint_defect(S: Operator, space: KrylovSpace) -> float:
 
     # <v_i, W v_j> of all pairs, in one reading.
     gram = S.device.empty((steps * (steps + 1), 1))
-    weights = None if S.weights is None else S.device.upload(S.weights / np.max(S.weights))
+    weights = None
+    if S.weights is not None:
+        weights = S.device.upload(S.weights / np.max(S.weights))
     for j, v in enumerate(basis[:steps]):
         weighted = v if weights is None else vectors.scale_rows(weights, v, v.like())
         for i, u in enumerate(basis):

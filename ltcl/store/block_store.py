@@ -50,6 +50,8 @@ from ltcl.transport.noise import Noise
 # A file of a final store: place of the array, its group, its name.
 ARRAY_FILE = re.compile(r"((.+)\.\d+/(\w+))/zarr\.json")
 CRC32C_BYTES = 4
+# File of a folder in which `ltcl acquire` works.
+ACQUISITION = "acquisition.toml"
 EXTRA = "extra."
 COLUMNS = re.compile(r"columns_(\d)\.(\d+)")
 
@@ -134,6 +136,13 @@ class BlockStore:
         """Open a store to read and to write; blocks are checked when they are read."""
         path = as_path(path)
         return cls(path)
+
+    @classmethod
+    def of(cls, store: BlockStore | str | os.PathLike[str]) -> BlockStore:
+        """A store, or the one at a path."""
+        if isinstance(store, BlockStore):
+            return store
+        return cls.open(store)
 
     @property
     def written(self) -> frozenset[tuple[int, int]]:
@@ -468,8 +477,9 @@ def read(path: Path) -> StoreRecord | CompressedRecord:
     F = extras.get("first_bounce")
     if F is not None and len(F) == 1:
         F = F[0]
+    matrices = [StoredRows(store, channel) for channel in range(layout.channels)]
     return StoreRecord(
-        matrices=tuple(StoredRows(store, channel) for channel in range(layout.channels)),
+        matrices=tuple(matrices),
         grid=layout.grid,
         camera_grid=layout.camera_grid,
         first_bounce=F,
@@ -566,12 +576,25 @@ def pinned(path: Path) -> PinnedFolder:
         return PinnedFolder(path, DOCUMENT)
     except FileNotFoundError:
         if path.is_dir():
-            raise FileError(
-                "is a folder without zarr.json (of a store) or acquisition.toml"
-            ) from None
+            raise FileError(_why_no_store(path)) from None
         raise FileError("no such folder") from None
     except NotADirectoryError:
         raise FileError("is a file; a store is a folder") from None
+
+
+def _why_no_store(folder: Path) -> str:
+    """Tell why a folder is no store, and of an acquisition which stores are in it."""
+    if not (folder / ACQUISITION).exists():
+        return f"is a folder without {DOCUMENT} (of a store) or {ACQUISITION}"
+    names = sorted(path.name for path in folder.glob("*.zarr") if is_store(path))
+    if not names:
+        return "is the folder of an acquisition without a store yet; 'ltcl acquire run' makes it"
+    if len(names) == 1:
+        return f"is the folder of an acquisition; give {names[0]} in it"
+    return (
+        f"is the folder of an acquisition with {', '.join(names)}; give one of them, or what "
+        "'ltcl combine' makes of several projectors"
+    )
 
 
 def _is_store_at(path: Path) -> bool:

@@ -3,7 +3,7 @@
 
 In a file the arrays of projector k have names that begin with ``projector_k.``, those of S between
 camera pixels, where it was given, ``scene.``; weights and blacks of the caller are ``blend_k`` and
-``blacks``.
+``blacks``; what is known of the projectors of scans begins with ``display_``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from ltcl.transport.projectors.montage import Montage
 from ltcl.transport.transport import Transport
 
 COMBINED_FORMAT = "ltcl-combined-1"
+# Beginning of the names of `CombinedTransport.displays`.
+DISPLAY = "display_"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,7 +55,8 @@ class CombinedRecord:
     @property
     def grid(self) -> tuple[int, int]:
         """Pixels of all patterns side by side."""
-        return Montage(tuple(member.grid or (1, 1) for member in self.members)).grid
+        grids = [member.grid or (1, 1) for member in self.members]
+        return Montage(tuple(grids)).grid
 
     @property
     def camera_grid(self) -> tuple[int, int]:
@@ -86,6 +89,8 @@ def combined_record(T: CombinedTransport) -> CombinedRecord:
             settings[f"blend_{number}"] = np.asarray(weights, np.float64)
     if T.blacks is not None:
         settings["blacks"] = np.stack(T.black_pictures())
+    for name, array in T.displays.items():
+        settings[f"{DISPLAY}{name}"] = array
     scene = None
     if T.given_scene is not None:
         scene = _record("scene", T.given_scene)
@@ -101,11 +106,14 @@ def _record(name: str, T: Transport) -> StoreRecord | CompressedRecord:
         if T.is_square:
             return CompressedRecord(T.to_arrays())
         raise InputTypeError(f"{name} shows no entries; only arrays and sparse matrices are stored")
+    first_bounce = None
+    if T.is_square:
+        first_bounce = T.first_bounce
     return StoreRecord(
         matrices=tuple(matrices),
         grid=T.grid,
         camera_grid=T.camera_grid,
-        first_bounce=T.first_bounce if T.is_square else None,
+        first_bounce=first_bounce,
         mixing=T.mixing,
         noise=T.measured_noise,
     )
@@ -125,7 +133,7 @@ def combined_transport(record: CombinedRecord, device: Any) -> CombinedTransport
             if f"blend_{number}" not in settings:
                 raise FileError(f"array 'blend_{number}' is missing")
             blend.append(settings[f"blend_{number}"])
-    return combine(
+    T = combine(
         [_transport(member, device) for member in record.members],
         blend=blend,
         balance=float(settings["balance"]),
@@ -134,6 +142,10 @@ def combined_transport(record: CombinedRecord, device: Any) -> CombinedTransport
         scene=scene,
         device=device,
     )
+    for name, array in settings.items():
+        if name.startswith(DISPLAY):
+            T.displays[name.removeprefix(DISPLAY)] = array
+    return T
 
 
 def _transport(record: StoreRecord, device: Any) -> Transport:

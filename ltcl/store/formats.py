@@ -189,11 +189,14 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
         if isinstance(matrix, np.ndarray):
             matrix = floats("T", check_mapped_file(matrix))
         matrices.append(matrix)
+    first_bounce = None
+    if T.is_square:
+        first_bounce = T.first_bounce
     record = StoreRecord(
         matrices=tuple(matrices),
         grid=T.grid,
         camera_grid=T.camera_grid,
-        first_bounce=T.first_bounce if T.is_square else None,
+        first_bounce=first_bounce,
         mixing=T.mixing,
         noise=T.measured_noise,
     )

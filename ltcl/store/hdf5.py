@@ -164,8 +164,4 @@ def _write_sparse(group: Any, columns: Any) -> None:
 
 
 def _h5py(path: Path) -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise FileError(f"{path.suffix} files need h5py; pip install 'ltcl[hdf5]'") from None
-    return h5py
+    return checks.load_extra("h5py", "hdf5", f"{path}: a file of this kind", FileError)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy  # its subpackage io is loaded at the first use
 
 from ltcl import checks
 from ltcl.errors import FileError

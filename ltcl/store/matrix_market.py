@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import scipy.io
+import scipy  # its subpackage io is loaded at the first use
 
 from ltcl import checks
 from ltcl.errors import FileError, InputError

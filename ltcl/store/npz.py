@@ -113,7 +113,7 @@ def _read_combined(
 ) -> CombinedRecord:
     """The record of several projectors."""
 
-    def part(prefix: str) -> StoreRecord | CompressedRecord | None:
+    def read_member(prefix: str) -> StoreRecord | CompressedRecord | None:
         own = {}
         for name, header in headers.items():
             if name.startswith(prefix):
@@ -124,14 +124,14 @@ def _read_combined(
 
     members = []
     for number in range(MAX_PROJECTORS):
-        member = part(f"projector_{number}.")
+        member = read_member(f"projector_{number}.")
         if isinstance(member, StoreRecord):
             members.append(member)
     settings = {name: load(name) for name in headers if "." not in name and name != "format"}
     for name in ("balance", "black"):
         if name not in settings:
             raise FileError(f"array {name!r} is missing")
-    return CombinedRecord(members=tuple(members), scene=part("scene."), settings=settings)
+    return CombinedRecord(members=tuple(members), scene=read_member("scene."), settings=settings)
 
 
 def _kind(dtype: np.dtype) -> str:
@@ -234,18 +234,18 @@ def _arrays(record: StoreRecord | CompressedRecord | CombinedRecord) -> dict[str
 
 def _combined_arrays(record: CombinedRecord) -> dict[str, Any]:
     """Arrays of several projectors, each with the name of its part in front."""
-    parts: dict[str, Any] = {}
+    members: dict[str, Any] = {}
     for number, member in enumerate(record.members):
-        parts[f"projector_{number}."] = member
+        members[f"projector_{number}."] = member
     if record.scene is not None:
-        parts["scene."] = record.scene
+        members["scene."] = record.scene
     arrays = {"format": COMBINED_FORMAT, **record.settings}
-    for prefix, part in parts.items():
-        own = _arrays(part)
-        if isinstance(part, StoreRecord) and not part.dense and len(part.matrices) == 1:
-            own = part.arrays() | {"format": GREY_FORMAT, "shape": part.shape}
+    for prefix, stored in members.items():
+        own = _arrays(stored)
+        if isinstance(stored, StoreRecord) and not stored.dense and len(stored.matrices) == 1:
+            own = stored.arrays() | {"format": GREY_FORMAT, "shape": stored.shape}
             for name in CSR:
-                own[f"{name}_0"] = getattr(part.matrices[0], name)
+                own[f"{name}_0"] = getattr(stored.matrices[0], name)
         for name, value in own.items():
             arrays[prefix + name] = value
     return arrays

@@ -211,6 +211,8 @@ class FileNames:
 
 
 DEFAULT_NAMES = FileNames()
+# Ends of names by which three matrices of a file are its channels.
+COLOUR_WORDS = (("red", "green", "blue"), ("r", "g", "b"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,8 +272,11 @@ def _one_channel(first_bounce: np.ndarray, shape: tuple[int, ...]) -> np.ndarray
 
 def _chosen_names(contents: FileContents, variable: str | Sequence[str]) -> Sequence[str]:
     """Names of the arrays that the user chose as T: one, or three of them, "red,green,blue"."""
-    chosen = [variable] if isinstance(variable, str) else list(variable)
-    if isinstance(variable, str) and variable not in contents.shapes:
+    if not isinstance(variable, str):
+        chosen = list(variable)
+    elif variable in contents.shapes:
+        chosen = [variable]
+    else:
         chosen = [name.strip().lstrip("/") for name in variable.split(",")]
     if len(chosen) not in (1, 3):
         raise InputError(f"variable is {variable!r:.100}; it must be one name, or three of colours")
@@ -310,6 +315,9 @@ def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:
             matrices.append(name)
     if len(matrices) == 1:
         return matrices
+    colours = _colours(matrices)
+    if colours:
+        return colours
     for name, kind in contents.unreadable.items():
         listed.append(f"{name!r} ({kind})")
     if not shapes:
@@ -319,6 +327,23 @@ def _matrix_names(contents: FileContents, names: FileNames) -> Sequence[str]:
         "channels, or one matrix by another name; variable= names one of several, or three of them "
         "(red,green,blue)"
     )
+
+
+def _colours(matrices: Sequence[str]) -> Sequence[str]:
+    """Sort the names of three matrices of colours, such as T_red; empty if they are not."""
+    if len(matrices) != 3:
+        return ()
+    for words in COLOUR_WORDS:
+        sorted_names = []
+        stems = set()
+        for word in words:
+            for name in matrices:
+                if name.lower().endswith(word):
+                    sorted_names.append(name)
+                    stems.add(name.lower().removesuffix(word))
+        if len(sorted_names) == 3 and len(stems) == 1:
+            return sorted_names
+    return ()
 
 
 def _check_dense(

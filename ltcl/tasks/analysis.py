@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import html
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,6 +73,21 @@ class ChannelAnalysis:
     energy: Energy
 
 
+# Facts of a channel that notebooks show, by their titles.
+HTML_FACTS = {
+    "spectral radius of R": "spectral_radius",
+    "albedo of a closed scene": "albedo",
+    "negative light in a bounce": "negative_bounce",
+    "reciprocity defect": "reciprocity_defect",
+}
+
+
+def _html_row(kind: str, title: str, values: Sequence[str]) -> str:
+    """Return a row of a table: a title, and a cell of the kind th or td for each value."""
+    cells = "".join(f"<{kind}>{html.escape(value)}</{kind}>" for value in values)
+    return f"<tr><th>{html.escape(title)}</th>{cells}</tr>"
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Analysis:
     """Result of `ltcl.analyze`: an analysis of each colour channel, and the verdict on T.
@@ -94,13 +110,19 @@ class Analysis:
 
     def _repr_html_(self) -> str:
         text = ""
-        for line in (str(self), self.verdict.text, f"Products with S to rtol {self.rtol:g}:"):
+        for line in (str(self), self.verdict.text):
             text += f"<div>{html.escape(line)}</div>"
-        rows = ""
-        for channel in self.channels:
-            for name, products in channel.products.items():
-                rows += f"<tr><td>{name}</td><td>{_count_text(products)}</td></tr>"
-        return f"{text}<table>{rows}</table>"
+        if not self.channels:
+            return text
+        colours = ("red", "green", "blue") if len(self.channels) == 3 else ("",)
+        rows = [_html_row("th", "", colours)]
+        for title, name in HTML_FACTS.items():
+            values = [f"{getattr(channel, name):.3g}" for channel in self.channels]
+            rows.append(_html_row("td", title, values))
+        for method in self.channels[0].products:
+            counts = [_count_text(channel.products[method]) for channel in self.channels]
+            rows.append(_html_row("td", f"products to {self.rtol:g}: {method}", counts))
+        return f"{text}<table>{''.join(rows)}</table>"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; infinite or unknown numbers are None."""

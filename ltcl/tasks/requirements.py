@@ -53,6 +53,8 @@ def check_inverse(T: Transport, inverse: Any, rtol: float | None, **replaced: An
                 f"{name} is given, but inverse takes the place of all solves; leave one out"
             )
     inverse.refuse_beyond(rtol)
+    # That of several projectors is the inverse of the scene that they have in common.
+    T = T.scene
     if inverse in T.checked_inverses:
         return
     check_same_scene("inverse", inverse, T, "make it with ltcl.invert(T)")

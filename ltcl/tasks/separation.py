@@ -13,9 +13,10 @@ whatever the tolerance. With one camera they are exact of Lambertian scenes only
 
 from __future__ import annotations
 
+import dataclasses
 import html
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,6 +25,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputTypeError
+from ltcl.interop.arrays import numbers
 from ltcl.operators import Operator
 from ltcl.solvers import Inverse, Solution, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
@@ -82,13 +84,18 @@ class Separation:
     _reference: Transport
     _inverse: Inverse | None
 
+    def with_arrays(self, give: Callable[[np.ndarray], Any]) -> Separation:
+        """The same result with pictures of another kind of array."""
+        names = ("direct", "indirect", "bounces", "rest")
+        return dataclasses.replace(self, **{name: give(getattr(self, name)) for name in names})
+
     @cached_property
     def std(self) -> SeparationStd:
         """Standard deviations by the noise of T alone, computed at the first call.
 
         They do not hold what `warning` says is unknown. See `ltcl.transport.uncertainty`.
         """
-        pictures = [self.direct, *self.bounces]
+        pictures = [numbers(self.direct), *numbers(self.bounces)]
         return separation_std(self._solving, self._reference.noise, pictures, self._inverse)
 
     def __repr__(self) -> str:
@@ -100,13 +107,14 @@ class Separation:
         # Imports OpenCV.
         from ltcl.images.thumbnails import thumbnails
 
-        pictures = {"direct": self.direct}
-        for number, bounce in enumerate(self.bounces, 1):
+        pictures = {"direct": numbers(self.direct)}
+        for number, bounce in enumerate(numbers(self.bounces), 1):
             pictures[f"bounce {number}"] = bounce
-        pictures["rest"] = self.rest
+        pictures["rest"] = numbers(self.rest)
         return f"{thumbnails(self, pictures)}<div>{html.escape(self.warning)}</div>"
 
 
+@checks.takes_arrays("image")
 def separate(
     T: Transport,
     image: Any,

@@ -133,10 +133,12 @@ def two_norm(
             break
     upper += process.rounding
     is_certain = frobenius <= upper
+    if is_certain:
+        confidence = 1.0
     return TwoNorm(
         estimate=min(estimate, frobenius),
         upper=min(upper, frobenius),
-        confidence=1.0 if is_certain else confidence,
+        confidence=confidence,
         products=process.products,
     )
 

@@ -24,8 +24,6 @@ from ltcl.transport.transport import Transport
 
 # Tolerance of solves, whose solutions are the smaller part of a variance.
 SOLVE_RTOL = 0.05
-# Variances of the pattern 1 are at least this, so that they divide.
-MIN_VARIANCE = 1e-300
 
 
 class EntryErrors:
@@ -134,11 +132,20 @@ class EntryErrors:
         """`q` of rows that add up to a measured white; pattern 1, number `white`, is dropped."""
         white_variance = self.noise.white[channel]
         has_white = np.isfinite(white_variance)[:, None]
-        V = np.where(has_white, np.maximum(q[..., white, white], MIN_VARIANCE), 1.0)
-        u = np.where(has_white, white_variance[:, None], 0.0)
-        factor = np.where(has_white, (u / V - 1.0) / V, 0.0)
-        q += factor[..., None, None] * q[..., white, :, None] * q[..., white, None, :]
+        V = q[..., white, white]
+        change = np.where(has_white, white_variance[:, None], V) - V
+        # Rows without noise have no share in that of white.
+        shares = ratio(q[..., white, :], V[..., None])
+        q += change[..., None, None] * shares[..., :, None] * shares[..., None, :]
         return np.delete(np.delete(q, white, axis=-1), white, axis=-2)
+
+
+def entry_errors(T: Transport, noise: Noise, inverse: Inverse | None = None) -> EntryErrors:
+    """The errors of T: several projectors know those of each."""
+    errors_of = getattr(T, "errors_of", None)
+    if errors_of is not None:
+        return errors_of(noise, inverse)
+    return EntryErrors(T, noise, inverse)
 
 
 def channel_matrices(T: Transport, channel: int) -> Any:

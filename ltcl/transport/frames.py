@@ -10,6 +10,7 @@ picture                       right-hand sides of a system of N = h * w pixels
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,13 +57,35 @@ class PictureLayout:
         n = grid[0] * grid[1]
         if len(columns[0]) != n:
             columns = np.split(columns[0], 3)
-        values = self._interleave(columns)
-        shape: tuple[int, ...] = (n,) if self.flat else grid
+        return self._interleave(columns).reshape(self.shape(grid))
+
+    def shape(self, grid: tuple[int, int]) -> tuple[int, ...]:
+        """The shape of a result on that grid."""
+        shape: tuple[int, ...] = (grid[0] * grid[1],) if self.flat else grid
         if self.frames is not None:
             shape = (self.frames, *shape)
         if self.colour:
             shape = (*shape, 3)
-        return values.reshape(shape)
+        return shape
+
+    def stacked(self, count: int) -> PictureLayout:
+        """The layout of `count` pictures of this one, all as frames."""
+        return dataclasses.replace(self, frames=count * self.frame_count)
+
+    def columns(self, picture: np.ndarray, pixels: int, channels: int) -> list[np.ndarray]:
+        """Copies of the values of a picture as right-hand sides (N, k) of each channel."""
+        # (frames, N, 1 or 3)
+        values = picture.reshape(self.frame_count, pixels, -1)
+        if channels == 1:
+            column = np.array(values.transpose(1, 0, 2), order="C").reshape(pixels, -1)
+            return [column]
+        columns = []
+        for channel in range(channels):
+            column = np.empty((pixels, len(values)), values.dtype)
+            # A grey picture has the same light in each channel.
+            column[...] = values[..., min(channel, values.shape[2] - 1)].T
+            columns.append(column)
+        return columns
 
     def _interleave(self, columns: Sequence[np.ndarray]) -> np.ndarray:
         if len(columns) == 1:
@@ -94,20 +117,8 @@ def unpack(
     _warn_of_codes(name, array)
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
-    layout = _find_layout(name, array, grid, channels)
-    n = grid[0] * grid[1]
-    # (frames, N, 1 or 3)
-    values = array.reshape(layout.frame_count, n, -1)
-    if channels == 1:
-        column = np.array(values.transpose(1, 0, 2), order="C").reshape(n, -1)
-        return [column], layout
-    columns = []
-    for channel in range(3):
-        column = np.empty((n, len(values)), values.dtype)
-        # A grey picture has the same light in each channel.
-        column[...] = values[..., min(channel, values.shape[2] - 1)].T
-        columns.append(column)
-    return columns, layout
+    layout = find_layout(name, array.shape, grid, channels)
+    return layout.columns(array, grid[0] * grid[1], channels), layout
 
 
 def _warn_of_codes(name: str, array: np.ndarray) -> None:
@@ -121,24 +132,24 @@ def _warn_of_codes(name: str, array: np.ndarray) -> None:
     logger.warning("%s holds %s, up to %d; %s", name, array.dtype, array.max(), UNITS % white)
 
 
-def _find_layout(
-    name: str, array: np.ndarray, grid: tuple[int, int], channels: int
+def find_layout(
+    name: str, shape: tuple[int, ...], grid: tuple[int, int], channels: int
 ) -> PictureLayout:
     """The layout of the first shape that fits: flat, colour, grey; refused if there is none."""
     colour_grid = (*grid, 3)
-    is_colour_result = channels == 3 or array.shape[-3:] == colour_grid
-    if array.shape == (grid[0] * grid[1],):
+    is_colour_result = channels == 3 or shape[-3:] == colour_grid
+    if shape == (grid[0] * grid[1],):
         return PictureLayout(True, None, is_colour_result)
     for size in (colour_grid, grid):
-        if array.shape == size:
+        if shape == size:
             return PictureLayout(False, None, is_colour_result)
-        if array.shape[1:] == size and len(array):
-            _check_unambiguous(name, array, grid, channels)
-            return PictureLayout(False, len(array), is_colour_result)
+        if shape[1:] == size and shape[0]:
+            _check_unambiguous(name, shape, grid, channels)
+            return PictureLayout(False, shape[0], is_colour_result)
     allowed = f"{grid}, {(*grid, 3)} or frames of these"
-    if array.shape[-3:] == (3, *grid):
+    if shape[-3:] == (3, *grid):
         allowed += f"; if it is in colour, colours come last: numpy.moveaxis({name}, -3, -1)"
-    raise InputError(f"{name} has shape {array.shape}; it must be {allowed}")
+    raise InputError(f"{name} has shape {shape}; it must be {allowed}")
 
 
 def to_light(
@@ -157,11 +168,13 @@ def to_light(
     return list(np.einsum("ij,jnk->ink", np.linalg.inv(mixing), light))
 
 
-def _check_unambiguous(name: str, array: np.ndarray, grid: tuple[int, int], channels: int) -> None:
+def _check_unambiguous(
+    name: str, shape: tuple[int, ...], grid: tuple[int, int], channels: int
+) -> None:
     """Refuse (3, h, w) for a T in colour: three grey frames, or the colours of one picture."""
-    if channels == 3 and array.shape == (3, *grid):
+    if channels == 3 and shape == (3, *grid):
         raise InputError(
-            f"{name} has shape {array.shape}: three grey frames, or the colours of one picture? "
+            f"{name} has shape {shape}: three grey frames, or the colours of one picture? "
             f"It must be {(*grid, 3)} for colours, numpy.moveaxis({name}, 0, -1), "
             f"or {(3, *grid, 3)} for frames, numpy.stack([{name}] * 3, -1)"
         )

@@ -36,9 +36,10 @@ def to_arrays(T: Transport) -> dict[str, np.ndarray]:
         if S is not None:
             systems.append(S)
     if not T.is_square or len(systems) < T.channels:
-        kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
+        kinds = {type(matrix).__name__ for matrix in T.matrices}
+        names = ", ".join(sorted(kinds))
         raise InputTypeError(
-            f"T is made of {kinds}; only arrays, sparse matrices and S diag(F) are stored"
+            f"T is made of {names}; only arrays, sparse matrices and S diag(F) are stored"
         )
     F = np.atleast_2d(T.first_bounce)
     arrays = {"grid": np.array(T.grid), "first_bounce": F}

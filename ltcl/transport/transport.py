@@ -24,6 +24,7 @@ from ltcl import checks
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.files import check_mapped_file
+from ltcl.interop.calls import Differentiable
 from ltcl.operators import (
     Coupled,
     IdentityPlus,
@@ -45,6 +46,7 @@ from ltcl.transport.first_bounce import (
 )
 from ltcl.transport.matrices import check_mixing, split_channels
 from ltcl.transport.noise import Noise, estimate
+from ltcl.transport.relighting import Relighting
 
 logger = logging.getLogger(__name__)
 # Share of diag(S) = 1 + diag(R) that is diag(T) / F: from here on, I + R has all digits of T F^-1.
@@ -52,6 +54,10 @@ MIN_DIAGONAL_SHARE = 0.5
 NOT_SHARED = "T is of one projector, which shares its light with no other one"
 # Attributes that do not leave this process.
 NOT_PICKLED = ("device", "systems", "operators", "checked_inverses", "reload")
+
+
+def _relighting(self: Transport, pattern: Any) -> Relighting:
+    return Relighting(self, pattern)
 
 
 class Transport:
@@ -405,7 +411,7 @@ class Transport:
 
     @property
     def background(self) -> list[np.ndarray] | None:
-        """None: the black of one projector is subtracted by its scan, or given by the caller."""
+        """No background: the scan, or the caller, subtracts the black of a single projector."""
         return None
 
     @property
@@ -585,17 +591,29 @@ class Transport:
         """Patterns (N, M) of several projectors from the light that drives all of them."""
         raise InputError(NOT_SHARED)
 
+    @checks.takes_arrays("pattern", differentiable=Differentiable(("pattern",), _relighting))
     def __matmul__(self, pattern: Any) -> np.ndarray:
         """Relight: the picture (float32) under `pattern`, as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
+        return shape.pack(self.multiply(columns), self.camera_grid)
+
+    def multiply(
+        self, columns: Sequence[np.ndarray], *, transpose: bool = False
+    ) -> list[np.ndarray]:
+        """T, or T^T, times right-hand sides (N, k) of each channel; one array if it couples."""
         if self.couples:
             columns = [np.concatenate(columns)]
+        operators = self.operators
+        if transpose:
+            operators = [T.T for T in operators]
         uploaded = []
-        for T, column in zip(self.operators, columns, strict=True):
-            uploaded.append((T, T.device.upload(column)))
+        for T, column in zip(operators, columns, strict=True):
+            uploaded.append(T.device.upload(column))
         # All products are queued before the first one is waited for.
-        pictures = [T.apply(x) for T, x in uploaded]
-        return shape.pack([picture.get() for picture in pictures], self.camera_grid)
+        products = []
+        for T, x in zip(operators, uploaded, strict=True):
+            products.append(T.apply(x))
+        return [product.get() for product in products]
 
     def to_numpy(self) -> np.ndarray:
         """T on the host, dense, without `mixing`: (M, N), (3, M, N), or (3, 3, M, N) of blocks."""

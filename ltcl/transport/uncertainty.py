@@ -37,7 +37,7 @@ from ltcl.operators import Operator
 from ltcl.solvers import Inverse
 from ltcl.solvers.host_krylov import least_squares
 from ltcl.transport import frames as layout
-from ltcl.transport.covariance import SOLVE_RTOL, EntryErrors, ratio
+from ltcl.transport.covariance import SOLVE_RTOL, EntryErrors, entry_errors, ratio
 from ltcl.transport.noise import Noise
 from ltcl.transport.transport import Transport
 
@@ -177,7 +177,7 @@ def compensation_std(
     If the pattern is the best one within bounds, `systems` and `weights` are the operators with
     their scales and the weights of its least squares problem, as `ltcl.compensate` has them.
     """
-    errors = EntryErrors(T, noise, inverse)
+    errors = entry_errors(T, noise, inverse)
     columns, shape = layout.unpack("pattern", pattern, T.grid, T.channels)
     is_free = []
     for light in columns:

@@ -32,6 +32,11 @@ MIN_TOKEN_LENGTH = 32
 # Addresses that are refused with a warning; those that follow are refused without.
 MAX_WARNINGS = 8
 MAX_NAME_LENGTH = 100
+# Whoever has no token hears of no address.
+NOT_THE_ADDRESS = (
+    "forbidden: the address of the viewer ends in a token, and this one has none, or another; "
+    "open the whole address that its terminal or notebook shows"
+)
 DEFAULT_PORTS = {"http": ":80", "https": ":443"}
 # Browsers of snap packages see the user's own folder, but no hidden or temporary one.
 SNAP_FOLDER = Path("/snap")
@@ -97,7 +102,7 @@ class Access:
     def refusal(self, connection: HTTPConnection, token: str, is_reading: bool) -> str:
         """Return why a request is refused; empty if it comes from the viewer's own page."""
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode()):
-            return "forbidden"
+            return NOT_THE_ADDRESS
         if self._is_served(connection, is_reading):
             return ""
         return f"forbidden: {self._explain(connection)}"
@@ -130,7 +135,7 @@ class Access:
         served = " and ".join(dict.fromkeys(filter(None, addresses)))
         text = (
             f"the page was asked for at {asked}; it is served at {served}; "
-            f"behind a proxy or on a forwarded port start the viewer with --url {asked}"
+            f"behind a proxy or on a forwarded port start the viewer with --origin {asked}"
         )
         if asked not in self._warned and len(self._warned) < MAX_WARNINGS:
             self._warned.add(asked)
@@ -148,8 +153,9 @@ def origin_of(url: str) -> str:
         return ""
     parts = urlsplit(url)
     host = parts.netloc.lower()
-    if parts.scheme not in DEFAULT_PORTS or not host or "@" in host or parts.query:
-        raise InputError(f"url is {url!r}; it must be an address such as http://localhost:9000")
+    is_host = bool(re.fullmatch(r"[\w.-]+(:\d+)?|\[[\da-f:.]+\](:\d+)?", host))
+    if parts.scheme not in DEFAULT_PORTS or not is_host or parts.query:
+        raise InputError(f"origin is {url!r}; it must be a URL such as http://localhost:9000")
     return f"{parts.scheme}://{host.removesuffix(DEFAULT_PORTS[parts.scheme])}"
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, images
-from ltcl.errors import InputError, InputTypeError, LtclError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.images.encoding import from_linear, to_linear
 from ltcl.images.pictures import BITS, RESIZES, as_picture
 from ltcl.tasks import report
@@ -23,6 +23,8 @@ from ltcl.tasks.separation import separate
 from ltcl.transport import frames as layout
 from ltcl.transport.first_bounce import ENTRIES
 from ltcl.transport.projectors import CombinedTransport
+from ltcl.viewer.messages import LARGEST_FILE
+from ltcl.viewer.pictures import KeptPictures, decode_file
 
 # Facts, and pictures by their names.
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -30,7 +32,17 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 Callback = Callable[[int, float], None]
 # Questions that take a solve, which calls back.
 LONG_QUESTIONS = ("bounces", "compensate")
-QUESTIONS = (*LONG_QUESTIONS, "adjust", "column", "row", "relight", "pictures", "projector")
+QUESTIONS = (
+    *LONG_QUESTIONS,
+    "adjust",
+    "column",
+    "row",
+    "relight",
+    "pictures",
+    "upload",
+    "result",
+    "projector",
+)
 # Pictures of a compensation.
 COMPENSATION_PICTURES = ("pattern", "appearance", "target", "out_of_reach")
 COMPENSATION_FACTS = ("error", "gain", "clipped", "gap", "transport_error")
@@ -40,11 +52,6 @@ RESULT_FILES = (
     "codes.png",
     *(f"{name}.exr" for name in COMPENSATION_PICTURES),
 )
-# Bytes of a file, and of a decoded picture: 64 million pixels.
-LARGEST_FILE = 64 << 20
-LARGEST_PICTURE = 3 << 29
-# Uploaded pictures that are kept; an older one is dropped.
-MAX_UPLOADS = 16
 MAX_BOUNCES = 16
 # Milliseconds of projected steps while a slider moves.
 ADJUST_DEADLINE_MS = 30.0
@@ -57,22 +64,14 @@ SRGB_CODES = from_linear(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class KeptPicture:
-    """A picture on the grids of camera and projector, by the way of `RESIZES` that it took."""
-
-    name: str
-    for_camera: dict[str, np.ndarray]
-    for_projector: dict[str, np.ndarray]
-
-
 class ViewerScene:
     """T and what is shown of it.
 
     Methods take the fields of a question, and raise LtclError for anything else. T is None if there
     is none yet, or only patterns are shown: then nothing is computed. `setup` is the
-    `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light of the projector,
-    of at most `white`, or uint8 codes. A question has at most so many `pixels`.
+    `ltcl.acquisition.Setup` of a measured T; a combination of scans has its own. `pattern`
+    (h, w[, 3]) is the light of the projector, of at most `white`, or uint8 codes. A question has at
+    most so many `pixels`.
     """
 
     page = "index.html"
@@ -80,6 +79,7 @@ class ViewerScene:
     def __init__(self, T: Any, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
         self.title = title
         self.T: Any = None
+        self._released: Any = None
         self.setup: Any = None
         self.pattern: Any = None
         self.white = 1.0
@@ -87,10 +87,8 @@ class ViewerScene:
         self._has_std = False
         self._compensation: tuple[Any, dict[str, Any]] | None = None
         # Prepared for the bounds of the last adjustment.
-        self._compensator: tuple[Any, Compensator] | None = None
-        self._pictures: dict[int, KeptPicture] = {}
-        self._picture_count = 0
-        self._first_pictures = len(pictures)
+        self._compensator: Compensator | None = None
+        self._pictures = KeptPictures(len(pictures))
         if T is not None:
             self.show_transport(T, setup)
         for name, picture in pictures.items():
@@ -100,12 +98,26 @@ class ViewerScene:
         """Show a transport from now on, while other threads may ask."""
         has_entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
         self._has_std = T.is_square and (has_entries or T.measured_noise is not None)
-        self.setup = setup
+        self.setup = _setup_of_several(T) if setup is None else setup
         self.pattern = np.ones(T.grid, np.float32)
         self.white = 1.0
         self.pixels = max(T.shape)
         # The last assignment: other threads see nothing of the transport, or all.
         self.T = T
+
+    def release(self) -> None:
+        """Let go of the transport, and of all that was made with it on the device."""
+        self._compensation = None
+        self._compensator = None
+        if self.T is not None:
+            self._released = weakref.ref(self.T)
+        self.T = None
+
+    def resume(self) -> bool:
+        """Take the transport up again; False if nobody else has kept it."""
+        if self.T is None and self._released is not None:
+            self.T = self._released()
+        return self.T is not None
 
     @property
     def questions(self) -> tuple[str, ...]:
@@ -132,9 +144,23 @@ class ViewerScene:
                 "square": T.is_square,
                 "bounces": T.scene.is_square,
                 "compressed": T.is_compressed,
+                "projectors": self._projectors(),
                 "extensions": [*BITS],
+                "largest_file": LARGEST_FILE,
             }
         return facts
+
+    def _projectors(self) -> list[dict[str, Any]]:
+        """Name, grid and first column of each of several projectors in a pattern."""
+        if not isinstance(self.T, CombinedTransport):
+            return []
+        montage = self.T.montage
+        numbered = [f"projector {number + 1}" for number in range(len(montage.grids))]
+        names: Sequence[str] = getattr(self.setup, "names", numbered)
+        projectors = []
+        for name, grid, left in zip(names, montage.grids, montage.lefts, strict=True):
+            projectors.append({"name": name, "grid": grid, "left": left})
+        return projectors
 
     def answer(self, do: str, asked: dict[str, Any], callback: Callback) -> Reply:
         """Answer a question by name; `callback` is called between the steps of a solve."""
@@ -173,7 +199,7 @@ class ViewerScene:
         if pattern is not None:
             light = self._light_of_codes(pattern)
         elif picture is not None:
-            light = self._picture(picture).for_projector[resize]
+            light = self._pictures.get(picture).for_projector[resize]
         else:
             light = self.pattern
         shown = {"picture": self.T @ light}
@@ -207,7 +233,7 @@ class ViewerScene:
         if picture is None:
             image = self.T @ self.pattern
         else:
-            image = self._picture(picture).for_camera[resize]
+            image = self._pictures.get(picture).for_camera[resize]
         result = separate(self.T, image, count, callback=callback)
         bounces = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
         light = {"direct": result.direct, **bounces, "rest": result.rest}
@@ -229,12 +255,12 @@ class ViewerScene:
     ) -> Reply:
         """Return the pattern for a picture, and let the projector show it."""
         checks.one_of("resize", resize, RESIZES)
-        desired = self._picture(picture)
+        desired = self._pictures.get(picture)
         start = time.perf_counter()
         result = compensate(
             self.T,
             desired.for_camera[resize],
-            background=None if self.setup is None else self.setup.ambient,
+            background=self._ambient,
             callback=callback,
             gain=gain,
             bounds=bounds,
@@ -242,7 +268,8 @@ class ViewerScene:
         facts = {name: getattr(result, name) for name in COMPENSATION_FACTS}
         facts["seconds"] = time.perf_counter() - start
         solves = _all_solves(result)
-        facts["method"] = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
+        methods = [solve["method"] for solve in solves]
+        facts["method"] = ", ".join(dict.fromkeys(methods))
         facts["products"] = sum(solve["products"] for solve in solves)
         facts["residuals"] = max((solve["residuals"] for solve in solves), key=len)
         self.pattern = result.pattern
@@ -274,7 +301,7 @@ class ViewerScene:
         """
         checks.one_of("resize", resize, RESIZES)
         checks.number("gain", gain, above=0.0)
-        light = self._picture(picture).for_camera[resize]
+        light = self._pictures.get(picture).for_camera[resize]
         compensator = self._prepared(bounds)
         compensator.gain = float(gain)
         pattern = compensator(light)
@@ -290,23 +317,36 @@ class ViewerScene:
             "p99": times.latency_p99,
         }
         appearance = self.T @ pattern
-        if self.setup is not None:
-            appearance = appearance + self.setup.ambient
+        if self._ambient is not None:
+            appearance = appearance + self._ambient
+        if self.T.background is not None:
+            shape = layout.PictureLayout(False, None, appearance.ndim == 3)
+            appearance = appearance + shape.pack(self.T.background, self.T.camera_grid)
         return facts, {"pattern": pattern, "appearance": appearance.astype(np.float32, copy=False)}
 
+    @property
+    def _ambient(self) -> np.ndarray | None:
+        """Light under a black projector; None if the projector was not measured."""
+        if self.setup is None:
+            return None
+        return self.setup.ambient
+
     def _prepared(self, bounds: Any) -> Compensator:
-        """The compensator for these bounds; made anew where they are others."""
-        if self._compensator is None or self._compensator[0] != (self.T, bounds):
+        """The compensator for these bounds, which is made at the first question."""
+        compensator = self._compensator
+        if compensator is None or compensator.T is not self.T:
             compensator = Compensator(
                 self.T,
-                background=None if self.setup is None else self.setup.ambient,
+                background=self._ambient,
                 bounds=bounds,
                 deadline_ms=ADJUST_DEADLINE_MS,
                 encode="linear",
                 dtype="float32",
             )
-            self._compensator = ((self.T, bounds), compensator)
-        return self._compensator[1]
+            self._compensator = compensator
+        elif compensator.bounds != checks.interval("bounds", bounds):
+            compensator.bounds = bounds
+        return compensator
 
     def _uncompensated(self, light: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return the scene under a picture as the pattern, made as bright as the target."""
@@ -317,10 +357,7 @@ class ViewerScene:
 
     def pictures(self) -> Reply:
         """Return names and numbers of the kept pictures."""
-        entries = []
-        for number, picture in self._pictures.items():
-            entries.append({"picture": number, "name": picture.name})
-        return {"pictures": entries}, {}
+        return {"pictures": self._pictures.entries()}, {}
 
     def projector(self) -> Reply:
         """Take note of a projector window that shows the pattern; the server sends the next one."""
@@ -328,52 +365,23 @@ class ViewerScene:
 
     def add(self, name: str, picture: np.ndarray) -> int:
         """Keep a picture on both grids; return its number."""
-        for_camera = _resized(picture, self.T.camera_grid)
-        for_projector = for_camera
-        if self.T.grid != self.T.camera_grid:
-            for_projector = self._for_projectors(picture)
-        self._picture_count += 1
-        number = self._picture_count
-        self._pictures[number] = KeptPicture(
-            name=name, for_camera=for_camera, for_projector=for_projector
-        )
-        if number > self._first_pictures + MAX_UPLOADS:
-            del self._pictures[number - MAX_UPLOADS]
-        return number
+        return self._pictures.add(name, picture, self.T)
 
-    def _for_projectors(self, picture: np.ndarray) -> dict[str, np.ndarray]:
-        """The picture on the projector's grid, or on that of each of several, side by side."""
-        if not isinstance(self.T, CombinedTransport):
-            return _resized(picture, self.T.grid)
-        parts = [_resized(picture, grid) for grid in self.T.montage.grids]
-        joined = {}
-        for way in parts[0]:
-            joined[way] = self.T.join([part[way] for part in parts])
-        return joined
-
-    def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
-        """Keep the picture of a file.
-
-        InputError, before it is decoded, if it has too many pixels.
-        """
-        if self.T is None:
-            problem = f"{self.title} has no transport, or none yet"
-            raise InputError(f"{problem}; pictures are for one")
-        suffix = checks.one_of("extension", Path(name).suffix.lower(), BITS)
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / f"picture{suffix}"
-            path.write_bytes(content)
-            try:
-                picture = images.read(path, memory=LARGEST_PICTURE)
-            except LtclError as error:
-                raise InputError(str(error).removeprefix(f"{path}: ")) from None
+    def upload(self, name: Any, content: Any) -> Reply:
+        """Keep the picture of a file, of which `content` are the bytes (size,), uint8."""
+        picture = decode_file(name, content)
         shape = picture.reshape(*picture.shape[:2], -1).shape
-        return {"picture": self.add(name, picture), "name": name, "shape": shape}
+        return {"picture": self.add(name, picture), "name": name, "shape": shape}, {}
 
-    def result(self, name: str) -> bytes | None:
-        """Return a file of the last compensation by its name; None if there is none."""
-        if self._compensation is None or name not in RESULT_FILES:
-            return None
+    def result(self, name: Any) -> Reply:
+        """Return a file of the last compensation by its name, as bytes (size,), uint8."""
+        checks.one_of("name", name, RESULT_FILES)
+        content = np.frombuffer(self._result_file(name), np.uint8)
+        return {"name": name}, {"content": content}
+
+    def _result_file(self, name: str) -> bytes:
+        if self._compensation is None:
+            raise InputError(f"name is {name!r}, but nothing was compensated yet")
         result, facts = self._compensation
         if name == "report.json":
             return report.dumps(facts).encode()
@@ -393,8 +401,15 @@ class ViewerScene:
         steps = pattern * np.float32(LIGHT_STEPS / white) + np.float32(0.5)
         return SRGB_CODES[np.clip(steps, 0, LIGHT_STEPS).astype(np.uint16)]
 
-    def _picture(self, number: Any) -> KeptPicture:
-        return self._pictures[checks.one_of("picture", number, self._pictures)]
+
+def _setup_of_several(T: Any) -> Any:
+    """What the projectors of a combination of scans are fed; None for any other T."""
+    if not isinstance(T, CombinedTransport) or not T.displays:
+        return None
+    # The import takes a second.
+    from ltcl.acquisition.projectors import CombinedSetup
+
+    return CombinedSetup.of(T)
 
 
 def _unit_picture(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
@@ -408,19 +423,6 @@ def _unit_picture(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
     unit = np.zeros(grid, np.float32)
     unit[row, column] = 1.0
     return unit
-
-
-def _resized(picture: np.ndarray, grid: tuple[int, int]) -> dict[str, np.ndarray]:
-    """Return a picture on a grid, by each way of `RESIZES`; one array where all are the same."""
-    h, w = picture.shape[:2]
-    if (h, w) == grid:
-        return dict.fromkeys(RESIZES, picture)
-    if h * grid[1] == w * grid[0]:
-        return dict.fromkeys(RESIZES, images.resize(picture, grid))
-    ways = {}
-    for how in RESIZES:
-        ways[how] = images.resize(picture, grid, how)
-    return ways
 
 
 def _sum(picture: np.ndarray) -> float:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Client`: a page's socket, its questions and their answers.
+"""`Client`: the questions of a page and their answers, over any `Carrier`.
 
 A product does not wait for a solve: each kind of question has a thread. A question that a page asks
 again replaces the one that waits. A page that does not read its answers is closed, and delays
-nobody.
+nobody. A page asks through a socket (`server`) or the kernel of a notebook (`widget`).
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
-
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from typing import Any, Protocol
 
 from ltcl import checks
 from ltcl.errors import LtclError
@@ -31,6 +29,22 @@ class Superseded(Exception):
     """Nobody waits for the computation any more."""
 
 
+class PageGone(Exception):
+    """The page has gone."""
+
+
+class Carrier(Protocol):
+    """Carries messages between a page and its client, whole and in their order."""
+
+    async def receive(self) -> str | bytes:
+        """Return the next message of the page; PageGone if it has gone."""
+        ...
+
+    async def send(self, message: str | bytes) -> None:
+        """Give a message to the page; TimeoutError if it does not read within `READ_SECONDS`."""
+        ...
+
+
 class Threads:
     """A thread for each kind of question."""
 
@@ -42,18 +56,24 @@ class Threads:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._executors[kind], call, *arguments)
 
+    def close(self) -> None:
+        """End the threads, without waiting for what they compute."""
+        for executor in self._executors.values():
+            executor.shutdown(wait=False, cancel_futures=True)
+        self._executors.clear()
+
 
 def _one_thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1)
 
 
 class Client:
-    """A page's socket, and of each kind of question the newest that waits."""
+    """A page, and of each kind of question the newest that waits."""
 
     def __init__(
-        self, socket: WebSocket, scene: Any, threads: Threads, clients: list[Client]
+        self, carrier: Carrier, scene: Any, threads: Threads, clients: list[Client]
     ) -> None:
-        self.socket = socket
+        self._carrier = carrier
         self._scene = scene
         self._threads = threads
         # All pages that are open, this one included.
@@ -65,14 +85,15 @@ class Client:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     async def serve(self) -> None:
-        """Take questions until the page goes; InputError for an invalid one."""
+        """Take questions until the page goes.
+
+        InputError for an invalid one, PageGone, and TimeoutError if the page does not read, all in
+        an ExceptionGroup.
+        """
         await self._send(messages.encode({"do": "hello", **self._scene.hello()}))
         async with asyncio.TaskGroup() as group:
             while True:
-                event = await self.socket.receive()
-                if event["type"] != "websocket.receive":
-                    raise WebSocketDisconnect
-                self._take(event.get("text") or event.get("bytes") or b"", group)
+                self._take(await self._carrier.receive(), group)
 
     def refresh(self) -> None:
         """Look for a new pattern; from any thread."""
@@ -115,9 +136,9 @@ class Client:
 
     async def _send(self, message: str | bytes) -> None:
         """Send a message; TimeoutError if the page does not read."""
-        kind = "text" if isinstance(message, str) else "bytes"
-        sending = self.socket.send({"type": "websocket.send", kind: message})
-        await asyncio.wait_for(sending, READ_SECONDS)
+        # Not `wait_for`: in Python 3.11 it loses a cancellation that comes as the message is sent.
+        async with asyncio.timeout(READ_SECONDS):
+            await self._carrier.send(message)
 
     def _compute(self, do: str, number: float, asked: dict[str, Any]) -> str | bytes | None:
         """Return the message with the answer, in a thread; None if it would come too late."""

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bytes of the messages between viewer and page, the same in both directions.
+"""Bytes of the messages between viewer and page, the same in both directions and on any carrier.
 
-A text frame is a JSON header. A binary frame is the length of its header (uint32, little-endian),
-the header, padded with spaces so that arrays begin at multiples of 4, then the arrays, each padded
-to a multiple of 4:
+A text message is a JSON header. A binary message is the length of its header (uint32,
+little-endian), the header, padded with spaces so that arrays begin at multiples of 4, then the
+arrays, each padded to a multiple of 4:
 
     {"id": 7, "do": "relight", "arrays": [{"name": "pattern", "shape": [h, w, c], "dtype": "u1"}]}
 
 Light goes to the page as float32 ("f4"), codes either way as uint8 ("u1"). A fourth channel, alpha
-of a canvas, is left out.
+of a canvas, is left out. The bytes of a file have the shape [size].
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,25 +31,33 @@ LENGTH_BYTES = 4
 ALIGNMENT = 4
 # Channels of a canvas: red, green, blue, alpha.
 CANVAS_CHANNELS = 4
-MAX_SIDE = 1 << 24
+MAX_SIDE = 1 << 26
+# Numbers in the shapes of a file and of a picture.
+DIMENSIONS = (1, 3)
+# Bytes of a file that a page gives.
+LARGEST_FILE = 64 << 20
 
 
 def largest_question(pixels: int) -> int:
     """Return the bytes of the largest question about a grid of so many pixels."""
-    return CANVAS_CHANNELS * pixels + LARGEST_HEADER
+    return max(CANVAS_CHANNELS * pixels, LARGEST_FILE) + LARGEST_HEADER
 
 
 def encode(
     header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
 ) -> str | bytes:
-    """Make a message with pictures (h, w[, 3]): uint8 ones as they are, others as float32."""
+    """Make a message with pictures (h, w[, 3]) and files (size,).
+
+    Arrays of uint8 go as they are, others as float32.
+    """
     if not arrays:
         return _dump(header)
     entries = []
     parts = []
     for name, array in arrays.items():
         dtype = "u1" if array.dtype == np.uint8 else "f4"
-        values = array.reshape(*array.shape[:2], -1).astype(dtype, copy=False)
+        shape = array.shape if array.ndim == 1 else (*array.shape[:2], -1)
+        values = array.reshape(shape).astype(dtype, copy=False)
         checks.finite(name, values)
         entries.append({"name": name, "shape": values.shape, "dtype": dtype})
         parts.append(values.tobytes())
@@ -68,7 +77,10 @@ def _padding(size: int) -> int:
 
 
 def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Decode a question: header and arrays of codes, (h, w[, c]) uint8; InputError if invalid."""
+    """Decode a question; InputError if it is invalid.
+
+    Returns its header, and its arrays of uint8: codes (h, w[, c]) and files (size,).
+    """
     if isinstance(message, str):
         text: str | bytes = message
         data = b""
@@ -100,15 +112,21 @@ def _decode_arrays(entries: Any, data: bytes, start: int) -> tuple[dict[str, np.
     arrays = {}
     for entry in entries:
         checks.one_of("dtype", entry["dtype"], ["u1"])
-        height, width, channels = (
-            checks.count("shape", size, most=MAX_SIDE) for size in entry["shape"]
-        )
-        codes = np.frombuffer(data, np.uint8, height * width * channels, start)
+        shape = [checks.count("shape", size, most=MAX_SIDE) for size in entry["shape"]]
+        checks.one_of("dimensions of the shape", len(shape), DIMENSIONS)
+        codes = np.frombuffer(data, np.uint8, math.prod(shape), start)
         start += codes.nbytes + _padding(codes.nbytes)
-        codes = codes.reshape(height, width, channels)
-        if channels == 1:
-            codes = codes[..., 0]
-        elif channels == CANVAS_CHANNELS:
-            codes = codes[..., :3]
-        arrays[str(entry["name"])] = codes
+        arrays[str(entry["name"])] = _without_alpha(codes.reshape(shape))
     return arrays, start
+
+
+def _without_alpha(codes: np.ndarray) -> np.ndarray:
+    """Return a picture without alpha, a grey one as (h, w); a file as it is."""
+    if codes.ndim == 1:
+        return codes
+    channels = codes.shape[2]
+    if channels == 1:
+        return codes[..., 0]
+    if channels == CANVAS_CHANNELS:
+        return codes[..., :3]
+    return codes

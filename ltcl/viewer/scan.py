@@ -84,7 +84,9 @@ class Scan(ViewerScene):
     @property
     def questions(self) -> tuple[str, ...]:
         """Questions that may be asked now."""
-        return ("scan", "pictures") if self.T is None else (*QUESTIONS, "scan")
+        if self.T is None:
+            return ("scan", "pictures")
+        return (*QUESTIONS, "scan")
 
     def scan(self, seen: Any) -> Reply:
         """Return progress, warnings, and the previews after the first `seen` ones."""

@@ -19,41 +19,35 @@ from pathlib import Path
 from typing import Any
 
 from ltcl import checks
-from ltcl.errors import InputError, LtclError
-from ltcl.viewer import messages
-from ltcl.viewer.answers import LARGEST_FILE
+from ltcl.errors import InputError
+from ltcl.viewer import messages, page_files
+from ltcl.viewer.client import READ_SECONDS, Client, PageGone, Threads
 
 try:
     import uvicorn
-    from starlette.requests import HTTPConnection, Request
-    from starlette.responses import JSONResponse, Response
-    from starlette.websockets import WebSocket, WebSocketDisconnect
+    from starlette.requests import HTTPConnection
+    from starlette.responses import Response
+    from starlette.websockets import WebSocket
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     from ltcl.viewer.access import Access, new_token, open_in_browser, origin_of, token_of_port
-    from ltcl.viewer.client import READ_SECONDS, Client, Threads
 except ImportError as error:
-    raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
+    raise InputError(checks.missing_extra("starlette", "view", "a viewer", error)) from None
 
 TYPES = {
     ".html": "text/html",
     ".css": "text/css",
     ".js": "text/javascript",
-    ".json": "application/json",
     ".svg": "image/svg+xml",
-    ".png": "image/png",
-    ".exr": "image/x-exr",
 }
 MAX_PAGES = 32
 # Connections that are no page yet.
 MAX_CONNECTIONS = 256
 # Bytes to a page: a picture is handed over at once.
 SEND_BUFFER = 1 << 21
-MAX_NAME_LENGTH = 255
 # Codes by which a WebSocket is closed (RFC 6455): bad data; try again later.
 POLICY_VIOLATION = 1008
 TRY_AGAIN_LATER = 1013
-PAGE_FOLDER = Path(__file__).parent / "page"
 HEADERS = {
     # The last line allows the frames of notebooks.
     "Content-Security-Policy": (
@@ -93,6 +87,25 @@ class _Connection(H11Protocol):
         return has_request, self.since
 
 
+class SocketCarrier:
+    """Carries messages through a WebSocket."""
+
+    def __init__(self, websocket: WebSocket) -> None:
+        self._websocket = websocket
+
+    async def receive(self) -> str | bytes:
+        """Return the next message of the page; PageGone if it has gone."""
+        event = await self._websocket.receive()
+        if event["type"] != "websocket.receive":
+            raise PageGone
+        return event.get("text") or event.get("bytes") or b""
+
+    async def send(self, message: str | bytes) -> None:
+        """Hand a message over to the socket, once there is room."""
+        kind = "text" if isinstance(message, str) else "bytes"
+        await self._websocket.send({"type": "websocket.send", kind: message})
+
+
 class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own, until `close` or the end of a with block.
 
@@ -105,14 +118,14 @@ class Viewer(contextlib.AbstractContextManager):
         host: str = "127.0.0.1",
         port: int = 0,
         open_browser: bool = True,
-        url: str = "",
+        origin: str = "",
     ) -> None:
         self._scene = scene
         self._clients: list[Client] = []
         self._threads = Threads()
-        self._files = _read_page()
-        # A wrong URL is refused before the port is opened.
-        origin_of(url)
+        self._files = page_files.read_page()
+        # A wrong one is refused before the port is opened.
+        origin_of(origin)
         listening, token = _listen(host, port)
         address = ipaddress.ip_address(listening.getsockname()[0])
         if not address.is_loopback:
@@ -120,7 +133,7 @@ class Viewer(contextlib.AbstractContextManager):
             token = new_token()
         name = socket.gethostname() if address.is_unspecified else host
         names = ("127.0.0.1", "localhost", name)
-        self._access = Access(token, names, listening.getsockname()[1], url)
+        self._access = Access(token, names, listening.getsockname()[1], origin)
         self.url = self._access.url
         self._uvicorn = uvicorn.Server(self._configuration())
         self._thread = threading.Thread(target=self._uvicorn.run, args=([listening],), daemon=True)
@@ -195,38 +208,23 @@ class Viewer(contextlib.AbstractContextManager):
             return
         response = Response(refusal, 403, media_type="text/plain")
         if is_allowed:
-            request = Request(scope, receive)
-            response = await self._respond(request, path if slash else "/", is_reading)
-            host = request.headers.get("host", "")
+            route = "/"
+            if slash:
+                route = path
+            response = self._respond(route, is_reading)
+            host = connection.headers.get("host", "")
             for name, value in HEADERS.items():
                 response.headers[name] = value.format(host)
         await response(scope, receive, send)
 
-    async def _respond(self, request: Request, path: str, is_reading: bool) -> Response:
-        """Answer a request for a file, or take a picture."""
-        if path == "picture" and request.method == "POST":
-            return await self._take_picture(request)
+    def _respond(self, path: str, is_reading: bool) -> Response:
+        """Answer a request for a file of the page."""
         pages = {"": self._scene.page, "projector": "projector.html"}
         name = pages.get(path, path)
         content = self._files.get(name)
-        if path.startswith("result/"):
-            name = path.removeprefix("result/")
-            content = await self._threads.run("result", self._scene.result, name)
         if content is None or not is_reading:
             return Response("not found", 404)
         return Response(content, media_type=TYPES[Path(name).suffix])
-
-    async def _take_picture(self, request: Request) -> Response:
-        name = request.query_params.get("name", "")[:MAX_NAME_LENGTH]
-        length = request.headers.get("content-length", "")
-        try:
-            size = int(length) if length.isdecimal() else None
-            checks.count("length", size, most=LARGEST_FILE)
-            content = await request.body()
-            facts = await self._threads.run("picture", self._scene.upload, name, content)
-        except LtclError as error:
-            return JSONResponse({"error": " ".join(str(error).split())}, 400)
-        return JSONResponse(facts)
 
     async def _serve(self, websocket: WebSocket) -> None:
         """Serve a page until it goes."""
@@ -235,14 +233,15 @@ class Viewer(contextlib.AbstractContextManager):
             reason = f"{MAX_PAGES} pages are open here, and there may be no more"
             await websocket.close(TRY_AGAIN_LATER, reason)
             return
-        client = Client(websocket, self._scene, self._threads, self._clients)
+        carrier = SocketCarrier(websocket)
+        client = Client(carrier, self._scene, self._threads, self._clients)
         self._clients.append(client)
         try:
             await client.serve()
         except* InputError as errors:
             reason = str(errors.exceptions[0])[:100]
             await asyncio.wait_for(websocket.close(POLICY_VIOLATION, reason), READ_SECONDS)
-        except* (TimeoutError, WebSocketDisconnect):
+        except* (TimeoutError, PageGone):
             websocket.state.abort()
         finally:
             self._clients.remove(client)
@@ -265,12 +264,3 @@ def _listen(host: str, port: int) -> tuple[socket.socket, str]:
     listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
     return listening, token
-
-
-def _read_page() -> dict[str, bytes]:
-    """Read all files of the page, by their names."""
-    files = {}
-    for file in PAGE_FOLDER.iterdir():
-        if file.suffix in TYPES:
-            files[file.name] = file.read_bytes()
-    return files

@@ -213,9 +213,18 @@ def test_bad_orders_are_refused(tmp_path, content, names):
 
 
 def test_missing_photographs_are_named(opencv, tmp_path):
-    with pytest.raises(errors.FileError, match="has 24 photographs; that of rows"):
+    with pytest.raises(errors.FileError, match="24 photographs"):
         import_gray_code(opencv, (200, 300))
-    with pytest.raises(errors.FileError, match=r"nowhere: no such file; .* opencv and scan3d"):
+    with pytest.raises(errors.FileError, match=r"nowhere: .* opencv and scan3d"):
         import_gray_code(opencv, GRID, "nowhere")
     with pytest.raises(errors.FileError, match="empty: cannot be read"):
         import_gray_code(tmp_path / "empty", GRID)
+
+
+def test_exchanged_sides_are_refused(tmp_path):
+    """48 x 64 pixels have as many stripes as 64 x 48, and numbers that those have not."""
+    patterns = opencv_patterns((48, 64))
+    save_all(tmp_path, patterns, [f"{k}.png" for k in range(len(patterns))])
+    assert error_of(import_gray_code(tmp_path, (48, 64)).mapping, (48, 64)) < 0.5
+    with pytest.raises(errors.InputError, match="beyond 64 x 48; grid must be"):
+        import_gray_code(tmp_path, (64, 48))

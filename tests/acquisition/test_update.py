@@ -249,11 +249,11 @@ def test_what_cannot_be_updated_is_refused_before_the_first_photograph(
     camera: Any = small_rig()
     camera.photograph = None
     new = tmp_path / "new.zarr"
-    with pytest.raises(InputError, match="'block'; it must be one of sketch, adaptive"):
+    with pytest.raises(InputError, match=r"'block'.* sketch, adaptive"):
         ltcl.update(camera, small, store=new)
     with pytest.raises(InputError, match=r"store is .*, which is the scan"):
         ltcl.update(camera, small, store=small)
-    with pytest.raises(FileError, match="exists; store must be a new folder"):
+    with pytest.raises(FileError, match="exists; store"):
         ltcl.update(camera, small, store=small.parent)
     with pytest.raises(FileError, match="no such folder"):
         ltcl.update(camera, tmp_path / "nowhere.zarr", store=new)
@@ -283,7 +283,7 @@ def test_a_scan_without_its_map_is_refused(scan: Scan, tmp_path: Path) -> None:
     assert len(names) == 2
     for name in names:
         del store._places[name]
-    with pytest.raises(FileError, match=r"ltcl.acquire keeps it now: scan again"):
+    with pytest.raises(FileError, match="scan again"):
         stored_map(store)
 
 

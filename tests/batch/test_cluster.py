@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -308,7 +309,8 @@ def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path)
             process.kill()
             process.wait()
     assert (run.returncode, run.stderr.count("\n")) == (1, 1), run.stderr
-    assert "was lost; 8 frame(s) are done" in run.stderr
+    # A batch of four that was solved before the end is written after it.
+    assert re.search(r"was lost; (8|12) frame\(s\) are done", run.stderr), run.stderr
     assert main([*words, "--resume"]) == 0
     patterns = {
         name: data for name, data in everything(film / "serial").items() if "json" not in name

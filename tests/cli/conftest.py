@@ -41,8 +41,8 @@ class Outcome:
         """The JSON document on stdout."""
         return json.loads(self.out, parse_constant=_refuse_constant)
 
-    def refused(self, *parts: str, code: int = 1) -> None:
-        """Expect one line on stderr with these parts, and nothing on stdout."""
+    def assert_refused(self, *parts: str, code: int = 1) -> None:
+        """Assert one line on stderr with these parts, and nothing on stdout."""
         assert self.code == code, self.err
         assert self.out == ""
         assert self.err.count("\n") == 1, self.err

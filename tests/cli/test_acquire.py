@@ -135,10 +135,10 @@ def test_a_run_continues_from_each_state_of_the_folder(program, scan, acquired, 
         (10, OSError("unplugged"), 1, ["unplugged", "transport.zarr", again]),
     ]
     for number, error, code, parts in ends:
-        program("acquire", "report", scan).refused("transport.zarr")
+        program("acquire", "report", scan).assert_refused("transport.zarr")
         with monkeypatch.context() as patch:
             patch.setattr(VirtualRig, "photograph", raise_at(number, error))
-            program("acquire", "run", scan).refused(*parts, code=code)
+            program("acquire", "run", scan).assert_refused(*parts, code=code)
 
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
@@ -172,18 +172,20 @@ def test_a_live_scan_with_all_photographs_opens_no_camera(program, finished):
 def test_a_scan_with_other_settings_is_refused(program, finished):
     """The table is named that the setting stands in."""
     change(finished, "bits = 12", "bits = 14")
-    program("acquire", "run", finished).refused("acquisition.toml: [rig]", "bits is 14", "12")
+    program("acquire", "run", finished).assert_refused(
+        "acquisition.toml: [rig]", "bits is 14", "12"
+    )
     change(finished, "bits = 14", "bits = 12")
     change(finished, 'strategy = "pixel"', 'strategy = "hadamard"')
     outcome = program("acquire", "run", finished)
-    outcome.refused("acquisition.toml: [acquire]", "strategy is 'hadamard'", "'pixel'")
+    outcome.assert_refused("acquisition.toml: [acquire]", "strategy is 'hadamard'", "'pixel'")
 
 
 @pytest.mark.parametrize("command", ["plan", "run"])
 def test_a_bad_setting_is_refused_and_nothing_is_written(program, scan, command):
     change(scan, "bits = 12", "bits = 99")
     outcome = program("acquire", command, scan)
-    outcome.refused(f"{scan / 'acquisition.toml'}: [rig] bits is 99")
+    outcome.assert_refused(f"{scan / 'acquisition.toml'}: [rig] bits is 99")
     names = sorted(path.name for path in scan.iterdir())
     assert names == ["acquisition.toml", "simulate.json", "truth.npz"]
 
@@ -226,7 +228,7 @@ def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, tmp_pa
     card.mkdir()
     (folder / "acquisition.toml").write_text(BY_HAND)
     store = folder / "transport.zarr"
-    program("acquire", "report", folder).refused(f"{store}: ", "ltcl acquire run")
+    program("acquire", "report", folder).assert_refused(f"{store}: ", "ltcl acquire run")
     for step in range(15):
         outcome = program("acquire", "run", folder)
         if outcome.code == 0:
@@ -248,7 +250,9 @@ def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, tmp_pa
             continue
         # The camera's own files stay on its card.
         photograph(simulated, folder, missing, card)
-        program("acquire", "run", folder, "--take", card / "none").refused(f"{card / 'none'}: ")
+        program("acquire", "run", folder, "--take", card / "none").assert_refused(
+            f"{card / 'none'}: "
+        )
         assert program("acquire", "run", folder, "--take", card).code in (0, 3)
         still_missing = FolderRig(folder, GRID, pattern_bits=16).missing()
         assert not {*missing} & {*still_missing}
@@ -273,7 +277,7 @@ def test_a_scan_is_carried_over_to_an_older_lamp(program, finished):
     assert report["largest"] == 0.0
     assert report["holds"]
     assert report["previous_error"] is None
-    program("acquire", "update", finished).refused("updated.zarr: exists")
+    program("acquire", "update", finished).assert_refused("updated.zarr: exists")
     printed = program("acquire", "update", finished, "--store", finished / "again.zarr").out
     for text in ("12 photographs", "nothing has moved", "the update holds", "again.zarr"):
         assert text in printed

@@ -21,7 +21,7 @@ def test_looks_of_a_rig(program, simulated):
     assert 0.0 < report["focus"] <= 1.0
     assert sorted(simulated.iterdir()) == before
     words = ["acquire", "aim", simulated, "--photographs", simulated, "--no-browser"]
-    program(*words).refused("--photographs is given", "virtual")
+    program(*words).assert_refused("--photographs is given", "virtual")
 
 
 @pytest.mark.slow

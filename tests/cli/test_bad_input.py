@@ -23,6 +23,7 @@ FIXTURES = (
     "acquired",
 )
 USAGE = [
+    ("combine a b --out c.npz --blend wrong", ["'--blend': 'wrong' is not one of 'auto'"]),
     ("nonsense", ["nonsense", "ltcl --help"]),
     ("info", ["FILE"]),
     ("convert a.npz b.npz --grid 4y5", ["--grid", "4y5"]),
@@ -70,10 +71,19 @@ OTHERS = [
     ("simulate mitsuba:dihedral --ambient 0.1 --out {out}", ["--ambient", "mitsuba"]),
     ("simulate {nan} --grid 3x3 --out {out}", ["--grid is 3 x 3"]),
     ("film {transport} {picture} --out {out}", ["FILM is ", "sky.exr", "ltcl compensate"]),
+    ("film {transport} no-film --out {out}", ["no-film: no such file"]),
     ("film {transport} {film} --workers 2 --out {out}", ["--workers is 2", "--cluster"]),
     ("play {film} {transport} --pipe", ["FILM is ", "--pipe is given"]),
     ("play - {transport}", ["FILM is -", "--pipe is not given"]),
+    ("play {film} {transport} --video-size 4x4", ["--video-size is 4x4", "--pipe is not given"]),
+    ("combine {transport} {transport} --out {out}.npz", ["SCAN ", "corner.npz is given twice"]),
+    ("combine {transport} {out}.zarr --out {out}.npz", ["out.zarr: no such file"]),
+    ("combine {out}.zarr --out {out}.npz", ["out.zarr: no such file"]),
     ("play --pipe - {transport} --gain auto", ["--gain is auto", "follow"]),
+    (
+        "play --pipe - {tall} --grid 2x5 --camera-grid 5x10 --bounces-every 2",
+        ["bounces_every is 2", "no S"],
+    ),
     ("play --pipe - {transport} --video-size 4", ["video_size is '4'", "1280x720"]),
     ("acquire run {empty}", ["acquisition.toml: ", "ltcl simulate"]),
     (
@@ -137,7 +147,7 @@ def times(folder: Path) -> dict[Path, int]:
 @pytest.mark.parametrize(("line", "parts"), USAGE)
 def test_wrong_usage_is_code_2(program, line, parts):
     words = [word.format(nothing=" ") for word in line.split()]
-    program(*words).refused(*parts, code=2)
+    program(*words).assert_refused(*parts, code=2)
     failed = program(*words, "--json")
     assert failed.code == 2
     assert failed.document["type"] == "UsageError"
@@ -152,7 +162,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(
 ):
     before = times(folder)
     words = [word.format(**names, out=tmp_path / "out") for word in line.split()]
-    program(*words).refused(*parts)
+    program(*words).assert_refused(*parts)
     assert list(tmp_path.iterdir()) == []
     assert times(folder) == before
 

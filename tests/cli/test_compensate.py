@@ -156,7 +156,7 @@ def test_reports_have_every_option_as_it_was_resolved(results):
 def test_a_second_run_in_a_folder_is_refused_at_once(program, transport, picture, tmp_path):
     arguments = ["compensate", transport, picture, "--out", tmp_path / "out"]
     with locked(tmp_path / "out"):
-        program(*arguments).refused("out: another run")
+        program(*arguments).assert_refused("out: another run")
     assert not (tmp_path / "out").exists()
     assert program(*arguments).code == 0
 
@@ -263,7 +263,7 @@ def test_a_failed_run_changes_nothing(program, transport, picture, tmp_path):
     before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
     black = write(tmp_path.with_name("black.exr"), np.zeros(GRID))
     arguments = [transport, picture, "--weights", black, "--gain", "auto", "--out", tmp_path]
-    program("compensate", *arguments).refused("weights", "0 to 0", "sky.exr")
+    program("compensate", *arguments).assert_refused("weights", "0 to 0", "sky.exr")
     assert {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)} == before
 
 

@@ -126,9 +126,9 @@ def test_a_copy_takes_the_calibration_of_its_store(program, store, waves, tmp_pa
 @pytest.mark.slow
 def test_a_wrong_calibration_is_refused(program, store, waves, transport, tmp_path):
     common = [waves, "--out", tmp_path / "no", "--calibration"]
-    program("compensate", transport, *common, store).refused("(4, 8)", "(5, 10)")
+    program("compensate", transport, *common, store).assert_refused("(4, 8)", "(5, 10)")
     nowhere = tmp_path / "none.zarr"
-    program("compensate", transport, *common, nowhere).refused("none.zarr: ")
+    program("compensate", transport, *common, nowhere).assert_refused("none.zarr: ")
 
 
 @pytest.mark.slow
@@ -142,4 +142,4 @@ def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
     grey = write(tmp_path / "grey.exr", np.full((4, 8), 0.5))
     common = ["compensate", store, grey, "--out", tmp_path / "out"]
     assert "T.zarr: 1 of 32 " in program(*common).err
-    program(*common, "--on-dark", "raise").refused("T.zarr", "on_dark")
+    program(*common, "--on-dark", "raise").assert_refused("T.zarr", "on_dark")

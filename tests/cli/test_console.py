@@ -12,16 +12,19 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import typer
 
 import ltcl
-from ltcl.cli import command, doctor
-from ltcl.cli.main import main
+from ltcl.cli import doctor, failure
+from ltcl.cli.main import PANELS, build_program, main
 from ltcl.cli.progress import Progress
 from ltcl.device import discovery
 from tests import json_schema
@@ -57,11 +60,11 @@ COMMANDS = [
     "acquire report",
 ]
 CODES = [
-    command.FAILED,
-    command.USAGE,
-    command.WAITING,
-    command.INTERNAL,
-    command.INTERRUPTED,
+    failure.FAILED,
+    failure.USAGE,
+    failure.WAITING,
+    failure.INTERNAL,
+    failure.INTERRUPTED,
 ]
 EXIT_CODES = (json_schema.PAGES / "exit-codes.md").read_text(encoding="utf-8")
 
@@ -87,18 +90,86 @@ def test_every_command_explains_itself(program, name):
     assert name.replace(" ", "-") in json_schema.SCHEMA["$defs"]
 
 
-@pytest.mark.slow
-def test_python_m_is_the_same_program_and_its_help_imports_nothing_heavy():
-    words = [sys.executable, "-X", "importtime", "-m", "ltcl", "--help"]
-    run = subprocess.run(words, capture_output=True, text=True)
-    assert run.returncode == 0
-    assert "compensate" in run.stdout
-    imported = set()
-    for line in run.stderr.splitlines():
-        module = line.split("|")[-1].strip()
-        imported.add(module.partition(".")[0])
-    assert "typer" in imported
-    assert not imported & {"pyopencl", "matplotlib", "cv2"}
+def commands_below(command: Any, name: str = "ltcl") -> Iterator[tuple[str, Any]]:
+    """The program and all its commands, by what is typed for them."""
+    yield name, command
+    for word, inner in getattr(command, "commands", {}).items():
+        yield from commands_below(inner, f"{name} {word}")
+
+
+WHOLE_PROGRAM: Any = typer.main.get_command(build_program())
+ALL_COMMANDS = dict(commands_below(WHOLE_PROGRAM))
+# Words by which no sentence of a help begins: what begins so is torn from another sentence.
+TORN = r"(?:^|[.!] +)(?:Of|What|Those|That|Which|Whose|Where|And|Or|But|Than)\b"
+
+
+@pytest.mark.parametrize("name", ALL_COMMANDS)
+def test_help_is_in_sentences_and_plain_names_of_values(name):
+    command = ALL_COMMANDS[name]
+    context = command.context_class(command, info_name=name)
+    texts = [" ".join(command.help.split())]
+    for parameter in command.params:
+        shown_names, text = parameter.get_help_record(context)
+        if parameter.param_type_name == "option":
+            assert not re.search(r"[<\[](int|float|str|bool|list)\b", shown_names)
+        assert not re.search("x[<>]=", text)
+        texts.append(re.sub(r"  \[.*\]$", "", text))
+    for text in texts:
+        assert text[0].isupper(), text
+        assert text.endswith((".", "demo")), text
+        assert re.search(TORN, text) is None, text
+
+
+@pytest.mark.parametrize("name", ALL_COMMANDS)
+def test_drawn_help_shows_no_types_of_python(program, name):
+    text = program(*name.split()[1:], "--help").out
+    assert "--help" in text
+    # Values to choose from are <one|other>.
+    assert re.search(r"<\w+>|\b(bool|int|float|str|list|Path|BOOLEAN|PATH)\b", text) is None
+
+
+def test_the_help_of_the_program_has_the_first_lines_of_its_commands():
+    """They stand in a table, so that the help needs no module of a command."""
+    table = {name: line for commands in PANELS.values() for name, (_, line) in commands.items()}
+    assert list(table) == list(WHOLE_PROGRAM.commands)
+    for name, command in WHOLE_PROGRAM.commands.items():
+        assert table[name] == " ".join(command.help.split("\n\n")[0].split())
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["nothing"]])
+def test_help_of_the_program_imports_little(words):
+    """Typer, rich and what they need. Seconds differ between machines, modules do not."""
+    run = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "ltcl", *words], capture_output=True, text=True
+    )
+    lines = [line for line in run.stderr.splitlines() if line.startswith("import time:")]
+    modules = {line.split("|")[-1].strip() for line in lines}
+    assert "typer" in modules
+    packages = {module.partition(".")[0] for module in modules}
+    assert not packages & {"numpy", "scipy", "pyopencl", "matplotlib", "cv2"}
+    ours = {module for module in modules if module.startswith("ltcl")}
+    assert len(ours) <= 12
+    assert len(modules) <= 600
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_get_a_script_that_completes(program, monkeypatch, shell):
+    monkeypatch.setenv("_LTCL_COMPLETE", f"source_{shell}")
+    script = program().out
+    assert f"complete_{shell}" in script
+    assert re.search(r"\bltcl\b", script)
+
+    def candidates(line: str) -> str:
+        monkeypatch.setenv("_LTCL_COMPLETE", f"complete_{shell}")
+        monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
+        variable = "COMP_WORDS" if shell == "bash" else "_TYPER_COMPLETE_ARGS"
+        monkeypatch.setenv(variable, line)
+        monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
+        return program().out
+
+    assert {"compensate", "compress"} <= set(re.findall(r"\w+", candidates("ltcl comp")))
+    assert "--camera-grid" in candidates("ltcl compensate --cam")
+    assert {"run", "report"} <= set(re.findall(r"\w+", candidates("ltcl acquire r")))
 
 
 @pytest.mark.parametrize(
@@ -112,12 +183,12 @@ def test_python_m_is_the_same_program_and_its_help_imports_nothing_heavy():
 )
 def test_an_error_is_a_line_a_code_and_json(program, monkeypatch, error, code, parts):
     monkeypatch.setattr(doctor.discovery, "list_devices", Mock(side_effect=error))
-    program("devices").refused(*parts, code=code)
+    program("devices").assert_refused(*parts, code=code)
     failed = program("devices", "--json").document
     assert failed["type"] == type(error).__name__
     assert failed["exit_code"] == code
     has_traceback = "Traceback" in program("devices", "--verbose").err
-    assert has_traceback == (code == command.INTERNAL)
+    assert has_traceback == (code == failure.INTERNAL)
 
 
 @needs_full_device
@@ -199,6 +270,28 @@ def test_ctrl_c_while_importing_is_one_line(tmp_path, module, options):
         assert json.loads(run.stdout)["exit_code"] == 130
 
 
+@pytest.mark.slow
+def test_ctrl_c_waits_until_native_code_is_imported(tmp_path):
+    """That of pyopencl ends the process at an interrupt; a module in its place tells its end."""
+    lines = (
+        "import os, signal, time",
+        "os.kill(os.getpid(), signal.SIGINT)",
+        "time.sleep(0.1)",
+        "os.write(2, b'imported\\n')",
+    )
+    (tmp_path / "pyopencl.py").write_text("\n".join(lines))
+    paths = os.pathsep.join([str(tmp_path), str(Path(ltcl.__file__).parents[1])])
+    run = subprocess.run(
+        [sys.executable, "-m", "ltcl", "devices"],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.stderr == "imported\nltcl: error: interrupted\n"
+    assert run.returncode == 130
+
+
 @pytest.mark.rare
 def test_ctrl_c_at_any_moment_is_one_line():
     """From the moment at which Python imports ltcl, to the end; after that all is printed."""
@@ -275,7 +368,7 @@ def test_devices_without_the_one_that_is_named(program, monkeypatch):
     assert "LTCL_DEVICE=nonsense" in outcome.err
     assert "->" not in outcome.out
     monkeypatch.setattr(discovery, "list_devices", list)
-    program("devices").refused("no OpenCL device", "install")
+    program("devices").assert_refused("no OpenCL device", "install")
 
 
 @pytest.mark.slow

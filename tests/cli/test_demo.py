@@ -93,10 +93,18 @@ def test_the_papers_iteration_diverges_and_chebyshev_does_not(done):
     methods = report["convergence"]["methods"]
     assert {method["method"]: method["status"] for method in methods} == {
         "chebyshev": "converged",
+        "gmres": "converged",
         "jacobi": "diverged",
         "neumann": "diverged",
-        "direct": "converged",
     }
+
+
+def test_the_verdict_says_that_a_simulated_transport_has_no_noise(done):
+    _, report, _ = done
+    verdict = report["analysis"]["verdict"]
+    assert verdict["text"] == "Unknown: this T is simulated and has no noise to judge by."
+    assert verdict["compensation"] is None
+    assert verdict["bounces"] is None
 
 
 @pytest.mark.slow
@@ -104,5 +112,5 @@ def test_bounces_are_those_of_the_form_factors(done):
     _, report, _ = done
     errors = [bounce["error"] for bounce in report["bounces"]]
     assert len(errors) == 5
-    # rtol is 1e-3, and each further bounce inherits the error of the one before.
-    assert max(errors) < 0.005
+    # rtol is 1e-4, and each further bounce inherits the error of the one before.
+    assert max(errors) < 0.001

@@ -27,4 +27,13 @@ def test_formats_are_chosen(program, acquired, tmp_path):
     report = program(*words, "obj", "--format", "png", "--json").json
     assert report["projectors"][0]["loss"] is None
     assert len(report["files"]) == 4
-    program(*words, "fbx").refused("'fbx' is not a format", "mpcdi", code=2)
+    program(*words, "fbx").assert_refused("'fbx' is not a format", "mpcdi", code=2)
+
+
+def test_folder_of_several_projectors(program, room_of_two, tmp_path):
+    words = ["export", room_of_two, "--no-error", "--out", tmp_path / "out"]
+    report = program(*words, "--format", "png", "--format", "mpcdi", "--json").json
+    assert [projector["name"] for projector in report["projectors"]] == ["left", "right"]
+    assert [projector["grid"] for projector in report["projectors"]] == [[13, 16]] * 2
+    assert report["camera_grid"] == [36, 72]
+    assert {"left_blend.png", "right_black.png", "projectors.mpcdi"} <= {*report["files"]}

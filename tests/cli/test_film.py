@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ltcl import images
+import ltcl
+from ltcl import batch, images
 from ltcl.cli.progress import Progress
 from ltcl.files import locked
 from ltcl.images.frames import open_frames, write_video
+from tests.transport import projectors
+from tests.transport.projectors import CAMERA, LEFT, RIGHT
 
 COUNT = 10
 
@@ -58,12 +61,12 @@ def test_finished_frames_are_kept_after_ctrl_c(program, transport, film, tmp_pat
     with monkeypatch.context() as patch:
         patch.setattr(Progress, "__call__", interrupt_at(6))
         # A third batch is solved while the second one is written, and is kept.
-        program(*common).refused("9 frame(s)", str(tmp_path), "--resume", code=130)
+        program(*common).assert_refused("9 frame(s)", str(tmp_path), "--resume", code=130)
     listed = json.loads((tmp_path / "frames.json").read_text())
     assert len(listed["frames"]) == 9
     assert len([*tmp_path.glob("pattern_*.png")]) == 9
-    program(*common).refused(f"{tmp_path}: ", "9 frame(s)", "resume=True")
-    program(*common, "--resume", "--rtol", "1e-3").refused("rtol=0.01", "0.001")
+    program(*common).assert_refused(f"{tmp_path}: ", "9 frame(s)", "resume=True")
+    program(*common, "--resume", "--rtol", "1e-3").assert_refused("rtol=0.01", "0.001")
     report = program(*common, "--resume", "--json").json
     assert report["solved"] == COUNT - 9
     assert len(report["frames"]) == COUNT
@@ -81,7 +84,7 @@ def test_frames_beyond_the_projector_are_noted(program, transport, film, tmp_pat
 def test_a_second_run_in_a_folder_is_refused_at_once(program, transport, film, tmp_path):
     arguments = ["film", transport, film, "--out", tmp_path / "out"]
     with locked(tmp_path / "out"):
-        program(*arguments).refused("out: another run")
+        program(*arguments).assert_refused("out: another run")
     assert not (tmp_path / "out").exists()
     assert program(*arguments).code == 0
 
@@ -104,3 +107,47 @@ def test_a_video_becomes_a_video(program, colour_transport, tmp_path):
         np.testing.assert_allclose(images.to_srgb(frame.picture()), codes, atol=0.6 / 255)
         appearance = images.read(out / f"appearance/appearance_{frame.number:06}.exr")
         assert appearance.shape == (4, 12, 3)
+
+
+def test_films_of_a_combination(program, device, tmp_path):
+    """Patterns of two projectors side by side in a file for each frame."""
+    members = projectors.transports(device, projectors.corner())
+    path = tmp_path / "two.npz"
+    ltcl.save(path, ltcl.combine(members))
+    film = tmp_path / "film"
+    film.mkdir()
+    y, x = np.mgrid[: CAMERA[0], : CAMERA[1]]
+    light = [0.2 + 0.05 * np.sin(0.6 * x + shift) * np.cos(0.5 * y) for shift in range(3)]
+    for number, picture in enumerate(light, 1):
+        images.write(film / f"{number}.exr", picture.astype(np.float32))
+    out = tmp_path / "out"
+    words = ["film", path, film, "--rtol", "1e-3", "--appearance", "--format", "exr"]
+    report = program(*words, "--out", out, "--json").json
+    assert [frame["name"] for frame in report["frames"]] == ["1.exr", "2.exr", "3.exr"]
+    assert report["worst"]["error"] < 0.02
+    T: Any = ltcl.load(path)
+    for number, picture in enumerate(light, 1):
+        pattern = images.read(out / f"pattern_{number:06}.exr")
+        patterns = T.split(pattern)
+        assert [part.shape for part in patterns] == [LEFT.grid, RIGHT.grid]
+        shown = sum(
+            member.to_numpy() @ part.ravel() for member, part in zip(members, patterns, strict=True)
+        )
+        assert np.linalg.norm(shown - picture.ravel()) < 0.02 * np.linalg.norm(picture)
+        appearance = images.read(out / f"appearance/appearance_{number:06}.exr")
+        np.testing.assert_allclose(appearance.ravel(), shown, rtol=1e-3)
+    # The same call in Python, as codes, and resumed.
+    codes = tmp_path / "codes"
+    first = batch.compensate_frames(T, film, codes, rtol=1e-3, frames=2)
+    assert first.solved == 2
+    done = batch.compensate_frames(T, film, codes, rtol=1e-3, resume=True)
+    assert done.solved == 1
+    for number in (1, 2, 3):
+        expected = images.read(out / f"pattern_{number:06}.exr")
+        pattern = images.read(codes / f"pattern_{number:06}.png")
+        np.testing.assert_allclose(pattern, expected, atol=2e-3)
+
+
+def test_a_gain_of_a_show_that_is_none_is_told_all_of_them(program):
+    outcome = program("play", "film.mp4", "T.npz", "--gain", "loud")
+    outcome.assert_refused("'loud' is not a gain; write a number, auto or follow", code=2)

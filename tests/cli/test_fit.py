@@ -61,10 +61,29 @@ def test_films_and_another_grid(program, pairs, T, tmp_path):
 
 
 def test_what_is_missing_is_named(program, pairs, tmp_path):
-    program("acquire", "fit", tmp_path).refused(str(tmp_path), "no patterns")
+    program("acquire", "fit", tmp_path).assert_refused(str(tmp_path), "no patterns")
     (tmp_path / "patterns").mkdir()
     (tmp_path / "patterns.mkv").touch()
-    program("acquire", "fit", tmp_path).refused("patterns and patterns.mkv", "must have one")
+    program("acquire", "fit", tmp_path).assert_refused("patterns and patterns.mkv", "must have one")
     bad = tmp_path / "T.xyz"
-    program("acquire", "fit", pairs, "--out", bad).refused("T.xyz")
+    program("acquire", "fit", pairs, "--out", bad).assert_refused("T.xyz")
     assert not bad.exists()
+
+
+def test_pixels_that_are_not_there_are_refused(program, pairs, tmp_path):
+    """Nothing is scaled up, and nothing stretched in silence."""
+    out = tmp_path / "T.npz"
+    fit = ("acquire", "fit", pairs, "--out", out)
+    program(*fit, "--grid", "8x17").assert_refused("--grid is 8x17", "8 x 16 pixels")
+    images.write(tmp_path / "black.exr", np.full((9, 16), 0.05))
+    program(*fit, "--black", tmp_path / "black.exr").assert_refused("black.exr", "9 x 16", "8 x 16")
+    assert program(*fit, "--resize", "crop").code == 2
+    assert not out.exists()
+
+
+def test_a_black_that_is_bright_is_refused(program, pairs, tmp_path):
+    out = tmp_path / "T.npz"
+    images.write(tmp_path / "black.exr", np.full((8, 16), 0.5))
+    outcome = program("acquire", "fit", pairs, "--out", out, "--black", tmp_path / "black.exr")
+    outcome.assert_refused("black.exr: is brighter than the mean photograph at", "shows black")
+    assert not out.exists()

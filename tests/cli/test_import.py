@@ -24,5 +24,8 @@ def test_photographs_become_files(program, tmp_path, device):
     assert read_map(out / "map.npz").camera_grid == (24, 40)
     T = ltcl.load(out / "direct.npz", device=device)
     np.testing.assert_allclose(T.first_bounce[:, T.masked == 0].mean(axis=1), [0.6, 0.5, 0.4], 0.02)
+    lines = program("acquire", "import", folder, "--grid", "6x10", "--out", tmp_path / "text").out
+    assert "map.npz: 1e+02 %" not in lines
+    assert "the camera sees 100 % of the projector" in lines
     again = program("acquire", "import", folder, "--grid", "6x10", "--out", out, "--order", "no")
-    again.refused("no: no such file", "opencv")
+    again.assert_refused("no: no such file", "opencv")

@@ -54,10 +54,10 @@ def test_no_acquisition_is_overwritten(program, tmp_path):
     assert program(*common, 2).code == 0
     assert program(*common, 3).code == 0
     (tmp_path / "transport.zarr").mkdir()
-    program(*common, 3).refused(f"{tmp_path}: ", "transport.zarr")
+    program(*common, 3).assert_refused(f"{tmp_path}: ", "transport.zarr")
     (tmp_path / "transport.zarr").rmdir()
     (tmp_path / "simulate.json").unlink()
-    program(*common, 3).refused(f"{tmp_path}: ", "acquisition.toml")
+    program(*common, 3).assert_refused(f"{tmp_path}: ", "acquisition.toml")
 
 
 @pytest.mark.slow
@@ -70,4 +70,6 @@ def test_mitsuba_renders_the_photographs(program, tmp_path):
     assert not (tmp_path / "m" / "truth.npz").exists()
     with Project.open(tmp_path / "m").rig() as rig:
         assert rig.photograph(np.ones((6, 8)), 0.5).max() > 100
-    program("simulate", "mitsuba:nothing.xml", "--out", tmp_path / "n").refused("nothing.xml: ")
+    program("simulate", "mitsuba:nothing.xml", "--out", tmp_path / "n").assert_refused(
+        "nothing.xml: "
+    )

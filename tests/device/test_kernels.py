@@ -42,7 +42,8 @@ def test_every_kernel_has_a_twin_and_every_line_its_mark(name):
     assert len(set(seen)) == len(seen)
     for kernel in re.findall(r"\bkernel\s+void\s+(\w+)", text):
         assert kernel.startswith(f"{name}_")
-        twin = re.sub("_(group|sum)$", "", kernel)
+        # The levels of a tail are those of a transform.
+        twin = re.sub("_(group|sum)$|_tail", "", kernel)
         assert re.search(rf"^def {twin}", TWINS, re.MULTILINE), kernel
 
 
@@ -66,6 +67,8 @@ DEFINES = {
     "CODE": "uchar",
     **krylov_state.DEFINES,
 }
+# Where a kernel takes no others.
+ONLY_DEFINES = {"wavelet_tail": {"K": 1}}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -73,7 +76,8 @@ def test_the_compiler_reads_the_files_as_they_are(device, name):
     """Editors and offline compilers, too: headers have guards, and name each other by place."""
     path = sources.folder() / f"{name}.cl"
     text = "\n".join(f'#include "{header.as_posix()}"' for header in (path.parent / HEADER, path))
-    options = [f"-D{define}={value}" for define, value in DEFINES.items()]
+    defines = {**DEFINES, **ONLY_DEFINES.get(name, {})}
+    options = [f"-D{define}={value}" for define, value in defines.items()]
     program = cl.Program(device.context, text).build([*sources.OPTIONS, *options])
     assert f"{name}_" in program.kernel_names
 

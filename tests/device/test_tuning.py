@@ -75,12 +75,20 @@ def test_speeds_of_the_machine_are_remembered(device, speed):
     assert speed(device) == measured
 
 
+def test_a_launch_and_a_wait_are_timed(device):
+    overheads = tuning.overheads(device)
+    assert 0.0 < overheads.launch < 1.0
+    assert 0.0 < overheads.wait < 1.0
+    assert tuning.overheads(device) == overheads
+
+
 def test_without_tuning_the_first_variant_and_constants_are_taken(device, monkeypatch, folder):
     monkeypatch.setenv("LTCL_TUNE", "0")
     assert tuning.choose(device, "csr", "k=1", {"a": pytest.fail, "b": pytest.fail}) == "a"
     assert tuning.seconds(device, "a", pytest.fail) == tuning.SECONDS
     assert tuning.bandwidth(device) == tuning.BANDWIDTH[device.is_cpu]
     assert tuning.factorization_flops() == tuning.FLOPS
+    assert tuning.overheads(device) == (tuning.LAUNCH_SECONDS, tuning.SECONDS)
     assert not folder.exists()
 
 

@@ -16,15 +16,18 @@ from ltcl.operators import (
     CSR,
     Compressed,
     Hats,
+    PatchHats,
+    Planes,
     Pyramid,
     SubsetBasis,
     Wavelet,
+    bases,
     multiresolution_order,
-    pyramid,
     restrict_to_support,
     wavelets,
 )
 from tests import gallery, reference
+from tests.conftest import launched_as
 from tests.operators import helpers
 
 NAMES = ("haar", "db2", "db4")
@@ -43,8 +46,7 @@ def some(n: int, share: int = 3) -> np.ndarray:
 @pytest.mark.parametrize("name", ["haar", "db4", "pyramid", "hats"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
-    monkeypatch.setattr(pyramid, "SMALL_LEVEL_PIXELS", small)
-    monkeypatch.setattr(wavelets, "SMALL_LEVEL_PIXELS", small)
+    monkeypatch.setattr(bases, "small_level_pixels", lambda device: small)
     # Launches of every width, and pieces.
     monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 5, 11))
     if name == "pyramid":
@@ -64,6 +66,23 @@ def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
     helpers.meets_twin(W.T, transposed)
 
 
+@pytest.mark.parametrize(
+    ("grid", "walls", "detail"),
+    [((1, 1), 1, 1), ((3, 10), 5, 1), ((4, 12), 3, 4), ((6, 12), 1, 2), ((15, 50), 2, 5)],
+)
+def test_patch_hats_meet_their_twin(shaped, grid, walls, detail):
+    W = PatchHats(shaped, grid, walls, detail)
+    matrix = reference.patch_hats(grid, walls, detail)
+    helpers.meets_twin(W, matrix)
+    helpers.meets_twin(W.T, matrix.T)
+    # Each pixel is shared in full, and each patch has as much of its pixels as they are many.
+    np.testing.assert_allclose(matrix.sum(axis=0), 1.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(matrix.sum(axis=1), detail**2, rtol=0, atol=1e-12)
+    core = np.random.default_rng(3).random((len(matrix), len(matrix)))
+    expected = np.diagonal(matrix.T @ core @ matrix)
+    np.testing.assert_allclose(W.diagonal_of(core), expected, rtol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [1, 3])
 # The last grid has more pixels than items.
@@ -80,6 +99,86 @@ def test_subsets_meet_their_twin(shaped, grid, share):
     assert P.nbytes == 4 * (len(places) + n)
     assert P.isometric
     assert P.orthonormal == (len(places) == n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("small", [0, 4096], ids=["a launch each", "all in one"])
+@pytest.mark.parametrize("share", [1, 3])
+@pytest.mark.parametrize("name", ["haar", "db4"])
+@pytest.mark.parametrize("grid", [(1, 1), (3, 5), (1, 29), (7, 53)])
+def test_subsets_of_coefficients_meet_their_twins(shaped, monkeypatch, grid, name, share, small):
+    """A GPU picks them while it transforms; a CPU afterwards."""
+    monkeypatch.setattr(bases, "small_level_pixels", lambda device: small)
+    monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 11))
+    W = Wavelet(shaped, grid, name)
+    places = some(grid[0] * grid[1], share)
+    matrix = reference.wavelet_split(grid, W.levels, wavelets.filters(name))
+    P = SubsetBasis(shaped, grid, places, W)
+    helpers.meets_twin(P, matrix[places])
+    helpers.meets_twin(
+        P.T, reference.wavelet_join(grid, W.levels, wavelets.filters(name))[:, places]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 3])
+def test_subsets_of_the_coefficients_of_several_pictures_meet_their_twin(shaped, count):
+    """Each picture has coefficients of its own."""
+    grid = (7, 10)
+    matrix = reference.wavelet_split(grid, 4, wavelets.filters("db2"))
+    whole = np.kron(np.eye(count), matrix)
+    places = some(len(whole))
+    W = Planes(Wavelet(shaped, grid, "db2"), count)
+    P = SubsetBasis(shaped, (count * grid[0], grid[1]), places, W)
+    helpers.meets_twin(P, whole[places])
+    helpers.meets_twin(P.T, whole[places].T)
+
+
+def test_a_gpu_picks_coefficients_without_a_launch_of_its_own(device):
+    gpu = launched_as(device, "gpu")
+    W = Wavelet(gpu, (40, 40), "haar")
+    P = SubsetBasis(gpu, (40, 40), some(1600), W)
+    launches = []
+    for A in (W, P, W.T, P.T):
+        x = gpu.upload(gallery.vectors(A.shape[1], 3))
+        before = gpu.launches.total()
+        A.apply(x)
+        launches.append(gpu.launches.total() - before)
+    gpu.finish()
+    assert launches == [1, 1, 1, 1]
+
+
+# Largest group, bytes of local memory, and the launches of a transform of 40 x 56 pixels: where
+# local memory holds all levels, some of them, and none.
+TAILS = [(1024, 49152, 1), (1024, 4096, 2), (8, 49152, 4), (1024, 4, 6)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("max_group", "local_memory", "launches"), TAILS)
+@pytest.mark.parametrize("k", [None, 3, 8])
+def test_a_gpu_keeps_small_levels_in_local_memory(device, max_group, local_memory, launches, k):
+    """Results are those of a launch for each level, also for coefficients in another order."""
+    grid = (40, 56)
+    gpu = launched_as(device, "gpu")
+    gpu.max_group = max_group
+    gpu.local_memory = local_memory
+    W = Wavelet(gpu, grid, "db2")
+    n = grid[0] * grid[1]
+    x = gallery.vectors(n, k)
+    before = gpu.launches.total()
+    coefficients = helpers.product(W, x)
+    assert gpu.launches.total() - before == launches
+    expected = helpers.product(Wavelet(device, grid, "db2"), x)
+    np.testing.assert_allclose(coefficients, expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(helpers.product(W.T, coefficients), x, rtol=0, atol=1e-5)
+    places = some(n)
+    P = SubsetBasis(gpu, grid, places, W)
+    np.testing.assert_array_equal(helpers.product(P, x), coefficients[places])
+    chosen = np.zeros_like(coefficients)
+    chosen[places] = coefficients[places]
+    np.testing.assert_array_equal(
+        helpers.product(P.T, coefficients[places]), helpers.product(W.T, chosen)
+    )
 
 
 @pytest.mark.parametrize("name", [*NAMES, "db38", "sym20"])

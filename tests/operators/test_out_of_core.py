@@ -17,7 +17,7 @@ import scipy.sparse
 import ltcl
 from ltcl.device import Device
 from ltcl.errors import FileError, InputError, MemoryLimitError
-from ltcl.operators import CSR, Dense, MultiDevice, Parts, ScaledColumns, Streamed, as_operator
+from ltcl.operators import CSR, Dense, MultiDevice, Operator, ScaledColumns, Streamed, as_operator
 from tests import gallery
 from tests.operators import helpers
 from tests.operators.large import GRID, PIXELS, Stored, mapped, transport
@@ -34,24 +34,24 @@ def no_room(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     monkeypatch.setattr("ltcl.operators.out_of_core.READ_BYTES", 1 << 18)
 
 
-def mapped_rows(folder: Path, device: Device, A: np.ndarray) -> Parts:
+def mapped_rows(folder: Path, device: Device, A: np.ndarray) -> Operator:
     return Streamed(device, mapped(folder, A))
 
 
-def stored_rows(folder: Path, device: Device, A: np.ndarray) -> Parts:
+def stored_rows(folder: Path, device: Device, A: np.ndarray) -> Operator:
     return Streamed(device, Stored(A))
 
 
-def dense_rows(folder: Path, device: Device, A: np.ndarray) -> Parts:
+def dense_rows(folder: Path, device: Device, A: np.ndarray) -> Operator:
     return MultiDevice(device, [Dense(device, A[:7]), Dense(device, A[7:])])
 
 
-def sparse_rows(folder: Path, device: Device, A: np.ndarray) -> Parts:
+def sparse_rows(folder: Path, device: Device, A: np.ndarray) -> Operator:
     pieces = [scipy.sparse.csr_array(rows) for rows in np.split(A, [3, 30])]
     return MultiDevice(device, [CSR(device, rows) for rows in pieces])
 
 
-FORMS: list[Callable[[Path, Device, np.ndarray], Parts]] = [
+FORMS: list[Callable[[Path, Device, np.ndarray], Operator]] = [
     mapped_rows,
     stored_rows,
     dense_rows,

@@ -180,6 +180,32 @@ def test_each_width_of_large_matrices_is_timed_once(device, asked, form):
     helpers.meets_twin(A, A.to_dense())
 
 
+@pytest.mark.parametrize("subgroup", [8, 32, 64])
+@pytest.mark.parametrize("max_group", [8, 256, 1024])
+@pytest.mark.parametrize("entries", [0, 1, 40, 256, 5000])
+@pytest.mark.parametrize("form", ["csr", "dense", "tiles of 8"])
+def test_groups_of_rows_follow_row_length_and_subgroups(
+    device, monkeypatch, form, entries, max_group, subgroup
+):
+    """Whole sub-groups, which rows share as long as items have something to do."""
+    ones = scipy.sparse.csr_array(np.ones((3, entries), np.float32))
+    A = helpers.FORMATS[form](device, ones)
+    monkeypatch.setattr(device, "kind", "gpu")
+    monkeypatch.setattr(device, "max_group", max_group)
+    monkeypatch.setattr(type(device), "subgroup", subgroup)
+    variants = [variant for variant in A.variants().values() if variant.shared]
+    for variant in variants:
+        assert variant.group <= max_group
+        assert variant.group % min(subgroup, max_group) == 0
+        assert variant.group % variant.rows == 0
+    default = variants[0]
+    turns = entries / A.entries_of_turn / (default.group // default.rows)
+    assert turns < 4 or default.rows == 1
+    if entries == 256 and max_group == 1024 and subgroup == 32:
+        rows = {"csr": 4, "dense": 4, "tiles of 8": 8}[form]
+        assert (default.rows, default.group) == (rows, 128)
+
+
 @pytest.mark.slow
 def test_kernels_of_different_tiles_are_timed_apart(device, asked):
     """The answer of one width or precision was that of all others."""

@@ -18,6 +18,7 @@ from ltcl.operators import (
     Dense,
     Hats,
     IdentityPlus,
+    PatchHats,
     Pyramid,
     ScaledBasis,
     ScaledColumns,
@@ -42,6 +43,7 @@ SYSTEMS = (
     "pixels",
     "pyramid",
     "hats",
+    "patch hats",
     "scaled",
     "two",
 )
@@ -85,6 +87,9 @@ def make_system(device: Device, name: str, form: str = "csr") -> IdentityPlus:
     if name in ("pyramid", "hats"):
         P = Pyramid(device, GRID) if name == "pyramid" else Hats(device, GRID)
         return IdentityPlus(between(P, P, error=0.1, diagonal=np.arange(N)))
+    if name == "patch hats":
+        P = PatchHats(device, GRID, walls=7, detail=1)
+        return IdentityPlus(between(P, P, error=0.1))
     if name == "scaled":
         P = Pyramid(device, GRID)
         out = ScaledBasis(P, np.linspace(0.2, 1.0, N))

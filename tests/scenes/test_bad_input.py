@@ -11,7 +11,18 @@ import numpy as np
 import pytest
 
 from ltcl.errors import InputError, InputTypeError
-from ltcl.scenes import Block, FormFactor, box, cut, dihedral, glossy, trihedral, visibility
+from ltcl.scenes import (
+    Block,
+    FormFactor,
+    RefinedScene,
+    box,
+    cut,
+    dihedral,
+    glossy,
+    refine,
+    trihedral,
+    visibility,
+)
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.camera import SceneCamera, frame
 from ltcl.scenes.scene import transport_matrix
@@ -69,6 +80,12 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: FormFactor([1], 0.5), "patches is a list"),  # pyright: ignore[reportArgumentType]
     (lambda: FormFactor(PATCHES, [0.5, 0.5]), r"albedo has shape \(2,\)"),
     (lambda: FormFactor.of(replace(dihedral(2), grid=(1, 8))), r"scene .* 1 x 4 .*n x n"),
+    (lambda: refine(CORNER, 0), "detail is 0"),
+    (lambda: refine(CORNER, 2.5), "detail is 2.5"),  # pyright: ignore[reportArgumentType]
+    (lambda: RefinedScene(PATCHES, 2), "patches is a Patches.*Scene"),  # pyright: ignore[reportArgumentType]
+    (lambda: refine(shine(), 2), "patches is .*without gloss"),
+    (lambda: refine(CORNER, 2).sample(np.full((2, 2), np.nan)), "image has 4 NaN"),
+    (lambda: refine(CORNER, 2).view(np.ones((5, 15))), r"picture has shape \(5, 15\)"),
     (lambda: visibility(PATCHES, [[(0, 0, 0), (1, 1, -1)]]), "the first must be below"),
 ]
 

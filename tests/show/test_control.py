@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -15,8 +18,11 @@ from pythonosc.udp_client import DispatchClient
 import ltcl
 from ltcl import errors, images
 from ltcl.show.control import OscServer, ShowControl
+from ltcl.show.pipes import RawVideo
 from ltcl.show.projection import Projection
 from ltcl.viewer.answers import ViewerScene
+from tests.transport import projectors
+from tests.transport.projectors import CAMERA, LEFT, RIGHT
 
 PATIENCE = 20.0
 
@@ -63,6 +69,12 @@ def show(device, pictures) -> Iterator[tuple[Projection, Client, ShowControl]]:
 
 
 FRAME = np.full((4, 8, 3), 200, np.uint8)
+FRAME_OF_TWO = np.full((*CAMERA, 3), 150, np.uint8)
+
+
+def frame_of(projection: Projection) -> np.ndarray:
+    """The frame of a show of one projector, or of two."""
+    return FRAME if projection.projectors == 1 else FRAME_OF_TWO
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -78,7 +90,7 @@ def codes_after(show, address: str, *values: Any) -> np.ndarray:
     before = control.state
     client.send_message(address, values)
     wait_until(lambda: control.state is not before)
-    return projection.codes(FRAME)
+    return projection.codes(frame_of(projection))
 
 
 def test_gain_follows_messages(show):
@@ -108,6 +120,121 @@ def test_black_and_off_and_on(show):
     np.testing.assert_array_equal(codes_after(show, "/ltcl/blackout", 0), shown)
     assert codes_after(show, "/ltcl/projector", 1, 0).max() == 0
     np.testing.assert_array_equal(codes_after(show, "/ltcl/projector", 1, 1), shown)
+
+
+@pytest.fixture(scope="module")
+def two(device) -> Any:
+    """Two projectors side by side, of other sizes."""
+    return ltcl.combine(projectors.transports(device, projectors.corner()))
+
+
+@pytest.fixture
+def show_of_two(two) -> Iterator[tuple[Projection, Client, ShowControl]]:
+    control = ShowControl()
+    projection = Projection(ViewerScene(two, "two", {}, None), 0.2, fps=25.0, control=control)
+    with OscServer(control, 0) as server:
+        client = Client(server.port)
+        yield projection, client, control
+        client.close()
+
+
+def test_projectors_of_a_combination(show_of_two, two):
+    projection, client, control = show_of_two
+    shown = projection.codes(FRAME_OF_TWO)
+    left, right = two.split(shown)
+    assert left.max() > 0
+    assert right.max() > 0
+
+    def check(codes: np.ndarray, has_left: bool, has_right: bool) -> None:
+        patterns = two.split(codes)
+        assert codes.dtype == np.uint8
+        np.testing.assert_array_equal(patterns[0], left * has_left)
+        np.testing.assert_array_equal(patterns[1], right * has_right)
+
+    check(codes_after(show_of_two, "/ltcl/projector", 2, 0), True, False)
+    # What is off stays so while others are switched, and under black.
+    assert codes_after(show_of_two, "/ltcl/blackout", 1).max() == 0
+    check(codes_after(show_of_two, "/ltcl/blackout", 0), True, False)
+    check(codes_after(show_of_two, "/ltcl/freeze", 1), True, False)
+    # Frozen codes stay as they are.
+    check(codes_after(show_of_two, "/ltcl/projector", 2, 1), True, False)
+    check(codes_after(show_of_two, "/ltcl/freeze", 0), True, True)
+    check(codes_after(show_of_two, "/ltcl/projector", 1, 0), False, True)
+    assert codes_after(show_of_two, "/ltcl/projector", 2, 0).max() == 0
+    check(codes_after(show_of_two, "/ltcl/projector", 1, 1), True, False)
+    # Frames of black alone, or frozen, are not computed.
+    _, values = client.ask("/ltcl/statistics")
+    assert values[:2] == (6, 0)
+    before = control.state
+    address, texts = client.ask("/ltcl/projector", 3, 0)
+    assert address == "/ltcl/error"
+    assert texts == ("/ltcl/projector: projector is 3; it must be at most 2",)
+    assert control.state is before
+
+
+def test_projectors_are_not_known_before_the_show(two):
+    control = ShowControl()
+    control.set_projector(1, False)
+    with pytest.raises(errors.InputError, match="projector is 2, but the show has not begun"):
+        control.set_projector(2, False)
+    Projection(ViewerScene(two, "two", {}, None), 0.2, fps=25.0, control=control).close()
+    control.set_projector(2, False)
+    assert control.state.off == {1, 2}
+
+
+def streams_of(program: subprocess.Popen[bytes]) -> tuple[IO[bytes], IO[bytes], IO[bytes]]:
+    """The pipes to and from a program."""
+    assert program.stdin is not None
+    assert program.stdout is not None
+    assert program.stderr is not None
+    return program.stdin, program.stdout, program.stderr
+
+
+def test_play_switches_projectors(two, tmp_path):
+    """`ltcl play --pipe` of a combination, whose second projector goes off and on."""
+    path = tmp_path / "two.npz"
+    ltcl.save(path, two)
+    frame = RawVideo(width=CAMERA[1], height=CAMERA[0])
+    target = RawVideo(width=two.grid[1], height=two.grid[0])
+    words = [sys.executable, "-m", "ltcl", "play", "--pipe", "--gain", "0.2", "--osc", "0"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [*words, "-", str(path)], stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0
+    ) as program:
+        stdin, stdout, stderr = streams_of(program)
+        told = stderr.readline().decode()
+        port = re.search(r"OSC on 127\.0\.0\.1:(\d+)", told)
+        assert port is not None, told
+        client = Client(int(port[1]))
+
+        def shown(*message: Any) -> tuple[np.ndarray, ...]:
+            """The patterns of a frame after a message."""
+            if message:
+                client.send_message("/ltcl/projector", message)
+                # Messages are obeyed in turn.
+                assert client.ask("/ltcl/statistics")[0] == "/ltcl/statistics"
+            stdin.write(frame.to_bytes(FRAME_OF_TWO))
+            data = b""
+            while len(data) < target.frame_bytes:
+                piece = stdout.read(target.frame_bytes - len(data))
+                assert piece, stderr.read().decode()
+                data += piece
+            return two.split(target.from_bytes(data))
+
+        left, right = shown()
+        assert left.shape == (*LEFT.grid, 3)
+        assert right.shape == (*RIGHT.grid, 3)
+        assert right.max() > 0
+        alone, dark = shown(2, 0)
+        np.testing.assert_array_equal(alone, left)
+        assert dark.max() == 0
+        np.testing.assert_array_equal(shown(2, 1)[1], right)
+        address, texts = client.ask("/ltcl/projector", 3, 0)
+        assert address == "/ltcl/error"
+        assert "projector is 3; it must be at most 2" in texts[0]
+        client.close()
+        stdin.close()
+        assert program.wait(PATIENCE) == 0
 
 
 def test_freeze_keeps_codes(show):
@@ -146,9 +273,13 @@ def test_statistics_come_back(show):
         ("/ltcl/gain", [], "has 0 values; it must have 1"),
         ("/ltcl/gain", ["loud"], "gain"),
         ("/ltcl/blackout", [2], "it must be 0 or 1"),
-        ("/ltcl/projector", [2, 1], "projector is 2"),
+        ("/ltcl/projector", [2, 1], "projector is 2; it must be at most 1"),
         ("/ltcl/picture", ["../card.png"], "it must be a name in"),
         ("/ltcl/picture", ["none.png"], "no such file"),
+        ("/ltcl/picture", [3], "picture is 3; it must be the name"),
+        ("/ltcl/statistics", ["x"], "port is 'x'; it must be a whole number"),
+        ("/ltcl/statistics", [0], "port is 0; it must be a whole number"),
+        ("/ltcl/statistics", [99999], "port is 99999; it must be at most 65535"),
         ("/ltcl/colour", [1], "is no address"),
         ("/other", [1], "is no address"),
     ],

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import xml.etree.ElementTree as ElementTree
 import zipfile
@@ -113,36 +114,97 @@ def read_pfm(data: bytes) -> np.ndarray:
     return np.frombuffer(values, "<f4").reshape(height, width, 3)[::-1]
 
 
-@pytest.mark.parametrize(("version", "width"), [("2.0", "xResolution"), ("1.0", "Xresolution")])
-def test_mpcdi_reads_back(projectors, tmp_path, version, width):
+@pytest.fixture(scope="module")
+def lifted(projectors) -> list[export.ExportedProjector]:
+    """The same with black to add, which photographs from elsewhere do not tell."""
+    return [dataclasses.replace(each, black=0.02 * each.blend) for each in projectors]
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+def test_mpcdi_names_what_readers_look_up(lifted, tmp_path, version):
     path = tmp_path / "projectors.mpcdi"
-    export.write_mpcdi(path, projectors, REMARK, version)
+    export.write_mpcdi(path, lifted, REMARK, version)
+    width, levels = {
+        "1.0": ("Xresolution", {"level": "4"}),
+        "2.0": ("xResolution", {"geometry": "2", "color": "2"}),
+    }[version]
     with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None
         root = ElementTree.fromstring(archive.read("mpcdi.xml"))  # noqa: S314 - we wrote it
-        assert root.attrib["version"] == version
-        assert root.attrib["profile"] == "2d"
-        regions = root.findall("./display/buffer/region")
-        assert [region.attrib[width] for region in regions] == ["30", "30"]
+    assert root.attrib["version"] == version
+    assert root.attrib["profile"] == "2d"
+    assert levels.items() <= root.attrib.items()
+    regions = root.findall("./display/buffer/region")
+    assert [region.attrib[width] for region in regions] == ["30", "30"]
+    filesets = root.findall("./files/fileset")
+    names = [fileset.attrib["region"] for fileset in filesets]
+    assert names == [region.attrib["id"] for region in regions]
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+def test_mpcdi_reads_back(lifted, tmp_path, version):
+    path = tmp_path / "projectors.mpcdi"
+    export.write_mpcdi(path, lifted, REMARK, version)
+    with zipfile.ZipFile(path) as archive:
+        root = ElementTree.fromstring(archive.read("mpcdi.xml"))  # noqa: S314 - we wrote it
         filesets = root.findall("./files/fileset")
-        names = [fileset.attrib["region"] for fileset in filesets]
-        assert names == [region.attrib["id"] for region in regions]
-        for fileset, projector in zip(filesets, projectors, strict=True):
-            place = read_pfm(archive.read(path_of(fileset, "geometryWarpFile")))
-            np.testing.assert_allclose(place[..., 0], (projector.camera_x + 0.5) / CAMERA[1])
-            np.testing.assert_allclose(place[..., 1], (projector.camera_y + 0.5) / CAMERA[0])
+        for fileset, projector in zip(filesets, lifted, strict=True):
+            warp = archive.read(text_of(fileset, "geometryWarpFile/path"))
+            place = read_pfm(warp)
+            # OpenCV reads the same, its colours in the order blue, green, red.
+            decoded: Any = cv2.imdecode(np.frombuffer(warp, np.uint8), cv2.IMREAD_UNCHANGED)
+            assert decoded.dtype == np.float32
+            np.testing.assert_array_equal(decoded[..., ::-1], place)
+            # From the left and from below, and none beyond the picture.
+            right = (projector.camera_x + 0.5) / CAMERA[1]
+            up = 1.0 - (projector.camera_y + 0.5) / CAMERA[0]
+            np.testing.assert_allclose(place[..., 0], np.clip(right, 0, 1), atol=1e-6)
+            np.testing.assert_allclose(place[..., 1], np.clip(up, 0, 1), atol=1e-6)
+            # A beta map without an exponent has that of the alpha map.
+            gamma = float(text_of(fileset, "alphaMap/gammaEmbedded"))
+            assert fileset.findtext("betaMap/gammaEmbedded", str(gamma)) == str(gamma)
             for kind, mask in (("alphaMap", projector.blend), ("betaMap", projector.black)):
-                data = np.frombuffer(archive.read(path_of(fileset, kind)), np.uint8)
+                data = np.frombuffer(archive.read(text_of(fileset, f"{kind}/path")), np.uint8)
                 codes: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-                assert codes.dtype == np.uint16
-                np.testing.assert_allclose(codes / 65535.0, mask, atol=1e-5)
+                assert 8 * codes.itemsize == int(text_of(fileset, f"{kind}/bitDepth"))
+                relative = codes / float(np.iinfo(codes.dtype).max)
+                half_a_code = 0.51 / np.iinfo(codes.dtype).max
+                np.testing.assert_allclose(relative, mask ** (1.0 / gamma), atol=half_a_code)
 
 
-def path_of(fileset: ElementTree.Element, kind: str) -> str:
-    element = fileset.find(f"{kind}/path")
-    assert element is not None
-    assert element.text is not None
-    return element.text
+def test_mpcdi_1_has_masks_of_bytes(lifted, tmp_path):
+    """The reference library of 1.0 takes each byte of a mask for a pixel."""
+    path = tmp_path / "projectors.mpcdi"
+    export.write_mpcdi(path, lifted, REMARK, "1.0")
+    with zipfile.ZipFile(path) as archive:
+        for name in (name for name in archive.namelist() if name.endswith(".png")):
+            data = np.frombuffer(archive.read(name), np.uint8)
+            codes: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            assert codes.dtype == np.uint8
+            assert codes.max() > 40
+
+
+def test_opencv_reads_the_warp_map_as_a_file(projectors, tmp_path):
+    """By its name, as programs that unpack an MPCDI do, and a picture is warped by it."""
+    archive_path = tmp_path / "projectors.mpcdi"
+    export.write_mpcdi(archive_path, projectors, REMARK)
+    with zipfile.ZipFile(archive_path) as archive:
+        archive.extractall(tmp_path)
+    picture = np.add.outer(np.arange(60.0), 2.0 * np.arange(120.0)).astype(np.float32)
+    for projector in projectors:
+        warp: Any = cv2.imread(str(tmp_path / f"{projector.name}_warp.pfm"), cv2.IMREAD_UNCHANGED)
+        assert warp.shape == (*GRID, 3)
+        map_x = warp[..., 2] * CAMERA[1] - 0.5
+        map_y = (1.0 - warp[..., 1]) * CAMERA[0] - 0.5
+        shown = cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR)
+        expected = 2.0 * projector.camera_x + projector.camera_y
+        np.testing.assert_allclose(shown[2:-2, 2:-2], expected[2:-2, 2:-2], atol=0.3)
+
+
+def text_of(fileset: ElementTree.Element, path: str) -> str:
+    text = fileset.findtext(path)
+    assert text is not None
+    return text
 
 
 def test_mesh_covers_what_is_seen(projectors, tmp_path):
@@ -192,7 +254,7 @@ def test_colours_are_undone():
 
 def test_cameras_must_agree(scans, tmp_path):
     write_map(tmp_path / "map.npz", Correspondence.aligned((4, 5)))
-    with pytest.raises(errors.InputError, match=r"camera of \(4, 5\) pixels; it must be"):
+    with pytest.raises(errors.InputError, match=r"camera of \(4, 5\) pixels"):
         export.read_projectors([*scans, tmp_path])
     with pytest.raises(errors.FileError, match="is no store"):
         export.read_projectors([tmp_path / "nowhere"])

@@ -19,6 +19,8 @@ from ltcl.show.export import write_cubes
 from ltcl.show.pipes import RawVideo
 from ltcl.show.projection import Projection
 from ltcl.viewer.answers import ViewerScene
+from tests.transport import projectors
+from tests.transport.projectors import CAMERA, LEFT, RIGHT
 
 PATIENCE = 100.0
 # An expression of FFmpeg whose frames differ and lie within reach.
@@ -46,15 +48,15 @@ def start(words: list[Any], **pipes: Any) -> Any:
     return subprocess.Popen([str(word) for word in words], **pipes)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("pixel_format", ["rgb24", "rgb48le", "gbrpf32le"])
-def test_video_goes_through(ffmpeg, transport, pixel_format):
-    video = RawVideo(width=16, height=8, pixel_format=pixel_format)
+def play_between(
+    ffmpeg: list[str], play: list[Any], pixel_format: str, options: str
+) -> tuple[bytes, bytes, str]:
+    """Bytes of the frames of FFmpeg, of what another FFmpeg receives, and what `play` has told.
+
+    The other one reads the codes by `options`.
+    """
     source = [*ffmpeg, "-f", "lavfi", "-i", PICTURES, "-f", "rawvideo", "-pix_fmt", pixel_format]
-    play = [sys.executable, "-m", "ltcl", "play", "--pipe", "--pixel-format", pixel_format]
-    play += ["--video-size", "16x8", "--gain", "0.2", "-", transport]
-    # Another FFmpeg reads the codes by the options that were told.
-    sink = [*ffmpeg, *video.options.split(), "-i", "-", "-f", "rawvideo", "-"]
+    sink = [*ffmpeg, *options.split(), "-i", "-", "-f", "rawvideo", "-"]
     pipe = subprocess.PIPE
     frames = subprocess.run([*source, "-"], capture_output=True, check=True).stdout
     with (
@@ -67,6 +69,19 @@ def test_video_goes_through(ffmpeg, transport, pixel_format):
         told = middle.stderr.read().decode()
         codes = [first.wait(PATIENCE), middle.wait(PATIENCE), last.wait(PATIENCE)]
     assert codes == [0, 0, 0], told
+    return frames, received, told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("pixel_format", "bounces_every"), [("rgb24", 1), ("rgb48le", 1), ("gbrpf32le", 3)]
+)
+def test_video_goes_through(ffmpeg, transport, pixel_format, bounces_every):
+    video = RawVideo(width=16, height=8, pixel_format=pixel_format)
+    play = [sys.executable, "-m", "ltcl", "play", "--pipe", "--pixel-format", pixel_format]
+    play += ["--video-size", "16x8", "--gain", "0.2", "--bounces-every", str(bounces_every)]
+    play += ["-", transport]
+    frames, received, told = play_between(ffmpeg, play, pixel_format, video.options)
     assert "video_size 16x8" in told
     assert "10 frames written" in told
     assert len(received) == len(frames) == 10 * video.frame_bytes
@@ -78,12 +93,46 @@ def test_video_goes_through(ffmpeg, transport, pixel_format):
         decode=encoding,
         encode=encoding,
         dtype=video.dtype.name,
+        bounces_every=bounces_every,
     )
     size = video.frame_bytes
     for begin in range(0, len(frames), size):
         picture = video.from_bytes(frames[begin : begin + size])
         shown = video.from_bytes(received[begin : begin + size])
         np.testing.assert_allclose(shown, projection.codes(picture), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_patterns_of_a_combination_go_through_side_by_side(ffmpeg, device, tmp_path):
+    """Frames of the camera's size in, patterns of two sizes out, whose sum is the picture."""
+    members = projectors.transports(device, projectors.corner())
+    T = ltcl.combine(members)
+    path = tmp_path / "two.npz"
+    ltcl.save(path, T)
+    height = max(LEFT.grid[0], RIGHT.grid[0])
+    width = LEFT.grid[1] + RIGHT.grid[1]
+    target = RawVideo(width=width, height=height, pixel_format="gbrpf32le")
+    play = [sys.executable, "-m", "ltcl", "play", "--pipe", "--pixel-format", "gbrpf32le"]
+    play += ["--gain", "0.1", "--rtol", "1e-3", "-", path]
+    frames, received, told = play_between(ffmpeg, play, "gbrpf32le", target.options)
+    assert f"video_size {width}x{height}" in told
+    assert len(received) == 10 * target.frame_bytes
+    video = RawVideo(width=CAMERA[1], height=CAMERA[0], pixel_format="gbrpf32le")
+    assert len(frames) == 10 * video.frame_bytes
+    for number in range(10):
+        size = video.frame_bytes
+        desired = 0.1 * video.from_bytes(frames[number * size : (number + 1) * size])
+        size = target.frame_bytes
+        shown = target.from_bytes(received[number * size : (number + 1) * size])
+        left = shown[: LEFT.grid[0], : LEFT.grid[1]]
+        right = shown[: RIGHT.grid[0], LEFT.grid[1] :]
+        assert shown[LEFT.grid[0] :, : LEFT.grid[1]].max() == 0.0
+        picture = members[0].to_numpy() @ left.reshape(-1, 3)
+        picture += members[1].to_numpy() @ right.reshape(-1, 3)
+        error = np.linalg.norm(picture - desired.reshape(-1, 3)) / np.linalg.norm(desired)
+        # The edges are sharper than what the projectors can make.
+        least = ltcl.compensate(T, desired, rtol=1e-3).error
+        assert error < 1.02 * least
 
 
 class Calibrated:

@@ -14,9 +14,9 @@ from scipy.optimize import lsq_linear
 
 import ltcl
 from ltcl.device import Device
-from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles
-from ltcl.solvers import Bounded, Status
-from ltcl.solvers.bounded import minimise
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles, block_diagonal
+from ltcl.solvers import Bounded, Status, bounded
+from ltcl.solvers.bounded import BoxProblem, minimise, minimise_each
 from ltcl.solvers.column_reductions import ColumnReductions
 from tests import gallery, reference
 from tests.problems import enclosure, lambertian
@@ -227,6 +227,17 @@ def test_black_is_reached_by_the_darkest_light():
     assert s.errors[0] <= 1.01 * errors(S, np.full((30, 1), 0.1), 0.0)[0]
 
 
+@pytest.mark.parametrize("brightness", [1e-10, 1e-20, 1e-30])
+def test_a_target_far_below_the_bounds_is_as_a_black_one(brightness):
+    S = lambertian(30, 0.8).S.astype(np.float32)
+    b = brightness * random.uniform(1.0, 2.0, (30, 1))
+    s = within(S, b, 0.2, 1.0, 1.0, rtol=1e-6)
+    least = errors(S, np.full((30, 1), 0.2), b)
+    np.testing.assert_allclose(s.errors, least, rtol=1e-6)
+    assert np.isfinite(s.gap)
+    assert s.saturated.all()
+
+
 def test_what_ends_a_solve():
     S = lambertian(40, 4.0).S.astype(np.float32)
     seen = []
@@ -269,3 +280,70 @@ def test_a_step_is_six_launches(shaped: Device, form: Any, k: int) -> None:
         counts.append(shaped.launches.total() - before)
     # The first solve also times variants of kernels.
     assert counts[2] - counts[1] == 8 * 6
+
+
+@pytest.mark.parametrize("rows", [1, 53, 700])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_several_problems_at_once_end_as_one_by_one(
+    shaped: Device, rows: int, weighted: bool
+) -> None:
+    operators: list[Operator] = []
+    problems = []
+    # The light of one is a million times that of another, and one has its target within reach.
+    for brightness, reach in ((1.0, 0.4), (1e6, 0.5), (1e-3, 2.0)):
+        matrix = np.eye(rows) + 0.5 * random.random((rows, rows)) / rows
+        operators.append(Dense(shaped, matrix.astype(np.float32)))
+        b = brightness * (0.2 + random.random((rows, 1)))
+        lower = np.where(random.random(rows) < 0.1, 0.0, -0.1 * brightness)
+        upper = np.full(rows, reach * brightness)
+        weights = None
+        if weighted:
+            weights = brightness * (0.1 + random.random((rows, 1)))
+        x0 = 0.5 * b
+        problems.append(BoxProblem(b=b, lower=lower, upper=upper, x0=x0, weights=weights))
+    together = minimise_each(block_diagonal(operators), problems, rtol=1e-4)
+    for A, problem, solution in zip(operators, problems, together, strict=True):
+        alone = minimise_each(A, [problem], rtol=1e-4)[0]
+        assert solution.status is alone.status is Status.CONVERGED
+        # One may take a step more, below the tolerance.
+        allowed = 1e-3 * np.linalg.norm(problem.b)
+        assert np.linalg.norm(solution.x - alone.x) <= allowed
+        weighted_b = problem.b if problem.weights is None else problem.weights * problem.b
+        size = float(np.linalg.norm(weighted_b))
+        np.testing.assert_allclose(solution.errors, alone.errors, rtol=0, atol=2e-4 * size)
+        assert np.all(solution.least <= solution.errors)
+        assert np.all(solution.x >= problem.lower.astype(np.float32)[:, None])
+        assert np.all(solution.x <= problem.upper.astype(np.float32)[:, None])
+        assert solution.gap <= 1e-4
+
+
+def test_problems_at_once_have_their_own_outcomes(device: Device) -> None:
+    # A column of S that is nearly zero cannot be solved in so few steps; the other is solved.
+    hard = Dense(device, np.array([[1.0, 0.999], [0.999, 1.0]], np.float32))
+    easy = Dense(device, np.eye(2, dtype=np.float32))
+    lower = np.full(2, -1e4)
+    target = np.array([[1.0], [-1.0]])
+    problem = BoxProblem(b=target, lower=lower, upper=-lower, x0=np.zeros((2, 1)))
+    dark = BoxProblem(b=0.0 * target, lower=lower, upper=-lower, x0=np.zeros((2, 1)))
+    both = minimise_each(block_diagonal([hard, easy]), [problem, dark], rtol=1e-6, maxiter=1)
+    assert both[0].status is Status.MAXITER
+    assert both[1].status is Status.CONVERGED
+    assert not both[1].x.any()
+
+
+def test_a_stagnated_problem_does_not_end_the_others(device: Device, monkeypatch: Any) -> None:
+    """The light of one is so large that rounding hides its error; the other takes more steps."""
+    monkeypatch.setattr(bounded, "PATIENCE", 10)
+    size = 60
+    ones = np.ones(size - 1)
+    chain = np.eye(size) - 0.48 * (np.diag(ones, 1) + np.diag(ones, -1))
+    dim = Dense(device, 1e-5 * np.eye(size, dtype=np.float32))
+    slow = Dense(device, chain.astype(np.float32))
+    zeros = np.zeros((size, 1))
+    target = chain @ np.random.default_rng(0).uniform(-0.5, 1.5, (size, 1))
+    far = np.full((size, 1), 1e5)
+    hidden = BoxProblem(b=zeros + 1.0, lower=zeros[:, 0], upper=2.0 * far[:, 0], x0=far)
+    solved = BoxProblem(b=target, lower=zeros[:, 0], upper=np.ones(size), x0=zeros)
+    both = minimise_each(block_diagonal([dim, slow]), [hidden, solved], rtol=1e-5)
+    assert [each.status for each in both] == [Status.STAGNATED, Status.CONVERGED]
+    assert both[1].iterations > 20

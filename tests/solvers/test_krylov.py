@@ -354,7 +354,7 @@ def test_steps_meet_their_twins(device, monkeypatch, rows, k, group):
     np.testing.assert_allclose(H.get(), half, **close)
     five, partials = summed(0.8, 1.1, 1.5, 0.6, 2.5)
     more = {"partials": partials, "next_partials": two, "g": G, "t": T, "p": P, "x": X}
-    columns.bind("krylov_bicgstab", extra=5, **more, **shared)()
+    columns.bind("krylov_bicgstab", extra=5, first=0, **more, **shared)()
     rho, *wanted = reference.krylov_bicgstab(five[:4], 1.2 * ones, 1.2 / sigma, half, t, v, p, x)
     np.testing.assert_allclose(numbers.get()[4], rho, rtol=1e-5)
     for array, new in zip((X, R, P), wanted, strict=True):

@@ -352,3 +352,12 @@ def test_arrays_that_declare_terabytes_or_hold_no_numbers(
     forge(store.path / "zarr.json", lambda attributes: attributes.update(files=sums))
     with pytest.raises(FileError, match=r"T\.zarr: .*block_000000"):
         ltcl.load(store.path, on_dark="mask")
+
+
+def test_the_folder_of_an_acquisition_names_its_stores(tmp_path: Path) -> None:
+    (tmp_path / "acquisition.toml").touch()
+    refused(tmp_path, "without a store yet; 'ltcl acquire run'")
+    make(tmp_path / "left.zarr", **SQUARE)
+    refused(tmp_path, r"give left\.zarr in it")
+    make(tmp_path / "right.zarr", **SQUARE)
+    refused(tmp_path, r"with left\.zarr, right\.zarr; give one of them, .*'ltcl combine'")

@@ -547,7 +547,7 @@ def test_matrices_in_groups_of_hdf5(tmp_path: Path) -> None:
     assert "'entry/title' (text)" in text
     for name in ("entry/data/other", "/entry/data/other"):
         np.testing.assert_array_equal(read(path, variable=name).matrices[0], 2 * dense())
-    with pytest.raises(FileError, match=r"'nowhere' is missing.*entry/data/transport"):
+    with pytest.raises(FileError, match=r"'nowhere'.*entry/data/transport"):
         formats.read(path, variable="nowhere")
     with pytest.raises(FileError, match=r"'entry/title' is text"):
         formats.read(path, variable="entry/title")
@@ -603,7 +603,7 @@ COLORS = {"T_red": dense(seed=1), "T_green": dense(seed=2), "T_blue": dense(seed
 
 
 @pytest.mark.parametrize(
-    "variable", ["T_red,T_green,T_blue", " T_red, T_green ,T_blue", tuple(COLORS)]
+    "variable", [None, "T_red,T_green,T_blue", " T_red, T_green ,T_blue", tuple(COLORS)]
 )
 @pytest.mark.parametrize("extension", [".npz", ".h5", ".mat"])
 def test_three_matrices_by_their_names(tmp_path: Path, extension: str, variable: Any) -> None:
@@ -620,6 +620,26 @@ def test_three_matrices_by_their_names(tmp_path: Path, extension: str, variable:
     for wrong in ("T_red,T_green", "T_red,T_green,T_blue,T_red", "T_red,T_green,T_blu"):
         with pytest.raises(FileError, match="variable"):
             ltcl.load(path, grid=(3, 4), variable=wrong)
+
+
+@pytest.mark.parametrize(
+    "names", [("B", "g", "R"), ("scan-b", "scan-g", "scan-r"), ("Blue", "GREEN", "red")]
+)
+def test_three_matrices_of_colours_are_t_without_being_named(tmp_path: Path, names: Any) -> None:
+    arrays = dict(zip(names, reversed(COLORS.values()), strict=True))
+    np.savez(tmp_path / "T.npz", allow_pickle=False, **arrays)
+    T = ltcl.load(tmp_path / "T.npz", grid=(3, 4))
+    np.testing.assert_array_equal(T.to_numpy(), list(COLORS.values()))
+
+
+@pytest.mark.parametrize(
+    "names", [("A_red", "B_green", "C_blue"), ("x", "y", "z"), ("r", "g", "a")]
+)
+def test_three_other_matrices_have_to_be_named(tmp_path: Path, names: Any) -> None:
+    arrays = dict(zip(names, COLORS.values(), strict=True))
+    np.savez(tmp_path / "T.npz", allow_pickle=False, **arrays)
+    with pytest.raises(FileError, match="variable= names"):
+        ltcl.load(tmp_path / "T.npz", grid=(3, 4))
 
 
 def test_three_matrices_are_one_channel_each(tmp_path: Path) -> None:

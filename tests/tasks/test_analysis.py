@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -122,3 +123,16 @@ def test_a_solution_is_reported_without_its_vector():
         "unknown": 1,
     }
     assert facts[2]["residuals"] == [1.0, 0.5, None]
+
+
+@pytest.mark.parametrize("albedo", [0.6, (0.8, 0.5, 0.3)])
+def test_a_notebook_shows_a_column_for_each_colour(device, albedo) -> None:
+    found = ltcl.analyze(ltcl.scenes.dihedral(3, albedo=albedo).transport(device=device))
+    html = found._repr_html_()
+    rows = re.findall(r"<tr>(.*?)</tr>", html)
+    columns = [len(re.findall(r"<t[hd]>", row)) for row in rows]
+    assert set(columns) == {1 + len(found.channels)}
+    titles = [re.sub("<.*?>", " ", row) for row in rows]
+    assert any("spectral radius" in title for title in titles)
+    assert sum("chebyshev" in title for title in titles) == 1
+    assert html.count("<table>") == html.count("</table>") == 1

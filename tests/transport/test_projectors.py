@@ -76,13 +76,15 @@ def test_direct_light_is_found(T):
         assert np.linalg.norm(error) < 0.03 * np.linalg.norm(true[rows])
 
 
-def test_weights_fall_at_borders(T):
+@pytest.mark.parametrize(("blend", "largest"), [("smooth", 0.05), ("linear", 0.15)])
+def test_weights_fall_at_borders(members, blend, largest):
+    T = ltcl.combine(members, blend=blend)
     left, right = (
         share.own.reshape(p.grid) for share, p in zip(T.shares, (LEFT, RIGHT), strict=True)
     )
     middle = LEFT.grid[0] // 2
-    assert left[middle, -1] < 0.05
-    assert right[middle, 0] < 0.05
+    assert left[middle, -1] < largest
+    assert right[middle, 0] < largest
     # Where no other projector takes over, there is no border.
     np.testing.assert_allclose(left[2:-2, 2], 1.0, atol=1e-6)
     assert (np.diff(left[middle, 6:]) <= 1e-9).all()
@@ -110,6 +112,29 @@ def test_shared_light_is_direct(T):
     inner[2:-2, 2:5] = True
     inner[2:-2, -5:-2] = True
     np.testing.assert_allclose(seen.reshape(CAMERA)[inner], smooth[0, 0], rtol=0.05)
+
+
+@pytest.mark.parametrize(("shared", "power"), [(8, 1.0), (24, 2.0)])
+def test_narrow_overlaps_have_linear_weights(shared, power):
+    """Two projectors side by side on one row of camera pixels, of which they share some."""
+    alone = 20
+    width = alone + shared
+    camera = (4, 2 * alone + shared)
+    members = []
+    for first in (0, alone):
+        matrix = np.zeros((*camera, 4, width), np.float32)
+        for row in range(4):
+            columns = np.arange(width)
+            matrix[row, first + columns, row, columns] = 0.5
+        size = camera[0] * camera[1]
+        matrix = matrix.reshape(size, 4 * width)
+        members.append(ltcl.Transport(matrix, (4, width), camera_grid=camera))
+    ramp = ltcl.combine(members).shares[0].ramp.reshape(4, width)
+    named = {1.0: "linear", 2.0: "smooth"}[power]
+    expected = ltcl.combine(members, blend=named).shares[0].ramp.reshape(4, width)
+    np.testing.assert_array_equal(ramp, expected)
+    distance = ramp[1] ** (1.0 / power)
+    np.testing.assert_allclose(np.diff(distance[alone + 2 : -1]), -1.0)
 
 
 def test_own_weights(members):

@@ -146,13 +146,13 @@ def test_ambiguous_shapes_are_colour(device):
 
 
 def test_no_device_is_opened_before_the_first_product(small_device):
-    T = transport(SCENE.T, device="there is no such device")
+    T = transport(SCENE.T, device="no such device")
     assert T.first_bounce.shape == (35,)
     assert "35 x 35, grey, grid 5 x 7" in repr(T)
     for task in (ltcl.compensate, ltcl.separate, ltcl.relight):
         with pytest.raises(InputError):
             task(T, pattern(5))
-        with pytest.raises(DeviceError, match="there is no such device"):
+        with pytest.raises(DeviceError, match="no such device"):
             task(T, pattern(*GRID))
     T = transport(SCENE.T, device=small_device)
     assert T.device is T.systems[0].R.device is small_device
@@ -285,7 +285,7 @@ BAD: list[tuple[Any, dict[str, Any], type[LtclError], str]] = [
 @pytest.mark.parametrize(("matrix", "arguments", "error", "says"), BAD)
 def test_bad_input_is_refused_by_name_before_a_device_is_opened(matrix, arguments, error, says):
     with pytest.raises(error, match=says) as caught:
-        transport(matrix, **{"device": "there is no such device", **arguments})
+        transport(matrix, **{"device": "no such device", **arguments})
     assert "\n" not in str(caught.value)
 
 
@@ -314,7 +314,7 @@ NO_PICTURES: list[tuple[Any, type[LtclError], str]] = [
 @pytest.mark.parametrize(("light", "error", "says"), NO_PICTURES)
 def test_bad_patterns_are_refused_by_name(light, error, says, channels):
     with pytest.raises(error, match=says) as caught:
-        ltcl.relight(transport([T35] * channels, device="there is no such device"), light)
+        ltcl.relight(transport([T35] * channels, device="no such device"), light)
     assert "\n" not in str(caught.value)
 
 

@@ -14,7 +14,7 @@ TYPES = {"f4": "<f4", "u1": "u1"}
 
 
 def question(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str | bytes:
-    """Make a frame with arrays (h, w, c), their numbers as they are."""
+    """Make a frame with arrays (h, w, c), or files (size,), their numbers as they are."""
     if not arrays:
         return json.dumps(header)
     kinds = {name: f"{array.dtype.kind}{array.dtype.itemsize}" for name, array in arrays.items()}
@@ -38,7 +38,9 @@ def answer(message: str | bytes) -> dict[str, Any]:
     for entry in header.pop("arrays"):
         assert start % 4 == 0
         numbers = np.frombuffer(message, TYPES[entry["dtype"]], int(np.prod(entry["shape"])), start)
-        header[entry["name"]] = numbers.reshape(entry["shape"]).astype(np.float64)
+        is_file = len(entry["shape"]) == 1
+        picture = numbers.reshape(entry["shape"]).astype(np.float64)
+        header[entry["name"]] = numbers.tobytes() if is_file else picture
         start += numbers.nbytes + -numbers.nbytes % 4
     assert start == len(message)
     return header
@@ -73,6 +75,12 @@ class Page:
     def next(self) -> dict[str, Any]:
         """Return the next message."""
         return answer(self.socket.recv(timeout=60))
+
+    def upload(self, name: Any, content: bytes) -> dict[str, Any]:
+        """Give a file; return the answer without its number and kind."""
+        answer = self.ask("upload", {"content": np.frombuffer(content, np.uint8)}, name=name)
+        del answer["id"], answer["do"]
+        return answer
 
     def ask(self, do: str, arrays: Any = None, **fields: Any) -> dict[str, Any]:
         """Return the answer to a question, without the messages before it."""

@@ -35,7 +35,7 @@ class Served:
     def __init__(self, url: str) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
-        self.viewer = ltcl.view(T, open_browser=False, port=self.port, url=url)
+        self.viewer = ltcl.view(T, open_browser=False, port=self.port, origin=url)
         self.token = self.viewer.url.split("/")[-2]
         self.host = f"127.0.0.1:{self.port}"
 
@@ -74,7 +74,7 @@ def served(
         yield served
 
 
-# --url, and the host and origin of a request; an empty one is the viewer's own.
+# --origin, and the host and origin of a request; an empty one is the viewer's own.
 ALLOWED = [
     ("", "", ""),
     (FORWARDED, "", ""),
@@ -114,7 +114,7 @@ def test_other_addresses_are_refused_in_words(
     for words in (text, caplog.text):
         assert origin in words
         assert f"http://{served.host}" in words
-        assert f"--url {origin}" in words
+        assert f"--origin {origin}" in words
         assert served.token not in words
     assert len(caplog.records) == 1
 
@@ -128,20 +128,32 @@ def test_a_proxy_may_keep_the_path(served: Served) -> None:
 
 
 @pytest.mark.parametrize("served", [FORWARDED], indirect=True)
-def test_without_the_token_nothing_is_told(
+def test_without_the_token_no_address_is_told(
     served: Served, caplog: pytest.LogCaptureFixture
 ) -> None:
     served.token += "x"
-    assert served.get("hub.example.org") == (403, "forbidden")
+    status, text = served.get("hub.example.org")
+    assert status == 403
+    assert "token" in text
+    for known in (served.host, FORWARDED, served.token[:-1]):
+        assert known not in text
     assert caplog.text == ""
 
 
 @pytest.mark.parametrize(
-    "url", ["localhost:9000", "ftp://localhost", "http://", "http://me@hub", "http://hub/?a=b"]
+    "url",
+    [
+        "localhost:9000",
+        "ftp://localhost",
+        "http://",
+        "http://me@hub",
+        "http://hub/?a=b",
+        "http://a b",
+    ],
 )
 def test_what_is_no_address_is_refused(device: Any, url: str) -> None:
-    with pytest.raises(InputError, match="url is"):
-        ltcl.view(T, open_browser=False, url=url)
+    with pytest.raises(InputError, match="origin is"):
+        ltcl.view(T, open_browser=False, origin=url)
 
 
 def view() -> Any:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 import time
@@ -18,6 +19,7 @@ import pytest
 import ltcl
 from ltcl.acquisition import FolderRig
 from ltcl.acquisition.aiming import read_white
+from ltcl.acquisition.projectors import combine_scans
 from ltcl.images import to_srgb
 from ltcl.images.encoding import to_linear
 from ltcl.show.window import Window
@@ -81,7 +83,7 @@ def page(browser: Browser, viewer: Any) -> Iterator[Page]:
 def visit(page: Page, viewer: Any, view: str) -> None:
     page.goto("about:blank")
     page.goto(f"{viewer.url}#{view}")
-    page.wait_for_selector("body[data-state=ready]")
+    page.wait_for_selector(".viewer[data-state=ready]")
 
 
 def pixels(page: Page, name: str) -> tuple[np.ndarray, float]:
@@ -292,6 +294,48 @@ def test_uncertainty_is_an_overlay(
     np.testing.assert_allclose(pink, expected, atol=4)
 
 
+def test_projectors_stand_side_by_side_with_their_names(
+    browser: Browser, room_of_two: Path
+) -> None:
+    """Two scans combined: a pattern for each, under its name, in all views that show patterns."""
+    T = combine_scans([room_of_two / "left.zarr", room_of_two / "right.zarr"])
+    y, x = np.mgrid[: T.camera_grid[0], : T.camera_grid[1]]
+    desired = (0.12 + 0.05 * np.sin(x / 3) * np.cos(y / 2)).astype(np.float32)
+    with browser.new_context(viewport={"width": 1280, "height": 800}) as context:
+        page = context.new_page()
+        with ltcl.view(T, desired, how="browser", open_browser=False) as viewer:
+            visit(page, viewer, "compensate")
+            c = ltcl.compensate(T, desired, gain="auto")
+            shows(page, "compensate-pattern", c.pattern, atol=2)
+            left, right = T.split(c.pattern)
+            assert not np.allclose(left, right)
+            names = page.locator("#compensate-pattern .names b")
+            assert names.all_inner_texts() == ["left", "right"]
+            whole = canvas(page, "compensate-pattern").bounding_box()
+            assert whole is not None
+            for number in range(2):
+                part = page.locator("#compensate-pattern .part").nth(number).bounding_box()
+                label = names.nth(number).bounding_box()
+                assert part is not None
+                assert label is not None
+                begin = whole["x"] + number / 2 * whole["width"]
+                assert part["x"] == pytest.approx(begin, abs=1)
+                assert part["width"] == pytest.approx(whole["width"] / 2, abs=1)
+                assert label["x"] == pytest.approx(begin, abs=2)
+                assert label["y"] + label["height"] <= whole["y"] + 1
+            facts = page.locator("#facts").inner_text()
+            assert facts.replace("\u00d7", "x").startswith("left 6 x 12, right 6 x 12 projector")
+            page.locator("#tab-probe").click()
+            page.mouse.move(*at(page, "probe-projector", 3, 12 + 8, T.grid))
+            shows(page, "probe-camera", T @ unit(T.grid, 3, 12 + 8))
+            assert "right: row 3, column 8" in page.locator("#probe-projector-values").inner_text()
+            page.locator("#tab-relight").click()
+            assert page.locator("#relight-pattern .names b").all_inner_texts() == ["left", "right"]
+            page.locator("#relight-clear").click()
+            page.mouse.click(*at(page, "relight-pattern", 2, 5, T.grid))
+            shows(page, "relight-seen", T @ painted(page)[..., 0])
+
+
 def test_painting_relights(page: Page, T: ltcl.Transport) -> None:
     page.locator("#tab-relight").click()
     page.locator("#relight-clear").click()
@@ -430,7 +474,7 @@ class Late:
 def settle(page: Page) -> None:
     """Wait until all questions are answered, and no answer has led to another question."""
     page.wait_for_timeout(300)
-    page.wait_for_selector("body[data-state=ready]")
+    page.wait_for_selector(".viewer[data-state=ready]")
 
 
 @pytest.mark.slow
@@ -542,11 +586,21 @@ def test_compensation(page: Page, T: ltcl.Transport, picture: np.ndarray, tmp_pa
     page.locator("#compensate-auto").uncheck()
     page.locator("#compensate-gain").fill("0.3")
     shows(page, "compensate-pattern", ltcl.compensate(T, picture, gain=0.3).pattern)
+    # While the slider moves, times of frames are told.
+    page.locator("#compensate-gain").evaluate(
+        "slider => { slider.value = 0.4; slider.dispatchEvent(new Event('input')); }"
+    )
+    times = page.locator("#compensate-wipe .note", has_text="99 % of frames")
+    times.wait_for()
+    told = re.search(r"99 % of frames within ([\d.e+]+) ms$", times.inner_text())
+    assert told is not None
+    assert float(told[1]) > 0.0
+    page.locator("#compensate-gain").fill("0.3")
     page.locator("#compensate-high").fill("0.5")
     dim = ltcl.compensate(T, picture, gain=0.3, bounds=(0, 0.5))
     shows(page, "compensate-pattern", dim.pattern)
     with page.expect_download() as download:
-        page.locator("#compensate-downloads a").first.click()
+        page.locator("#compensate-downloads button").first.click()
     download.value.save_as(tmp_path / "pattern.exr")
     np.testing.assert_allclose(ltcl.images.read(tmp_path / "pattern.exr"), dim.pattern, atol=2e-3)
 
@@ -622,14 +676,14 @@ def test_server_is_killed_and_started_again(
         page = context.new_page()
         visit(page, viewer, "relight")
         viewer.close()
-        page.wait_for_selector("body[data-state=lost]")
+        page.wait_for_selector(".viewer[data-state=lost]")
         assert "trying again" in page.locator("#banner").inner_text()
         with ltcl.view(T, open_browser=False, port=port):
-            page.wait_for_selector("body[data-state=ready]")
+            page.wait_for_selector(".viewer[data-state=ready]")
             assert page.locator("#banner").is_hidden()
             page.locator("#relight-fill").click()
             shows(page, "relight-seen", T @ np.ones(T.grid, np.float32))
-        page.wait_for_selector("body[data-state=lost]")
+        page.wait_for_selector(".viewer[data-state=lost]")
         (tmp_path / f"viewer-{port}").unlink()
         with ltcl.view(T, open_browser=False, port=port):
             page.get_by_text("another address").wait_for()
@@ -643,7 +697,7 @@ def test_a_page_too_many_is_told_so_and_comes_in_later(
     second_page.goto(viewer.url)
     second_page.get_by_text("1 pages are open here").wait_for()
     page.goto("about:blank")
-    second_page.wait_for_selector("body[data-state=ready]")
+    second_page.wait_for_selector(".viewer[data-state=ready]")
     assert second_page.locator("#banner").is_hidden()
 
 
@@ -812,7 +866,7 @@ def test_nothing_serious_stands_in_the_way_of_access(
         page = context.new_page()
         for view in VIEWS:
             visit(page, viewer, view)
-            page.wait_for_selector("body[data-state=ready]")
+            page.wait_for_selector(".viewer[data-state=ready]")
             violations = axe.run(page).response["violations"]
             assert [
                 each["id"] for each in violations if each["impact"] in ("serious", "critical")
@@ -834,5 +888,5 @@ def test_the_file_that_the_browser_is_given_leads_to_the_page(
         page = browser.new_page()
         page.goto(arguments[0])
         page.wait_for_url(f"{viewer.url}**")
-        page.wait_for_selector("body[data-state=ready]")
+        page.wait_for_selector(".viewer[data-state=ready]")
         page.close()

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import ltcl
+from ltcl.acquisition.projectors import combine_scans
 from ltcl.viewer.answers import ViewerScene
 from tests.transport import projectors
 from tests.transport.projectors import CAMERA
@@ -35,6 +38,29 @@ def test_patterns_stand_side_by_side(scene):
     _, shown = scene.answer("relight", {"picture": 1}, ignore)
     for pattern in T.split(shown["pattern"]):
         assert pattern.min() > 0.15
+
+
+def test_projectors_have_numbers_where_they_have_no_names(scene):
+    assert scene.hello()["projectors"] == [
+        {"name": "projector 1", "grid": (10, 13), "left": 0},
+        {"name": "projector 2", "grid": (12, 14), "left": 13},
+    ]
+
+
+def test_scans_bring_names_and_codes(room_of_two, tmp_path):
+    stores = [room_of_two / "left.zarr", room_of_two / "right.zarr"]
+    ltcl.save(tmp_path / "both.npz", combine_scans(stores))
+    T: Any = ltcl.load(tmp_path / "both.npz")
+    scene = ViewerScene(T, "room", {"grey": np.full(T.camera_grid, 0.15)}, None)
+    assert [projector["name"] for projector in scene.hello()["projectors"]] == ["left", "right"]
+    codes = scene.codes(scene.pattern, 1.0)
+    # Each projector has 13 x 16 pixels of its own.
+    assert codes.shape == (13, 32)
+    black = T.black_pictures()[0]
+    for question in ("compensate", "adjust"):
+        _, shown = scene.answer(question, {"picture": 1, "gain": 1.0}, ignore)
+        expected = T @ shown["pattern"] + black
+        np.testing.assert_allclose(shown["appearance"], expected, rtol=1e-4)
 
 
 def test_bounces_and_probes(scene):

@@ -14,6 +14,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 import ltcl
-from ltcl.viewer import client, server
+from ltcl.viewer import client, messages, server
 from tests.viewer.page import Page, question
 
 pytestmark = pytest.mark.slow
@@ -284,7 +285,6 @@ def png(w: int, h: int) -> bytes:
 
 
 def test_uploads(running):
-    origin = f"Origin: http://{running.host}\r\n"
     bmp = b"BM" + struct.pack(
         "<IHHIIiiHHIIiiII", 200, 0, 0, 54, 40, 60_000, 60_000, 1, 24, 0, 0, 0, 0, 0, 0
     )
@@ -300,41 +300,34 @@ def test_uploads(running):
         "g.tif": b"II*\0\xff\xff\xff\xff",
         "h.jpg": b"\xff\xd8\xff\xe0" + bytes(99),
     }
-    names = [
+    names: list[Any] = [
+        None,
+        5,
+        ["a.png"],
         "",
         "a",
         "a.exe",
         "a.svg",
-        "a.png%00.exe",
+        "a.png\0.exe",
         "..",
         "../../a",
         "a.npz",
         "a.html",
         "a.py",
         "/etc/passwd",
-        "a" * 4000,
+        "a" * 400 + ".png",
     ]
     contents = [*files.items(), *((name, png(1, 1)) for name in names)]
-    for name, content in contents:
-        more = f"{origin}Content-Length: {len(content)}\r\n\r\n"
-        head = (
-            f"POST /{running.token}/picture?name={name} HTTP/1.1\r\nHost: {running.host}\r\n{more}"
-        )
-        response = running.raw(head.encode() + content)
-        assert status(response) == 400, (name, response)
-    for length in (str((64 << 20) + 1), "9" * 30, "-1", "x", "1, 2", "", "0x10"):
-        more = f"{origin}Content-Length: {length}\r\n"
-        assert (
-            status(
-                running.request(f"/{running.token}/picture?name=a.png", more=more, method="POST")
-            )
-            == 400
-        )
-    chunked = f"{origin}Transfer-Encoding: chunked\r\n"
-    assert (
-        status(running.request(f"/{running.token}/picture?name=a.png", more=chunked, method="POST"))
-        == 400
-    )
+    with Page(running.url) as page:
+        for name, content in contents:
+            answer = page.upload(name, content)
+            assert [*answer] == ["error"], (name, answer)
+            assert " object at " not in answer["error"]
+        picture = page.ask("upload", {"content": np.zeros((1, 9, 1), np.uint8)}, name="a.png")
+        assert "content is" in picture["error"]
+        assert "content" in page.ask("upload", name="a.png")["error"]
+    with Page(running.url) as page, pytest.raises(ConnectionClosed):
+        page.upload("a.png", bytes(messages.LARGEST_FILE + messages.LARGEST_HEADER))
 
 
 def frames() -> list[str | bytes]:

@@ -16,11 +16,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
-from urllib.error import HTTPError
-from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
 
 import ltcl
 from ltcl import errors, images
@@ -242,13 +241,11 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
     ):
         assert rigs.show(tmp_path, window, advance, photograph) == 3
         window.wait(1.0)
-        headers = {"Origin": window.url.rsplit("/", 2)[0]}
-        for path, data, code in (
-            ("result/report.json", None, 404),
-            ("picture?name=a.png", b"", 400),
-        ):
-            with pytest.raises(HTTPError, match=str(code)):  # a window has neither
-                urlopen(Request(f"{window.url}{path}", data, headers))  # noqa: S310
+        for do in ("result", "upload"):
+            with Page(window.url) as page:
+                page.send(do, name="report.json")
+                with pytest.raises(ConnectionClosed, match="do is"):  # a window has neither
+                    _ = [page.next() for _ in range(100)]
         window.close()
     for codes, pattern in zip(shown, patterns, strict=True):
         np.testing.assert_array_equal(codes[..., 0], np.rint(255 * pattern))
@@ -282,6 +279,9 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(
     assert pace.latency < slow + 1.0
     assert pace.dropped > 5 or not slow
     assert "dropped" in window.title
+    # What computing takes is told with it.
+    assert 0.0 < pace.computing_p50 <= pace.computing_p99
+    assert window.title.endswith(f"p99 {1e3 * pace.computing_p99:.1f} ms")
 
 
 def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) -> None:
@@ -388,8 +388,11 @@ def test_pages_find_the_next_viewer_on_a_port_that_was_named(
 
 
 @contextmanager
-def running(command: str, *arguments: Any) -> Iterator[Any]:
-    """A command in a process of its own, which has said its URL; what it prints is checked."""
+def running(command: str, *arguments: Any, reports: list[Any] | None = None) -> Iterator[Any]:
+    """A command in a process of its own, which has said its URL; what it prints is checked.
+
+    Its report is appended to `reports`.
+    """
     words = [sys.executable, "-m", "ltcl", command, *arguments, "--json"]
     pipes: dict[str, Any] = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, env=os.environ | {"BROWSER": "true"}, **pipes) as process:
@@ -397,7 +400,10 @@ def running(command: str, *arguments: Any) -> Iterator[Any]:
         assert process.stdout is not None
         yield process, process.stderr.readline().split()[0]
         assert process.wait(PATIENCE) == 0
-        json_schema.check([command], json.load(process.stdout))
+        report = json.load(process.stdout)
+        json_schema.check([command], report)
+        if reports is not None:
+            reports.append(report)
 
 
 def film(folder: Path) -> Path:
@@ -409,13 +415,28 @@ def film(folder: Path) -> Path:
 @pytest.mark.rare
 def test_play_and_show_run(tmp_path: Path) -> None:
     ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
+    reports: list[Any] = []
     for command, *more in (["play", tmp_path / "T.npz", "--no-browser"], ["show", "--browser"]):
         with (
-            running(command, film(tmp_path / "film"), *more) as (_, url),
+            running(command, film(tmp_path / "film"), *more, reports=reports) as (_, url),
             looking(url, keys=True) as shown,
         ):
             pass
         assert len(shown) >= 2
+    played, _ = reports
+    assert played["shown"] >= 2
+    assert 0.0 < played["computing_p50"] <= played["computing_p99"]
+
+
+@pytest.mark.slow
+def test_view_combines_the_scans_of_several_projectors(room_of_two: Path, tmp_path: Path) -> None:
+    images.write(tmp_path / "wanted.png", np.full((6, 12), 0.3))
+    words = (room_of_two, tmp_path / "wanted.png", "--no-browser")
+    with running("view", *words) as (process, url), Page(url) as page:
+        assert [projector["name"] for projector in page.hello["projectors"]] == ["left", "right"]
+        assert page.hello["grid"] == [6, 24]
+        assert page.ask("pictures")["pictures"] == [{"picture": 1, "name": "wanted.png"}]
+        process.send_signal(signal.SIGINT)
 
 
 @pytest.mark.rare

@@ -28,7 +28,7 @@ from websockets.exceptions import ConnectionClosed
 
 import ltcl
 from ltcl import errors, images
-from ltcl.viewer import answers
+from ltcl.viewer import answers, pictures
 from tests.viewer.page import Page
 
 ROUNDING = 2.0**-20  # of the largest value: float32 sums
@@ -158,6 +158,7 @@ def test_a_compensation_and_its_downloads(colour, tmp_path):
     pattern = 0.2 + 0.6 * random.random((*colour.grid, 3))
     desired = (colour @ pattern).astype(np.float32)
     with viewing(colour, {"wanted": desired}) as page:
+        assert "compensated" in page.ask("result", name="pattern.exr")["error"]
         reply = page.ask("compensate", picture=1)
         exact = np.linalg.solve(whole(colour), desired.ravel())
         np.testing.assert_allclose(reply["pattern"].ravel(), exact, atol=0.02)
@@ -172,7 +173,6 @@ def test_a_compensation_and_its_downloads(colour, tmp_path):
         assert reply["products"] == 0
         assert reply["seconds"] > 0
         assert reply["residuals"][-1] <= 1e-2
-        files = {}
         for name in (
             "pattern.exr",
             "appearance.exr",
@@ -181,11 +181,7 @@ def test_a_compensation_and_its_downloads(colour, tmp_path):
             "codes.png",
             "report.json",
         ):
-            with urllib.request.urlopen(f"{page.url}result/{name}") as response:  # noqa: S310
-                (tmp_path / name).write_bytes(response.read())
-                files[name] = response.headers["Content-Type"]
-        assert files["pattern.exr"] == "image/x-exr"
-        assert files["codes.png"] == "image/png"
+            (tmp_path / name).write_bytes(page.ask("result", name=name)["content"])
         light = images.read(tmp_path / "pattern.exr")
         near(reply["pattern"], light)
         codes = np.rint(255 * images.to_srgb(light))
@@ -211,15 +207,6 @@ def test_a_T_without_first_bounce_compensates_but_does_not_separate(device):
         assert page.ask("compensate", picture=1)["error"] < 0.02
 
 
-def upload(page: Page, name: str, content: bytes) -> dict[str, Any]:
-    headers = {"Origin": page.origin}
-    request = urllib.request.Request(f"{page.url}picture?name={name}", content, headers)  # noqa: S310
-    try:
-        return json.load(urllib.request.urlopen(request))  # noqa: S310
-    except urllib.error.HTTPError as error:
-        return json.load(error)
-
-
 def png(codes: np.ndarray) -> bytes:
     Image.fromarray(codes).save(file := io.BytesIO(), "PNG")
     return file.getvalue()
@@ -228,14 +215,14 @@ def png(codes: np.ndarray) -> bytes:
 def test_uploads_are_relit_and_wrong_ones_refused(colour):
     codes = random.integers(0, 256, (*colour.grid, 3), dtype=np.uint8)
     with viewing(colour) as page:
-        told = upload(page, "a%20b.png", png(codes))
+        told = page.upload("a b.png", png(codes))
         assert told == {"picture": 1, "name": "a b.png", "shape": [*codes.shape]}
         assert page.ask("pictures")["pictures"] == [{"picture": 1, "name": "a b.png"}]
         near(
             page.ask("relight", picture=1)["picture"],
             whole(colour) @ images.from_srgb(codes / 255.0).ravel(),
         )
-        assert upload(page, "large.png", png(np.zeros((40, 50), np.uint8)))["shape"] == [40, 50, 1]
+        assert page.upload("large.png", png(np.zeros((40, 50), np.uint8)))["shape"] == [40, 50, 1]
         assert page.ask("relight", picture=2)["picture"].max() == 0
         for name, content in {
             "a.txt": b"text",
@@ -243,13 +230,13 @@ def test_uploads_are_relit_and_wrong_ones_refused(colour):
             "a.exr": b"text",
             "": b"x",
         }.items():
-            (wrong,) = upload(page, name, content).items()
+            (wrong,) = page.upload(name, content).items()
             assert wrong[0] == "error"
             assert " object at " not in wrong[1]
         for number in range(3, 25):
-            upload(page, f"{number}.png", png(codes))
-        pictures = page.ask("pictures")["pictures"]
-        assert [each["picture"] for each in pictures] == list(range(25 - answers.MAX_UPLOADS, 25))
+            page.upload(f"{number}.png", png(codes))
+        kept = page.ask("pictures")["pictures"]
+        assert [each["picture"] for each in kept] == list(range(25 - pictures.MAX_UPLOADS, 25))
 
 
 def test_pictures_of_other_proportions_are_cropped_letterboxed_or_stretched(colour):
@@ -262,15 +249,15 @@ def test_pictures_of_other_proportions_are_cropped_letterboxed_or_stretched(colo
     between_bars[h // 4 : h // 4 + h // 2] = quarters
     expected = {"crop": light[:, w // 2 : w // 2 + w], "letterbox": between_bars, "stretch": halves}
     with viewing(colour) as page:
-        upload(page, "wide.png", png(codes))
+        page.upload("wide.png", png(codes))
         for how, on_grid in expected.items():
             reply = page.ask("relight", picture=1, resize=how)
             near(reply["pattern"], on_grid)
             near(reply["picture"], whole(colour) @ on_grid.ravel())
             compensation = page.ask("compensate", picture=1, resize=how)
             near(compensation["target"], on_grid)
-            with urllib.request.urlopen(f"{page.url}result/report.json") as response:  # noqa: S310
-                assert json.load(response)["resize"] == how
+            content = page.ask("result", name="report.json")["content"]
+            assert json.loads(content)["resize"] == how
             parts = page.ask("bounces", picture=1, resize=how, count=1)
             near(parts["direct"] + parts["bounce_1"] + parts["rest"], on_grid)
         near(page.ask("relight", picture=1)["pattern"], expected["crop"])
@@ -482,13 +469,25 @@ def test_the_command_runs_until_ctrl_c(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_command_names_the_address_behind_a_proxy(tmp_path):
+    ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(6) / 2, (2, 3)))
+    words = [sys.executable, "-m", "ltcl", "view", tmp_path / "T.npz", "--no-browser"]
+    words += ["--origin", "http://localhost:9000"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("http://localhost:9000/")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+
+
+@pytest.mark.slow
 def test_without_the_extra_ltcl_imports_and_says_how_to_get_it():
     code = "import sys; sys.modules['starlette'] = None; import ltcl, numpy; "
     code += "ltcl.view(ltcl.Transport(numpy.eye(2), (1, 2)))"
     words = [sys.executable, "-c", code]
     folder = Path(ltcl.__file__).parents[1]
     run = subprocess.run(words, capture_output=True, text=True, cwd=folder)
-    assert run.stderr.splitlines()[-1].endswith("pip install 'ltcl[view]'")
+    assert run.stderr.splitlines()[-1].endswith('pip install "ltcl[view]"')
 
 
 def test_pattern_while_a_slider_moves(device) -> None:

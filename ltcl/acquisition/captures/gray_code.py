@@ -31,11 +31,13 @@ from ltcl.images.encoding import ENCODINGS, Encoding, to_linear
 
 # Share of full scale from which a pixel is saturated.
 SATURATION_LEVEL = 0.999
+# Share of decoded camera pixels that may lie beyond the projector, by errors of single bits.
+MAX_BEYOND = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Capture:
-    """What photographs of Gray code tell.
+    """The map and the light that photographs of Gray code tell.
 
     Attributes
     ----------
@@ -91,8 +93,8 @@ def import_gray_code(
     FileError, AcquisitionError
         A photograph is missing, or cannot be read.
     InputError
-        The order is not valid, photographs have different sizes, white is as dark as black, or no
-        pixel is decoded.
+        The order is not valid, photographs have different sizes, white is as dark as black, no
+        pixel is decoded, or more than a tenth of the decoded pixels lie beyond the grid.
 
     Examples
     --------
@@ -116,13 +118,15 @@ def import_gray_code(
     reader = _Reader(files, encoding, order.has_inverses)
     codes = order.codes(grid)
     photographs = reader.read_all()
-    cells = (codes[1].cells, codes[0].cells)
-    mapping = decode(photographs, cells, levels=reader.levels)
-    mapping = _on_pixels(mapping, codes, grid)
-    if not mapping.valid.any():
+    # All numbers that the stripes can tell, so that those beyond the projector are seen.
+    cells = (_code_length(codes[1]), _code_length(codes[0]))
+    decoded = decode(photographs, cells, levels=reader.levels)
+    mapping = _on_pixels(decoded, codes, grid)
+    beyond = 1.0 - np.count_nonzero(mapping.valid) / max(np.count_nonzero(decoded.valid), 1)
+    if beyond > MAX_BEYOND:
         raise InputError(
-            f"{folder}: all decoded pixels lie beyond {height} x {width}; grid must be that of the "
-            "projector"
+            f"{folder}: {beyond:.0%} of decoded pixels lie beyond {height} x {width}; grid must be "
+            "that of the projector, height first, and order that of the photographs"
         )
     resampling = Resampling.of(mapping)
     direct = None
@@ -237,6 +241,11 @@ class _Reader:
         if path.suffix.lower() in RAW_SUFFIXES:
             encoding = "linear"
         return to_linear(codes, encoding)
+
+
+def _code_length(code: AxisCode) -> int:
+    """The numbers that the bits of a code can tell."""
+    return 1 << (code.cells - 1).bit_length()
 
 
 def _on_pixels(

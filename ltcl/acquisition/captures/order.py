@@ -94,7 +94,7 @@ class AxisCode:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotographOrder:
-    """Which file of a folder is the photograph of which pattern.
+    """The order of photographs in a folder: which file shows which pattern.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class PhotographOrder:
         """
         pictures = list_photographs(folder)
         columns, rows = self.codes(grid)
-        found: dict[str, list[Path]] = {}
+        files_of_series: dict[str, list[Path]] = {}
         ends: dict[str, tuple[int, int]] = {}
         for kind in SERIES:
             series = getattr(self, kind)
@@ -222,17 +222,17 @@ class PhotographOrder:
             first = _first_number(kind, series, ends)
             numbers = range(first, first + bits * series.step, series.step)
             ends[kind] = (first, first + (bits - 1) * series.step)
-            found[kind] = []
+            files_of_series[kind] = []
             for number in numbers:
                 place = number if series.name is None else series.name.format(n=number)
-                found[kind].append(_find(folder, pictures, f"{kind} {number}", place))
+                files_of_series[kind].append(_find(folder, pictures, f"{kind} {number}", place))
             if not self.coarsest_first:
-                found[kind].reverse()
+                files_of_series[kind].reverse()
         for kind in SINGLES:
             place = getattr(self, kind)
             if place is not None:
-                found[kind] = [_find(folder, pictures, kind, place)]
-        return found
+                files_of_series[kind] = [_find(folder, pictures, kind, place)]
+        return files_of_series
 
 
 def list_photographs(folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.estimation.hats import HatLevels, light_of_scales
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.regression import (
     PRIOR_STEP,
@@ -74,8 +75,9 @@ class Estimator:
         self._progress = progress
         self._done = 0
         # Rows that are solved: some in each round that learns the prior, and all.
-        some, _ = self.windows.every(PRIOR_STEP)
-        self._expected = ROUNDS * len(some.nodes) + solves * len(self.windows.nodes)
+        sparse_windows, _ = self.windows.every(PRIOR_STEP)
+        prior_rows = ROUNDS * len(sparse_windows.nodes)
+        self._expected = prior_rows + solves * len(self.windows.nodes)
 
     def learn(self, pairs: Pairs) -> None:
         """Learn the priors, and the mixing of the colours if it is asked for; solve the rows."""
@@ -93,9 +95,9 @@ class Estimator:
         self.solve(pairs)
         if not self.finds_mixing:
             return
-        found = self._find_mixing(pairs)
-        change = np.abs(found - self.mixing).max()
-        self.mixing = found
+        mixing = self._find_mixing(pairs)
+        change = np.abs(mixing - self.mixing).max()
+        self.mixing = mixing
         if change > NOTABLE_MIXING:
             self.solve(pairs)
             self.mixing = self._find_mixing(pairs)
@@ -137,14 +139,15 @@ class Estimator:
     @property
     def noise(self) -> float:
         """The median of what rows leave of a photograph, relative to the light of the pixel."""
-        return float(np.sqrt(np.median([prior.noise for prior in self.priors])))
+        variances = [prior.noise for prior in self.priors]
+        return float(np.sqrt(np.median(variances)))
 
-    def scale_of_variance(self, patterns: np.ndarray, left: np.ndarray) -> np.ndarray:
+    def scale_of_variance(self, patterns: np.ndarray, residual_squares: np.ndarray) -> np.ndarray:
         """Factors of the variances of all entries, under which T p errs as it did, (channels,).
 
-        `left` are the squares that T left of photographs of patterns, summed up over them and all
-        pixels, (channels,). Errors of entries in a row go together, which their variances do not
-        tell.
+        `residual_squares` are the squares that T left of photographs of patterns, summed up over
+        them and all pixels, (channels,). Errors of entries in a row go together, which their
+        variances do not tell.
         """
         scales = []
         for channel in range(self.channels):
@@ -153,9 +156,21 @@ class Estimator:
             sums = self.W_squared @ squares.T
             expected = (self.variances(channel) @ sums).sum()
             noise = len(patterns) * (prior.noise * prior.light**2).sum()
-            measured = max(left[channel] - noise, 0.0)
+            measured = max(residual_squares[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
+
+    def unknown_light(self) -> np.ndarray:
+        """The variance of the light of each scale and place of the projector, (levels, h, w).
+
+        It is that under a hat of the level around a pixel, for all camera pixels and channels, as
+        much of it as belongs to the pixel.
+        """
+        hats = HatLevels(self.grid)
+        variance = np.zeros(hats.nodes)
+        for channel in range(self.channels):
+            variance += self.variances(channel).sum(axis=0)
+        return light_of_scales(hats, variance)
 
     def own_variance(self) -> np.ndarray:
         """Variances of the light of each pixel's own, (channels, N)."""
@@ -237,7 +252,7 @@ class Estimator:
 
     def _find_mixing(self, pairs: Pairs) -> np.ndarray:
         """The mixing that explains the photographs best, given the rows."""
-        found = np.empty_like(self.mixing)
+        mixing = np.empty_like(self.mixing)
         for channel in range(self.channels):
             C = self.coefficients(channel)
             answers = []
@@ -247,8 +262,8 @@ class Estimator:
             answer = np.stack(answers, axis=1)
             pictures = pairs.photographs[:, :, channel].T.ravel()
             shares = np.linalg.lstsq(answer, pictures, rcond=1e-6)[0]
-            found[channel] = shares / shares.sum()
-        return found
+            mixing[channel] = shares / shares.sum()
+        return mixing
 
     def _count(self, rows: int) -> None:
         """Tell the progress that some rows were solved."""

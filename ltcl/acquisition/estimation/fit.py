@@ -193,7 +193,7 @@ def _check_geometry(geometry: Any, pairs: Pairs) -> str | Correspondence:
 
 
 def _fit(
-    given: Pairs,
+    original_pairs: Pairs,
     *,
     geometry: str | Correspondence,
     mixing: np.ndarray | None,
@@ -201,12 +201,15 @@ def _fit(
     device: Any,
     progress: Callable[[str, int, int], object] | None,
 ) -> Fit:
-    pairs = given
+    pairs = original_pairs
     if geometry == "aligned":
         pairs.check_order()
     else:
-        mapping = geometry if isinstance(geometry, Correspondence) else find_view(pairs)
-        pairs = given.resampled(Resampling.of(mapping))
+        if isinstance(geometry, Correspondence):
+            mapping = geometry
+        else:
+            mapping = find_view(pairs)
+        pairs = pairs.resampled(Resampling.of(mapping))
         pairs.check_order()
     judges = _held_out(len(pairs), held_out)
     is_judge = np.zeros(len(pairs), bool)
@@ -229,11 +232,11 @@ def _fit(
         steady = replace(pairs, photographs=photographs)
         estimator.solve(steady.select(~is_judge))
         explained = estimator.explain(pairs.patterns)
-    left = steady.photographs[judges] - explained[judges]
-    errors = _norms(left) / np.maximum(_norms(steady.photographs[judges]), np.finfo(float).tiny)
+    residual = steady.photographs[judges] - explained[judges]
+    errors = _norms(residual) / np.maximum(_norms(steady.photographs[judges]), np.finfo(float).tiny)
 
     error = float(np.sqrt(np.mean(errors**2)))
-    squares = (left**2).sum(axis=(0, 1))
+    squares = (residual**2).sum(axis=(0, 1))
     scales = estimator.scale_of_variance(pairs.patterns[judges], squares)
 
     # 3. The transport, from all pairs.
@@ -245,7 +248,7 @@ def _fit(
         held_out=judges,
         drift=drift,
         noise=estimator.noise,
-        pairs=given,
+        pairs=original_pairs,
         options={"geometry": geometry, "mixing": mixing, "held_out": held_out, "device": device},
     )
 

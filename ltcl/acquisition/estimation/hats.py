@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.estimation.windows import hat_levels, hats_of_side
+from ltcl.acquisition.estimation.windows import hat_levels, hats_of_side, nearest
 
 
 class HatLevels:
@@ -82,14 +82,27 @@ class HatLevels:
         shares = np.stack([share for _, share in corners], axis=1)
         places = np.arange(0, nodes.size + 1, len(corners))
         shape = (len(numbers), rows * columns)
-        found = scipy.sparse.csr_array((shares.ravel(), nodes.ravel(), places), shape=shape)
-        found.sum_duplicates()
-        return found
+        hats = scipy.sparse.csr_array((shares.ravel(), nodes.ravel(), places), shape=shape)
+        hats.sum_duplicates()
+        return hats
 
     def at_pixels(self, pixels: np.ndarray) -> scipy.sparse.csr_array:
         """The hats of all levels at some pixels, (len(pixels), nodes)."""
         levels = [self.between(level, 0, pixels) for level in range(len(self.sizes))]
         return scipy.sparse.csr_array(scipy.sparse.hstack(levels, format="csr"))
+
+    def by_scale(self, values: np.ndarray) -> np.ndarray:
+        """Values of all nodes, (nodes,), at the pixels: that of the nearest node of each level.
+
+        The result is (levels, h, w) float32.
+        """
+        planes = np.empty((len(self.sizes), *self.grid), np.float32)
+        for level, (rows, columns) in enumerate(self.sizes):
+            of_level = values[self.first[level] : self.first[level + 1]].reshape(rows, columns)
+            down = nearest(np.arange(self.grid[0]), level)
+            across = nearest(np.arange(self.grid[1]), level)
+            planes[level] = of_level[np.ix_(down, across)]
+        return planes
 
     def _sides(self, level: int) -> tuple[Any, Any]:
         return self._all_sides[level]
@@ -102,6 +115,17 @@ class HatLevels:
             across = hats_of_side(self.grid[1], columns, 2**level)
             sides.append((down, across))
         return sides
+
+
+def light_of_scales(hats: HatLevels, variance: np.ndarray) -> np.ndarray:
+    """Variances of light at pixels, (levels, h, w), by those of the coefficients of all nodes.
+
+    A hat of level l has 4^l pixels: its light is its coefficient times that, if all are lit.
+    """
+    planes = hats.by_scale(variance)
+    for level, plane in enumerate(planes):
+        plane *= 4.0**level
+    return planes
 
 
 def _corners(place: np.ndarray, levels: int, count: int) -> list[tuple[np.ndarray, np.ndarray]]:

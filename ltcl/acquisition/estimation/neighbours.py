@@ -121,10 +121,10 @@ def separate(
     chunk = max(CHUNK_NUMBERS // (frames * unknowns), 1)
     # The first round measures the misfit at some pixels.
     step = max(pixels // chunk, 1)
-    some = np.arange(0, pixels, step)
+    sparse_pixels = np.arange(0, pixels, step)
     system = _System(numbers, lit, shares, pictures, variances)
     for _ in range(2):
-        misfit = system.solve(some, misfit).misfit
+        misfit = system.solve(sparse_pixels, misfit).misfit
     for start in range(0, pixels, chunk):
         rows = np.arange(start, min(start + chunk, pixels))
         solution.put(rows, system.solve(rows, misfit))
@@ -139,7 +139,7 @@ def _lit_beside(patterns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Part:
+class _SolvedPixels:
     """The findings for some pixels: D and g (n, 10), variances, surprise (n, frames), misfit."""
 
     values: np.ndarray
@@ -165,7 +165,7 @@ class _System:
         self.pictures = pictures
         self.variances = variances
 
-    def solve(self, rows: np.ndarray, misfit: float) -> _Part:
+    def solve(self, rows: np.ndarray, misfit: float) -> _SolvedPixels:
         """Solve the equations of some pixels, whose pictures differ by `misfit` from the model."""
         white = self.pictures[0, rows].astype(np.float64)
         is_lit = white > CLEAR_SIGMAS * np.sqrt(self.variances[0, rows])
@@ -183,24 +183,24 @@ class _System:
         precision = weighted.transpose(0, 2, 1) @ A + np.diag(1.0 / deviation**2)
         covariance = np.linalg.inv(precision)
         values = (covariance @ (weighted.transpose(0, 2, 1) @ y[:, :, None]))[:, :, 0]
-        left = y - (A @ values[:, :, None])[:, :, 0]
+        residual = y - (A @ values[:, :, None])[:, :, 0]
         # Part of each picture that the fit takes up: the diagonal of the hat matrix.
         taken = ((A @ covariance) * weighted).sum(axis=2)
-        surprise = left**2 / (noise * np.maximum(1.0 - taken, 1e-9))
+        surprise = residual**2 / (noise * np.maximum(1.0 - taken, 1e-9))
         is_known = (noise < UNKNOWN_NOISE) & is_lit[:, None]
         surprise = np.where(is_known, np.minimum(surprise, MAX_SURPRISE), 0.0)
         freedom = np.where(is_known, 1.0 - taken, 0.0).sum()
         camera_noise = np.where(is_known, (1.0 - taken) * (noise - misfit**2), 0.0).sum()
-        squares = np.where(is_known, left**2, 0.0).sum()
-        found = max(squares - camera_noise, 0.0) / max(freedom, 1.0)
+        squares = np.where(is_known, residual**2, 0.0).sum()
+        excess = max(squares - camera_noise, 0.0) / max(freedom, 1.0)
         is_there = np.ones(values.shape, bool)
         is_there[:, :-1] = beside >= 0
         is_there &= is_lit[:, None]
-        return _Part(
+        return _SolvedPixels(
             values=np.where(is_there, values * unit, 0.0),
             variance=np.where(is_there, np.diagonal(covariance, axis1=1, axis2=2) * unit**2, 0.0),
             surprise=surprise,
-            misfit=max(found**0.5, LEAST_MISFIT),
+            misfit=max(excess**0.5, LEAST_MISFIT),
         )
 
 
@@ -212,11 +212,11 @@ class _Solution:
         self.variance = np.zeros((pixels, len(OFFSETS)), np.float32)
         self.surprise = np.zeros(frames)
 
-    def put(self, rows: np.ndarray, part: _Part) -> None:
+    def put(self, rows: np.ndarray, solved: _SolvedPixels) -> None:
         """Take the solution of some pixels."""
-        self.values[rows] = part.values
-        self.variance[rows] = part.variance[:, :-1]
-        self.surprise += part.surprise.sum(axis=0)
+        self.values[rows] = solved.values
+        self.variance[rows] = solved.variance[:, :-1]
+        self.surprise += solved.surprise.sum(axis=0)
 
     def light(self) -> DirectLight:
         """The solution of all pixels."""

@@ -86,12 +86,14 @@ class Pairs:
         return self.photographs.shape[2]
 
     def select(self, chosen: np.ndarray | slice) -> Self:
-        """Some of the pairs; a slice copies nothing."""
-        variance = None if self.variance is None else _some(self.variance, chosen)
+        """The chosen pairs; a slice copies nothing."""
+        variance = None
+        if self.variance is not None:
+            variance = _select_frames(self.variance, chosen)
         return replace(
             self,
-            patterns=_some(self.patterns, chosen),
-            photographs=_some(self.photographs, chosen),
+            patterns=_select_frames(self.patterns, chosen),
+            photographs=_select_frames(self.photographs, chosen),
             variance=variance,
         )
 
@@ -193,17 +195,17 @@ class Pairs:
         return np.linspace(0, pixels - 1, min(pixels, COMPARED_PIXELS)).astype(int)
 
 
-def _some(frames: np.ndarray, chosen: np.ndarray | slice) -> np.ndarray:
-    """Some frames (frames, N, channels), in a temporary file if they are large."""
+def _select_frames(frames: np.ndarray, chosen: np.ndarray | slice) -> np.ndarray:
+    """The chosen frames of (frames, N, channels), in a temporary file if they are large."""
     if isinstance(chosen, slice):
         return frames[chosen]
     is_grey = frames.strides[2] == 0
     planes = frames[:, :, :1] if is_grey else frames
     numbers = np.arange(len(frames))[chosen]
-    some = scratch_array((len(numbers), *planes.shape[1:]), frames.dtype)
+    selected = scratch_array((len(numbers), *planes.shape[1:]), frames.dtype)
     for place, number in enumerate(numbers):
-        some[place] = planes[number]
-    return np.broadcast_to(some, (len(numbers), *frames.shape[1:]))
+        selected[place] = planes[number]
+    return np.broadcast_to(selected, (len(numbers), *frames.shape[1:]))
 
 
 def gains(photographs: np.ndarray, explained: np.ndarray) -> np.ndarray:

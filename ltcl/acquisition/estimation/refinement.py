@@ -32,7 +32,7 @@ from ltcl.acquisition.estimation.estimator import (
     LEAST_SCALE,
     Estimator,
 )
-from ltcl.acquisition.estimation.hats import HatLevels
+from ltcl.acquisition.estimation.hats import HatLevels, light_of_scales
 from ltcl.acquisition.estimation.near import (
     NearFunctions,
     NearPrior,
@@ -174,7 +174,7 @@ class RefinedEstimator:
 
     @property
     def noise(self) -> float:
-        """As `Estimator.noise`, of the pixels."""
+        """The noise of the pixels, as in `Estimator.noise`."""
         return float(np.sqrt(np.median(self.stages[-1].noise)))
 
     def learn(self, pairs: Pairs) -> None:
@@ -203,8 +203,8 @@ class RefinedEstimator:
             explained[:, :, channel] = (self.light[:, channel, None] * shares).T
         return explained
 
-    def scale_of_variance(self, patterns: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """As `Estimator.scale_of_variance`."""
+    def scale_of_variance(self, patterns: np.ndarray, residual_squares: np.ndarray) -> np.ndarray:
+        """The same as `Estimator.scale_of_variance`."""
         scales = []
         for channel in range(self.channels):
             squares = self._pictures(patterns, channel) ** 2
@@ -213,9 +213,19 @@ class RefinedEstimator:
             light = self.light[:, channel] ** 2
             expected = (light[:, None] * shares).sum()
             noise = len(patterns) * (self.stages[-1].noise * light).sum()
-            measured = max(left[channel] - noise, 0.0)
+            measured = max(residual_squares[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
         return np.array(scales)
+
+    def unknown_light(self) -> np.ndarray:
+        """The same as `Estimator.unknown_light`; rows of a stage are summed under its hats."""
+        variance = np.zeros(self.hats.nodes)
+        for channel in range(self.channels):
+            light = self.light[:, channel].reshape(self.grid) ** 2
+            for stage in self.stages:
+                of_rows = self.hats.sums(stage.level, light).ravel()
+                variance += stage.variance[channel].T @ of_rows
+        return light_of_scales(self.hats, variance)
 
     def own_variance(self) -> np.ndarray:
         """Variances of the light of each pixel's own, (channels, N)."""
@@ -318,7 +328,9 @@ class RefinedEstimator:
     def _alike_channels(self, patterns: np.ndarray) -> list[list[int]]:
         """Channels that see the same patterns: all, if patterns are grey."""
         channels = list(range(self.channels))
-        return [channels] if _are_grey(patterns) else [[channel] for channel in channels]
+        if _are_grey(patterns):
+            return [channels]
+        return [[channel] for channel in channels]
 
     def _solve_near(self, pairs: Pairs, level: int, channels: list[int]) -> Stage:
         """The rows of some channels at the nodes of a level; coarser stages are solved."""
@@ -375,7 +387,8 @@ class RefinedEstimator:
         Channels answer to the patterns of `near` times their factors.
         """
         count = self.hats.nodes_of(level)
-        collected = [_Rows((count, self.hats.nodes)) for _ in factors]
+        most = len(near.group)
+        collected = [_Rows((count, self.hats.nodes), most) for _ in factors]
         noise = np.empty(count)
 
         def solve(numbers: np.ndarray) -> _Solved:
@@ -521,17 +534,16 @@ class RefinedEstimator:
 
     def _core(self, channel: int) -> scipy.sparse.csr_array:
         """K of all stages, (nodes, nodes), less the identity: T - I = diag(w) W^T K W."""
-        pixels: Any = self.stages[-1].mean[channel].copy()
-        is_own = pixels.indices == np.repeat(np.arange(self.pixels), np.diff(pixels.indptr))
-        pixels.data[is_own] -= 1.0 / self.light[:, channel]
         by_level = {stage.level: stage.mean[channel] for stage in self.stages}
-        by_level[0] = pixels
         blocks = []
         for level in range(len(self.hats.sizes)):
             shape = (self.hats.nodes_of(level), self.hats.nodes)
             block = by_level.get(level)
             blocks.append(scipy.sparse.csr_array(shape) if block is None else block)
-        core = scipy.sparse.csr_array(scipy.sparse.vstack(blocks, format="csr"))
+        core = _stacked(blocks)
+        # The first rows are those of the pixels, and the first number of each is its own.
+        own = core.indptr[: self.pixels]
+        core.data[own] -= 1.0 / self.light[:, channel]
         core.sort_indices()
         return core
 
@@ -547,6 +559,24 @@ class RefinedEstimator:
         self._done += rows
         if self._progress is not None:
             self._progress("fit", self._done, max(self._done, self._total))
+
+
+def _stacked(blocks: list[Any]) -> scipy.sparse.csr_array:
+    """Matrices of as many columns one above the other, in temporary files if they are large."""
+    entries = sum(block.nnz for block in blocks)
+    data = scratch_array((entries,), np.float32)
+    indices = scratch_array((entries,), np.int32)
+    ends = [np.zeros(1, np.int32)]
+    start = 0
+    for block in blocks:
+        stop = start + block.nnz
+        data[start:stop] = block.data
+        indices[start:stop] = block.indices
+        ends.append(block.indptr[1:] + np.int32(start))
+        start = stop
+    rows = sum(block.shape[0] for block in blocks)
+    shape = (rows, blocks[0].shape[1])
+    return scipy.sparse.csr_array((data, indices, np.concatenate(ends)), shape=shape)
 
 
 class _Photographs:
@@ -578,33 +608,37 @@ class _Photographs:
 
 
 class _Rows:
-    """Collects the coefficients of rows and their variances, chunk by chunk."""
+    """Collects the coefficients of rows and their variances, chunk by chunk.
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    A row has `most` at most. Many stand in temporary files, whose unused ends take no place.
+    """
+
+    def __init__(self, shape: tuple[int, int], most: int) -> None:
         self._shape = shape
         self._counts: list[np.ndarray] = [np.zeros(1, int)]
-        self._columns: list[np.ndarray] = []
-        self._means: list[np.ndarray] = []
-        self._variances: list[np.ndarray] = []
+        self._end = 0
+        self._columns = scratch_array((shape[0] * most,), np.int32)
+        self._mean = scratch_array((shape[0] * most,), np.float32)
+        self._variance = scratch_array((shape[0] * most,), np.float32)
 
     def add(
         self, columns: np.ndarray, matters: np.ndarray, mean: np.ndarray, variance: np.ndarray
     ) -> None:
         """Add the next rows: values (rows, q) at columns, as far as they matter."""
-        self._counts.append(np.count_nonzero(matters, axis=1))
-        self._columns.append(columns[matters].astype(np.int32))
-        self._means.append(mean[matters].astype(np.float32))
-        self._variances.append(variance[matters].astype(np.float32))
+        counts = np.count_nonzero(matters, axis=1)
+        self._counts.append(counts)
+        added = slice(self._end, self._end + counts.sum())
+        self._columns[added] = columns[matters]
+        self._mean[added] = mean[matters]
+        self._variance[added] = variance[matters]
+        self._end = added.stop
 
     def matrices(self) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
         """The coefficients and their variances, which share their pattern."""
         ends = np.cumsum(np.concatenate(self._counts)).astype(np.int32)
-        columns = np.concatenate(self._columns)
-        self._columns.clear()
-        mean = np.concatenate(self._means)
-        self._means.clear()
-        variance = np.concatenate(self._variances)
-        self._variances.clear()
+        columns = self._columns[: self._end]
+        mean = self._mean[: self._end]
+        variance = self._variance[: self._end]
         return (
             scipy.sparse.csr_array((mean, columns, ends), shape=self._shape),
             scipy.sparse.csr_array((variance, columns, ends), shape=self._shape),

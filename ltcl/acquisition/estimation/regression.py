@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.ndimage
+import scipy  # its subpackage ndimage is loaded at the first use
 
 from ltcl.acquisition.estimation.windows import Windows
 
@@ -94,9 +94,9 @@ class Foretold:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Solution:
-    """Some rows, `part` of all, and the pictures that others foretell there."""
+    """A chunk of rows, its slice of all, and the pictures that others foretell there."""
 
-    part: slice
+    chunk: slice
     rows: Rows
     foretold: Foretold
 
@@ -115,19 +115,19 @@ def learn_prior(
     `variance` is that of the pictures by the noise of the camera, if it is known; `progress` is
     called with the number of rows that were solved since its last call.
     """
-    some, chosen = windows.every(PRIOR_STEP)
-    prior = Prior.first(some, light[chosen])
-    variance_of_some = None if variance is None else variance[chosen]
+    sparse_windows, chosen = windows.every(PRIOR_STEP)
+    prior = Prior.first(sparse_windows, light[chosen])
+    chosen_variance = None if variance is None else variance[chosen]
     for _ in range(ROUNDS):
-        rows = solve_rows(some, sums, pictures[chosen], prior, progress, variance_of_some)
-        prior = _more_likely(some, rows, prior)
+        rows = solve_rows(sparse_windows, sums, pictures[chosen], prior, progress, chosen_variance)
+        prior = _more_likely(sparse_windows, rows, prior)
     places = np.indices(windows.grid).reshape(2, -1) / PRIOR_STEP
-    groups = prior.coefficients.T.reshape(-1, *some.grid)
+    groups = prior.coefficients.T.reshape(-1, *sparse_windows.grid)
     coefficients = [between(group, places) for group in groups]
     return Prior(
         light=light,
         coefficients=np.stack(coefficients, axis=1),
-        noise=between(prior.noise.reshape(some.grid), places),
+        noise=between(prior.noise.reshape(sparse_windows.grid), places),
     )
 
 
@@ -142,10 +142,10 @@ def solve_rows(
     """The rows of T, given a prior; the arguments are those of `learn_prior`."""
     shape = windows.nodes.shape
     rows = Rows(mean=np.zeros(shape), variance=np.zeros(shape), residual=np.zeros(len(prior.light)))
-    for solution in _solve_in_parts(windows, sums, pictures, prior, progress, variance):
-        rows.mean[solution.part] = solution.rows.mean
-        rows.variance[solution.part] = solution.rows.variance
-        rows.residual[solution.part] = solution.rows.residual
+    for solution in _solve_in_chunks(windows, sums, pictures, prior, progress, variance):
+        rows.mean[solution.chunk] = solution.rows.mean
+        rows.variance[solution.chunk] = solution.rows.variance
+        rows.residual[solution.chunk] = solution.rows.residual
     return rows
 
 
@@ -159,13 +159,13 @@ def foretell(
 ) -> Foretold:
     """Compare each picture with all others, given a prior; the arguments are as of `solve_rows`."""
     foretold = Foretold(error=np.zeros(pictures.shape), variance=np.zeros(pictures.shape))
-    for solution in _solve_in_parts(windows, sums, pictures, prior, progress, variance):
-        foretold.error[solution.part] = solution.foretold.error
-        foretold.variance[solution.part] = solution.foretold.variance
+    for solution in _solve_in_chunks(windows, sums, pictures, prior, progress, variance):
+        foretold.error[solution.chunk] = solution.foretold.error
+        foretold.variance[solution.chunk] = solution.foretold.variance
     return foretold
 
 
-def _solve_in_parts(
+def _solve_in_chunks(
     windows: Windows,
     sums: np.ndarray,
     pictures: np.ndarray,
@@ -176,29 +176,29 @@ def _solve_in_parts(
     """The rows of T, as many at once as memory holds."""
     pixels, q = windows.nodes.shape
     patterns = sums.shape[1]
-    chunk = max(CHUNK_NUMBERS // (q * (patterns + q)), 1)
-    for start in range(0, pixels, chunk):
-        part = slice(start, start + chunk)
-        light = prior.light[part, None]
-        left = prior.noise[part, None] * light**2
-        noise = np.broadcast_to(left, (len(light), patterns))
+    chunk_rows = max(CHUNK_NUMBERS // (q * (patterns + q)), 1)
+    for start in range(0, pixels, chunk_rows):
+        chunk = slice(start, start + chunk_rows)
+        light = prior.light[chunk, None]
+        misfit = prior.noise[chunk, None] * light**2
+        noise = np.broadcast_to(misfit, (len(light), patterns))
         if variance is not None:
-            noise = noise + variance[part]
+            noise = noise + variance[chunk]
         rows, foretold = _solve(
-            sums[windows.nodes[part]],
-            pictures[part],
-            np.sqrt(prior.coefficients[part][:, windows.group]) * light,
+            sums[windows.nodes[chunk]],
+            pictures[chunk],
+            np.sqrt(prior.coefficients[chunk][:, windows.group]) * light,
             noise,
         )
-        rows = replace(rows, residual=rows.residual * left[:, 0])
-        yield _Solution(part=part, rows=rows, foretold=foretold)
+        rows = replace(rows, residual=rows.residual * misfit[:, 0])
+        yield _Solution(chunk=chunk, rows=rows, foretold=foretold)
         progress(len(light))
 
 
 def _solve(
     B: np.ndarray, pictures: np.ndarray, deviation: np.ndarray, noise: np.ndarray
 ) -> tuple[Rows, Foretold]:
-    """Some rows, with a residual relative to the noise, and what all but one picture foretell.
+    """Solve rows, with residuals relative to the noise; also foretell each picture by all others.
 
     B is (rows, q, patterns), `deviation` V^1/2 (rows, q), `noise` (rows, patterns).
     """
@@ -207,7 +207,7 @@ def _solve(
     S = B * deviation[:, :, None] * whitening[:, None, :]
     y = pictures * whitening
     mean, variance, precision = _posterior(S, y)
-    left = y - (mean[:, None, :] @ S)[:, 0, :]
+    residual = y - (mean[:, None, :] @ S)[:, 0, :]
     # Coefficients that the pictures determine, and not the prior.
     determined = S.shape[1] - variance.sum(axis=1)
     known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
@@ -215,11 +215,11 @@ def _solve(
     rows = Rows(
         mean=deviation * mean,
         variance=deviation**2 * variance,
-        residual=(left**2).sum(axis=1) / freedom,
+        residual=(residual**2).sum(axis=1) / freedom,
     )
-    # Of y given all others the residual is left / precision, its variance 1 / precision.
+    # Given all others, y errs by residual / precision, with the variance 1 / precision.
     precision = np.maximum(precision, np.finfo(float).tiny)
-    foretold = Foretold(error=left / precision / whitening, variance=noise / precision)
+    foretold = Foretold(error=residual / precision / whitening, variance=noise / precision)
     return rows, foretold
 
 
@@ -252,10 +252,10 @@ def solve_channels(
     covariance = np.linalg.inv(np.eye(q) + S @ transposed)
     mean = covariance @ (S @ y)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    left = y - transposed @ mean
+    residual = y - transposed @ mean
     known = np.count_nonzero(noise < UNKNOWN_NOISE, axis=1)
     freedom = np.maximum(known - (q - variance.sum(axis=1)), 1.0)
-    squares = (left**2).sum(axis=1).mean(axis=1)
+    squares = (residual**2).sum(axis=1).mean(axis=1)
     return ChannelRows(
         mean=deviation[:, :, None] * mean,
         variance=deviation**2 * variance,

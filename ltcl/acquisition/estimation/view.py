@@ -12,7 +12,7 @@ a side.
 from __future__ import annotations
 
 import numpy as np
-import scipy.ndimage
+import scipy  # its subpackage ndimage is loaded at the first use
 
 from ltcl.acquisition.agreement import standardised
 from ltcl.acquisition.estimation.pairs import Pairs
@@ -53,9 +53,9 @@ def find_view(pairs: Pairs) -> Correspondence:
     seen = standardised(seen[:, pixels])
     step = max(CHUNK_NUMBERS // shown.shape[1], 1)
     for start in range(0, len(pixels), step):
-        part = pixels[start : start + step]
+        chunk = pixels[start : start + step]
         correlation = shown.T @ seen[:, start : start + step] / len(pairs)
-        x[part], y[part] = _peaks(correlation.reshape(*pairs.grid, -1))
+        x[chunk], y[chunk] = _peaks(correlation.reshape(*pairs.grid, -1))
     x, y = _on_planes(x, y, pairs.camera_grid, PLANE_WIDTH * side)
     height, width = pairs.grid
     is_inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)

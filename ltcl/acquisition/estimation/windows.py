@@ -135,7 +135,8 @@ class Windows:
                 builder.add_all(level, size)
                 break
             builder.add_window(level, size)
-        return builder.windows(sum(rows * columns for rows, columns in levels))
+        hats = sum(rows * columns for rows, columns in levels)
+        return builder.windows(hats)
 
     @property
     def groups(self) -> int:
@@ -168,8 +169,8 @@ class _Builder:
         rings = range(REACH + 1)
         self.area += [4.0**level for _ in rings]
         height, width = size
-        middle_row = _nearest(self.row, level)
-        middle_column = _nearest(self.column, level)
+        middle_row = nearest(self.row, level)
+        middle_column = nearest(self.column, level)
         for down in range(-REACH, REACH + 1):
             for across in range(-REACH, REACH + 1):
                 row = middle_row + down
@@ -212,7 +213,7 @@ class _Builder:
         )
 
 
-def _nearest(pixel: np.ndarray, level: int) -> np.ndarray:
+def nearest(pixel: np.ndarray, level: int) -> np.ndarray:
     """The number of the node of a level that is nearest to a pixel, along one side."""
     half = (1 << level) >> 1
     return (pixel + half) >> level

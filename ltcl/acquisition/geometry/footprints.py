@@ -152,19 +152,19 @@ class Footprints:
         chunks: dict[int, scipy.sparse.csr_array] = {}
         area = np.empty((height, W), np.float32)
 
-        def split_rows(part: slice) -> None:
-            chunk = _shifted(part, rows.start)
-            known = self.known[chunk].ravel()
-            x = np.where(self.known[chunk], self.mapping.x[chunk], 0.0).ravel()
-            y = np.where(self.known[chunk], self.mapping.y[chunk], 0.0).ravel()
-            J, _ = _jacobians(self.mapping, chunk)
-            area[part] = np.abs(_determinants(J))
+        def split_rows(strip: slice) -> None:
+            in_picture = _shifted(strip, rows.start)
+            known = self.known[in_picture].ravel()
+            x = np.where(self.known[in_picture], self.mapping.x[in_picture], 0.0).ravel()
+            y = np.where(self.known[in_picture], self.mapping.y[in_picture], 0.0).ravel()
+            J, _ = _jacobians(self.mapping, in_picture)
+            area[strip] = np.abs(_determinants(J))
             J = J.reshape(-1, 4)
             numbers = padded.numbers(*_places(x, y, J, corners))
             is_split = known & (numbers != numbers[:, :1]).any(axis=1)
             places = _places(x[is_split], y[is_split], J[is_split], points)
-            parts = _count_points(padded.numbers(*places), padded.size)
-            chunks[part.start] = _insert_whole(parts, is_split, known, numbers[:, 0])
+            counts = _count_points(padded.numbers(*places), padded.size)
+            chunks[strip.start] = _insert_whole(counts, is_split, known, numbers[:, 0])
 
         in_strips(height, step, split_rows)
         ordered = [chunks[top] for top in sorted(chunks)]
@@ -248,22 +248,22 @@ def _count_points(numbers: np.ndarray, pixels: int) -> scipy.sparse.csr_array:
 
 
 def _insert_whole(
-    parts: Any, is_split: np.ndarray, known: np.ndarray, numbers: np.ndarray
+    split: Any, is_split: np.ndarray, known: np.ndarray, numbers: np.ndarray
 ) -> scipy.sparse.csr_array:
-    """Rows of all camera pixels: `parts` of split ones, others whole in the projector's `numbers`.
+    """Rows of all camera pixels: `split` of split ones, others whole in the projector's `numbers`.
 
     Rows of unknown ones are empty.
     """
     lengths = known.astype(np.int32)
-    lengths[is_split] = np.diff(parts.indptr)
+    lengths[is_split] = np.diff(split.indptr)
     indptr = np.append(0, np.cumsum(lengths, dtype=np.int32))
     is_part = np.repeat(is_split, lengths)
     values = np.ones(len(is_part))
-    values[is_part] = parts.data
+    values[is_part] = split.data
     columns = np.empty(len(is_part), np.int32)
-    columns[is_part] = parts.indices
+    columns[is_part] = split.indices
     columns[~is_part] = numbers[known & ~is_split]
-    return scipy.sparse.csr_array((values, columns, indptr), (len(known), parts.shape[1]))
+    return scipy.sparse.csr_array((values, columns, indptr), (len(known), split.shape[1]))
 
 
 def _differences(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

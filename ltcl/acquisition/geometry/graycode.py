@@ -79,7 +79,7 @@ class GrayCode:
         return 2 * sum(self.bits) + 2
 
     def patterns(self) -> list[np.ndarray]:
-        """Patterns as codes (h, w) in {0, 1}, float32."""
+        """Patterns as codes (h, w) in {0, 1}, float32, which are not to be written to."""
         h, w = self.grid
         column_bits, row_bits = self.bits
         patterns = []
@@ -138,8 +138,8 @@ class GrayCode:
         return decoder.x, decoder.y
 
     def _with_inverse(self, bit: np.ndarray) -> list[np.ndarray]:
-        pattern = np.broadcast_to(bit, self.grid).astype(np.float32)
-        return [pattern, 1.0 - pattern]
+        code = bit.astype(np.float32)
+        return [np.broadcast_to(code, self.grid), np.broadcast_to(1.0 - code, self.grid)]
 
 
 def _gray_bits(size: int, bits: int) -> list[np.ndarray]:

@@ -368,12 +368,12 @@ def _keep_rows(weights: Any, is_kept: np.ndarray) -> scipy.sparse.csr_array:
     matrix = scipy.sparse.csr_array(weights)
     lengths = np.diff(np.asarray(matrix.indptr))
     is_kept_entry = np.repeat(is_kept, lengths)
-    kept = (
+    arrays = (
         matrix.data[is_kept_entry].astype(np.float32),
         _short(matrix.indices[is_kept_entry]),
         _short(np.append(0, np.cumsum(lengths * is_kept))),
     )
-    rows = scipy.sparse.csr_array(kept, matrix.shape)
+    rows = scipy.sparse.csr_array(arrays, matrix.shape)
     rows.eliminate_zeros()
     return rows
 

@@ -68,11 +68,11 @@ class Radiance:
         return self.value.shape
 
     def rows(self, rows: slice) -> Radiance:
-        """Some rows of the picture."""
+        """The picture in some rows."""
         return Radiance(self.value[rows], self.variance[rows], self.valid[rows])
 
     def part(self, name: str, rows: slice) -> np.ndarray:
-        """Some rows of value, variance or valid."""
+        """Value, variance or valid in some rows."""
         return getattr(self, name)[rows]
 
     def __repr__(self) -> str:

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.optimize
+import scipy  # its subpackage optimize is loaded at the first use
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.exposures import (

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.optimize
+import scipy  # its subpackage optimize is loaded at the first use
 from scipy.interpolate import PchipInterpolator
 
 from ltcl import checks

@@ -16,10 +16,15 @@ def in_strips(
     At most so many `workers` have strips in memory; None: one for each core.
     """
     step = max(rows, 1)
-    strips = [slice(top, min(top + step, height)) for top in range(0, height, step)]
-    if len(strips) == 1:  # a thread takes longer to start than the work on a small picture
+    strips = []
+    for top in range(0, height, step):
+        strips.append(slice(top, min(top + step, height)))
+    if len(strips) == 1:
+        # A thread takes longer to start than the work on a small picture.
         work(strips[0])
         return
-    cores = os.cpu_count() or 1
-    with ThreadPoolExecutor(min(cores, workers or cores)) as pool:
+    threads = os.cpu_count() or 1
+    if workers is not None:
+        threads = min(threads, workers)
+    with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, strips))

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.rig import LONGEST, SHORTEST, Closing, load_extra, offered_exposure
+from ltcl.acquisition.rig import LONGEST, SHORTEST, Closing, offered_exposure
 from ltcl.acquisition.rigs.photographs import read_photograph
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
@@ -237,7 +237,9 @@ class GPhoto2Camera(Closing):
     def __init__(self, channels: int = 3, *, white_level: int | None = None) -> None:
         self.channels = checks.one_of("channels", channels, (1, 3))
         self.white_level = _check_white_level(white_level)
-        self._gphoto2 = load_extra("gphoto2", "camera", "a camera on a cable")
+        self._gphoto2 = checks.load_extra(
+            "gphoto2", "camera", "a camera on a cable", AcquisitionError
+        )
         self._camera = self._gphoto2.Camera()
         self._seconds: float | None = None
         with self._refusing("be opened"):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, images
-from ltcl.acquisition.rig import Closing, as_codes, load_extra
+from ltcl.acquisition.rig import Closing, as_codes
 from ltcl.acquisition.rigs.folder import FolderRig, enlarge
 from ltcl.acquisition.rigs.memory_card import number_key
 from ltcl.acquisition.rigs.shooting_list import Shot
@@ -68,7 +68,7 @@ class Display(Closing):
         if grid is not None:
             grid = checks.grid("grid", grid)
         with contextlib.redirect_stdout(None):  # pygame prints a greeting
-            self._pygame = load_extra("pygame", "projector", "a display")
+            self._pygame = checks.load_extra("pygame", "projector", "a display", AcquisitionError)
         if self._pygame.display.get_surface() is not None:
             raise InputError("pygame shows a window in this process already; close it first")
         with self._closed_on_error():

@@ -16,7 +16,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +198,12 @@ class FolderRig:
                 return image.shape[0], image.shape[1]
         return None
 
-    def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
+    def take(
+        self,
+        files: Iterable[str | os.PathLike[str]],
+        *,
+        known: Iterable[str | os.PathLike[str]] = (),
+    ) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in place of those that are missing.
 
         They are taken in the order in which they were photographed (`memory_card`). Files that were
@@ -209,6 +214,8 @@ class FolderRig:
         ----------
         files : iterable of paths
             As many new files as photographs are missing.
+        known : iterable of paths
+            Copies of further files that are left out, such as the photographs of another scan.
 
         Raises
         ------
@@ -219,13 +226,10 @@ class FolderRig:
         """
         numbers = self.missing()
         unique_files = dict.fromkeys(map(input_file, files))
-        paths = self._new_files(unique_files)
+        paths = self._new_files(unique_files, map(input_file, known))
         if len(paths) != len(numbers):
-            missing = f"{len(numbers)} are missing"
-            if numbers:
-                missing += f", {numbers[0]} to {numbers[-1]}"
             raise InputError(
-                f"files holds {len(paths)} new photographs, but {missing}; "
+                f"files holds {_describe_files(paths)}, but {_describe_missing(numbers)}; "
                 "give just these, or save them by the names on the list"
             )
         for number, path in zip(numbers, paths, strict=True):
@@ -309,9 +313,10 @@ class FolderRig:
         )
         return PhotographMissing(text, shot.number, shot, len(missing))
 
-    def _new_files(self, files: Iterable[Path]) -> list[Path]:
+    def _new_files(self, files: Iterable[Path], known: Iterable[Path]) -> list[Path]:
         """Files that were not copied before, in order; FileError for one of another kind."""
         copied = [path for paths in self._files.values() for path in paths]
+        copied.extend(known)
         for path in files:
             if path.suffix.lower() not in PHOTOGRAPH_SUFFIXES:
                 raise FileError(f"{path}: is not a photograph; it must be {PHOTOGRAPH_KINDS}")
@@ -324,6 +329,26 @@ class FolderRig:
                 # Two photographs of black may be equal: each copy stands for one file.
                 copied.remove(twin)
         return new
+
+
+def _describe_files(paths: Sequence[Path]) -> str:
+    """New photographs by their number and names: "3 new photographs, IMG_1.png to IMG_3.png"."""
+    if len(paths) == 1:
+        return f"1 new photograph, {paths[0].name}"
+    text = f"{len(paths)} new photographs"
+    if paths:
+        text += f", {paths[0].name} to {paths[-1].name}"
+    return text
+
+
+def _describe_missing(numbers: Sequence[int]) -> str:
+    """Numbers on the list whose photographs are missing, from the first to the last one."""
+    if len(numbers) == 1:
+        return f"1 is missing, number {numbers[0]}"
+    text = f"{len(numbers)} are missing"
+    if numbers:
+        text += f", {numbers[0]} to {numbers[-1]}"
+    return text
 
 
 def _holds(path: Path, pattern: np.ndarray, step: float) -> bool:

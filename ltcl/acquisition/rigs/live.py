@@ -177,8 +177,8 @@ class LiveRig(Closing):
             "kind": "live",
             "projector_grid": self.projector_grid,
             "channels": self.channels,
-            "camera": _describe_part(self._link.camera),
-            "display": _describe_part(self._link.display),
+            "camera": _describe_instrument(self._link.camera),
+            "display": _describe_instrument(self._link.display),
             "period": self._period,
             "exposures": self.exposures,
             "survey": None if self.survey is None else self.survey._asdict(),
@@ -186,9 +186,9 @@ class LiveRig(Closing):
 
     def close(self) -> None:
         """Close camera and display, if they can be closed."""
-        for part in (self._link.camera, self._link.display):
-            if hasattr(part, "close"):
-                part.close()
+        for instrument in (self._link.camera, self._link.display):
+            if hasattr(instrument, "close"):
+                instrument.close()
 
     def _measure(self) -> Survey:
         tests = SurveyTests(
@@ -332,8 +332,8 @@ def _whole_periods(
     return tuple(whole)
 
 
-def _describe_part(part: Any) -> dict[str, Any]:
+def _describe_instrument(instrument: Any) -> dict[str, Any]:
     """Camera or display as plain JSON."""
-    if hasattr(part, "describe"):
-        return part.describe()
-    return {"kind": type(part).__name__}
+    if hasattr(instrument, "describe"):
+        return instrument.describe()
+    return {"kind": type(instrument).__name__}

@@ -85,15 +85,17 @@ def _begin_of_round(times: Sequence[Any]) -> int | None:
 
 def _spans_counter(paths: Sequence[Path]) -> bool:
     """True if the last numbers in the names are near both ends of a counter."""
-    counts = []
+    numbers = []
+    lengths = set()
     for path in paths:
         match = re.search("([0-9]+)[^0-9]*$", path.stem)
-        counts.append("" if match is None else match[1])
-    digits = {len(count) for count in counts}
-    if len(digits) != 1 or max(digits) < MIN_DIGITS:
+        if match is None:
+            return False
+        numbers.append(int(match[1]))
+        lengths.add(len(match[1]))
+    if len(lengths) != 1 or max(lengths) < MIN_DIGITS:
         return False
-    end = 10 ** max(digits)
-    numbers = [int(count) for count in counts]
+    end = 10 ** max(lengths)
     return max(numbers) > ROUND_END * end and min(numbers) < ROUND_BEGIN * end
 
 

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.rig import load_extra
 from ltcl.acquisition.rigs.simulated import SimulatedRig
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 from ltcl.files import input_file
@@ -149,7 +148,7 @@ class MitsubaRig(SimulatedRig):
                 f"scene is a {type(scene).__name__}; it must be a name, dict or XML file"
             )
         self._samples = checks.count("samples", samples)
-        self._mi = load_extra("mitsuba", "rig", "MitsubaRig")
+        self._mi = checks.load_extra("mitsuba", "rig", "MitsubaRig", AcquisitionError)
         name = "dict"
         if not isinstance(scene, dict):
             name = os.path.basename(os.fspath(scene))

@@ -15,8 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from ltcl import images
-from ltcl.acquisition.rig import load_extra
+from ltcl import checks, images
 from ltcl.errors import AcquisitionError, FileError, MemoryLimitError
 from ltcl.files import input_file
 
@@ -96,7 +95,7 @@ def _develop_raw(path: Path) -> tuple[np.ndarray, float]:
     The black level stays, as subtracting it would clip noise; 65535 is the sensor's white level.
     """
     user = f"{path}, camera RAW instead of 16-bit TIFF,"
-    rawpy = load_extra("rawpy", "camera", user)
+    rawpy = checks.load_extra("rawpy", "camera", user, AcquisitionError)
     try:
         # An open file, as LibRaw takes names in UTF-8 alone.
         with input_file(path).open("rb") as file, rawpy.imread(file) as raw:

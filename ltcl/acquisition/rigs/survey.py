@@ -116,8 +116,10 @@ class SurveyTests:
 
     def _choose_exposure(self) -> float:
         """The longest exposure tried in which white is not saturated; it is set."""
-        trials = [LONGEST_TRIAL / 2**k for k in range(EXPOSURE_TRIALS)]
-        offered = trials if self.exposures is None else self.exposures
+        trials = (LONGEST_TRIAL / 2.0 ** np.arange(EXPOSURE_TRIALS)).tolist()
+        offered = self.exposures
+        if offered is None:
+            offered = trials
         seconds = LONGEST_TRIAL
         for longest in trials:
             possible = [exposure for exposure in offered if exposure <= longest]

@@ -155,7 +155,9 @@ def scan(
     for start in range(0, len(shown), BATCH_SIZE):
         pictures += log.take(shown[start : start + BATCH_SIZE])
     count = _FitCount(len(grid.seen) * grid.channels, progress)
-    lit = [np.ones(grid.grid, np.float32), *fitted]
+    white = np.ones(grid.grid, np.float32)
+    lit = [grid.light_of(pattern) for pattern in (white, *fitted)]
+    judging = [grid.light_of(pattern) for pattern in judging]
     seen = [grid.white, *pictures[: len(fitted)]]
     channels = []
     for channel in range(grid.channels):
@@ -218,9 +220,9 @@ def _judged(
             is_known = picture.known[c]
             direct = D @ pattern.ravel()
             explained = direct + pattern.mean() * light.indirect
-            left = np.where(is_known, picture.value[c] - explained, 0.0)
+            residual = np.where(is_known, picture.value[c] - explained, 0.0)
             variance = np.where(is_known, picture.variance[c] + grid.ambient[c], 0.0)
-            squares[k, c] = (left**2).sum(dtype=np.float64)
+            squares[k, c] = (residual**2).sum(dtype=np.float64)
             noise[k, c] = variance.sum(dtype=np.float64)
             energy[k, c] = (direct**2)[is_known].sum(dtype=np.float64)
             expected[k, c] = (V @ pattern.ravel())[is_known].sum(dtype=np.float64)
@@ -248,6 +250,8 @@ def _left_out(grid: ScanGrid, channels: Sequence[DirectLight]) -> float:
     white = grid.white.value.sum(axis=0, dtype=np.float64)
     direct = np.sum([light.direct.sum(axis=1) for light in channels], axis=0)
     is_lit = grid.seen & grid.white.known.all(axis=0) & (white > 0)
+    if grid.lit is not None:
+        is_lit &= grid.lit.ravel()
     if not is_lit.any():
         return math.nan
     return float(np.median(1.0 - direct[is_lit] / white[is_lit]))

@@ -42,6 +42,12 @@ class PictureLog:
         """False if the next batch is not in the store, and there is no camera."""
         return self._camera is not None or self._is_written(self._batches)
 
+    def keep(self, name: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array that the store has by this name; at first it is made, and kept."""
+        if name not in self._store.extras:
+            self._store.extra(name, make())
+        return self._store.extra(name)
+
     def announce(self, patterns: Iterable[np.ndarray]) -> None:
         """Announce the patterns of the next batches that are not in the store."""
         if self._camera is None:

@@ -40,7 +40,7 @@ from ltcl.acquisition.radiance import (
     values_at,
 )
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scratch import ImageFile, StoredImage
+from ltcl.acquisition.scratch import ImageFile, StoredImage, scratch_array
 from ltcl.acquisition.session import Photograph, merge_photographs
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
@@ -50,12 +50,16 @@ UNKNOWN = np.float32(1e12)
 """The variance of an unknown value."""
 KNOWN_VARIANCE = 1e-3 * UNKNOWN
 """The variance from which on a value is unknown."""
+# Extra array of a store: the pixels that the projector lights, where those are not all.
+LIT = "scanned.lit"
 # Attribute of a store: the gain of the lamp at the end of the last batch.
 LAMP_GAIN = "lamp_gain"
 # Valid share of a projector pixel's camera pixels; less determines nothing.
 MIN_VALID_SHARE = 0.5
 # Standard deviations by which white must be above 0 for a pixel to count in comparisons.
 CLEAR_SIGMAS = 5.0
+# Pixels that are compared at most: scans of more light many at once.
+MAX_COMPARED_PIXELS = 1 << 18
 # Standard deviation, relative to white, of a pixel that counts in comparisons.
 MAX_RELATIVE_NOISE = 0.25
 # A picture shows the pattern of another if it is so many times as bright there, and brighter by so
@@ -94,6 +98,15 @@ class Picture(NamedTuple):
         variance = np.where(self.known, self.variance * np.float32(factor**2), self.variance)
         return Picture(value=self.value * np.float32(factor), variance=variance)
 
+    def stored(self) -> Picture:
+        """The picture, in temporary files if it is large: a batch has several."""
+        arrays = []
+        for array in self:
+            copy = scratch_array(array.shape, array.dtype)
+            copy[:] = array
+            arrays.append(copy)
+        return Picture(*arrays)
+
 
 class ScanGrid:
     """The pixels of a scan, with the light that the calibration shows there.
@@ -114,10 +127,15 @@ class ScanGrid:
         Pixels that the camera sees.
     sharpness : Sharpness, optional
         How sharply it sees them; None: exactly.
+    lit : (h, w) of bool, optional
+        Pixels that the projector lights, if others see only what bounces; None: all.
     """
 
-    def __init__(self, calibration: Calibration, side: int = 1) -> None:
+    def __init__(
+        self, calibration: Calibration, side: int = 1, lit: np.ndarray | None = None
+    ) -> None:
         self.calibration = calibration
+        self.lit = lit
         self.channels = len(calibration.offset)
         self.blocks = Blocks(calibration.resampling.grid, side)
         self.grid = self.blocks.grid
@@ -135,7 +153,14 @@ class ScanGrid:
     def of(cls, store: BlockStore) -> ScanGrid:
         """The pixels of a scan in a store of `ltcl.acquire`."""
         setup = Setup.of(store)
-        return cls(setup.calibration, setup.blocks.side)
+        lit = None
+        if LIT in store.extras:
+            lit = store.extra(LIT).astype(bool)
+        return cls(setup.calibration, setup.blocks.side, lit)
+
+    def light_of(self, pattern: np.ndarray) -> np.ndarray:
+        """The light (h, w) of a pattern: pixels that the projector does not reach stay dark."""
+        return pattern if self.lit is None else pattern * self.lit
 
     def noise(self, entries: Callable[[int], Any]) -> dict[str, np.ndarray]:
         """The noise of T for its store, by entries of each channel as `Noise.fit` takes them."""
@@ -188,7 +213,7 @@ class ScanCamera(ScanGrid):
     """A rig that was calibrated, as a camera on the pixels of the scan."""
 
     def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
-        super().__init__(calibration, side)
+        super().__init__(calibration, side, getattr(shots.rig, "lit", None))
         self.shots = shots
         # Photographs are compared at some of the pixels that see the projector.
         seeing = calibration.resampling.camera_pixels()
@@ -229,7 +254,7 @@ class ScanCamera(ScanGrid):
             if self._deviation(photographs) is not None:
                 self._refuse(photographs, batch[k + 1 : k + 2])
             light = self._merge(photographs)
-            pictures.append(self._without_ambient(self.picture(light)))
+            pictures.append(self._without_ambient(self.picture(light)).stored())
             stored = anchor.compact(light, self._compact)
             exposed.append(replace(photographs, images=[], light=stored))
             progress(1)
@@ -239,7 +264,9 @@ class ScanCamera(ScanGrid):
         first = self.lamp_gain
         self.lamp_gain = self._check_anchor(blocks, exposed)
         gains = np.linspace(first, self.lamp_gain, len(pictures)).tolist()
-        return [picture.scaled(1.0 / g) for picture, g in zip(pictures, gains, strict=True)]
+        for number, gain in enumerate(gains):
+            pictures[number] = pictures[number].scaled(1.0 / gain).stored()
+        return pictures
 
     def _photograph(self, codes: np.ndarray, seconds: Sequence[float]) -> _ExposedPattern:
         # The file of the photographs is removed with the last of them.
@@ -306,7 +333,7 @@ class ScanCamera(ScanGrid):
         exposed: Sequence[_ExposedPattern],
     ) -> None:
         """Raise AcquisitionError if a picture shows another pattern than its own."""
-        comparison = _BatchComparison(self.white, patterns, pictures)
+        comparison = _BatchComparison(self.white, patterns, pictures, self.lit)
         unlike = comparison.unlike_their_patterns()
         if len(unlike):
             names = " and ".join(self._names(exposed[a]) for a in unlike.tolist())
@@ -431,18 +458,24 @@ class _BatchComparison:
     """Comparison of the pictures of a batch with the patterns of each other, relative to white."""
 
     def __init__(
-        self, white: Picture, patterns: Sequence[np.ndarray], pictures: Sequence[Picture]
+        self,
+        white: Picture,
+        patterns: Sequence[np.ndarray],
+        pictures: Sequence[Picture],
+        lit: np.ndarray | None = None,
     ) -> None:
         light = white.value.sum(axis=0)
         is_clear = light > CLEAR_SIGMAS * np.sqrt(white.variance.sum(axis=0))
-        light = light[is_clear]
-        values = np.stack([picture.value.sum(axis=0) for picture in pictures])
-        variances = np.stack([picture.variance.sum(axis=0) for picture in pictures])
-        flat_patterns = np.stack(patterns).reshape(len(patterns), -1)
-        self.value = values[:, is_clear] / light
-        self.variance = variances[:, is_clear] / light**2
+        if lit is not None:
+            is_clear &= lit.ravel()
+        chosen = _draw_pixels(np.flatnonzero(is_clear))
+        light = light[chosen]
+        values = np.stack([picture.value[:, chosen].sum(axis=0) for picture in pictures])
+        variances = np.stack([picture.variance[:, chosen].sum(axis=0) for picture in pictures])
+        self.value = values / light
+        self.variance = variances / light**2
         self.known = self.variance < MAX_RELATIVE_NOISE**2
-        self.lit = flat_patterns[:, is_clear] > 0
+        self.lit = np.stack([pattern.ravel()[chosen] > 0 for pattern in patterns])
 
     def unlike_their_patterns(self) -> np.ndarray:
         """Numbers of pictures that resemble their own pattern hardly, or another one far more.
@@ -514,3 +547,11 @@ class _BatchComparison:
         variance = self.variance[a] + self.variance[b] + systematic
         z2 = (self.value[a] - self.value[b]) ** 2 / variance
         return bool(np.mean(z2[both]) < MAX_SAME_Z2)
+
+
+def _draw_pixels(pixels: np.ndarray) -> np.ndarray:
+    """Draw at most `MAX_COMPARED_PIXELS` pixels: at random, as patterns repeat at even steps."""
+    if len(pixels) <= MAX_COMPARED_PIXELS:
+        return pixels
+    random = np.random.default_rng(0)
+    return np.sort(random.choice(pixels, MAX_COMPARED_PIXELS, replace=False))

@@ -98,7 +98,7 @@ class Report:
 
         FileError if the scan is not finished, or was not made by `ltcl.acquire`.
         """
-        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        scan = BlockStore.of(store)
         scan.verify()
         _check_finished(scan)
         grid = ScanGrid.of(scan)

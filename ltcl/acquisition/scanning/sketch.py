@@ -10,8 +10,9 @@ off, so that the curve of the projector does not matter. Of each scale s = 2^l t
     products   w(row / s) xor w'(column / s) of Walsh functions w and w' of four steps, repeated
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
-that of T. If it is too large, rounds of other patterns follow (`more_patterns`), each of which
-helps: patterns like nature, and blocks at random.
+that of T. If it is too large, rounds of other patterns follow, each of which helps: squares at
+random, of the scales that are unknown at each place (`refined_patterns`). Where nothing is known of
+that, as after a nudge, they are patterns like nature, and blocks (`more_patterns`).
 
 A picture that all others contradict is left out (`estimation.contradiction`); several are refused.
 """
@@ -26,7 +27,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import scipy.stats
+import scipy  # its subpackage stats is loaded at the first use
 
 from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
 from ltcl.acquisition.estimation.estimator import Estimator
@@ -34,6 +35,7 @@ from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import RefinedEstimator, make_estimator
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, ScanGrid
+from ltcl.acquisition.scanning.refined_patterns import refined_patterns
 from ltcl.acquisition.scanning.sketch_pictures import SketchPictures
 from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore, CompressedRecord
@@ -298,15 +300,33 @@ def scan(
     estimate = _estimate(grid, pictures, progress)
     errors = [estimate.error]
     while rounds.go_on(errors) and log.can_take:
-        shown = more_patterns(grid.grid, len(errors) - 1)
+        number = len(errors)
+        shown = _patterns_of_round(grid.grid, log, estimate.estimator, number)
         log.announce(shown)
         pictures.take(shown)
         estimate = _estimate(grid, pictures, progress)
         errors.append(estimate.error)
-        logger.info("round %d: error of T p %.2f %%", len(errors) - 1, 100 * estimate.error)
+        logger.info("round %d: error of T p %.2f %%", number, 100 * estimate.error)
     # Once, not in each round.
     _warn_of_wrong(estimate.wrong_patterns, log.names)
     return estimate.sketch()
+
+
+def _patterns_of_round(
+    grid: tuple[int, int], log: PictureLog, estimator: Estimator | RefinedEstimator, number: int
+) -> list[np.ndarray]:
+    """The patterns of a round: each place is divided at the scales that are unknown there.
+
+    They are kept with the pictures, since an estimate that is rounded in another way, on another
+    machine, would make others.
+    """
+
+    def make() -> np.ndarray:
+        shown = refined_patterns(estimator.unknown_light(), BATCH_SIZE, (SEED, number))
+        return np.packbits(np.array(shown, bool), axis=2)
+
+    bits = np.unpackbits(log.keep(f"round_{number}", make), axis=2, count=grid[1])
+    return list(bits.astype(np.float32))
 
 
 def _estimate(
@@ -322,7 +342,8 @@ def _estimate(
 
     def learn(wrong: list[int]) -> Estimator | RefinedEstimator:
         estimator = make_estimator(grid.grid, grid.channels, known_mixing, progress)
-        estimator.learn(fitted.without([number for number in wrong if number < len(fitted)]))
+        wrong_fitted = [number for number in wrong if number < len(fitted)]
+        estimator.learn(fitted.without(wrong_fitted))
         return estimator
 
     wrong, estimator = find_wrong_pictures(pairs, learn)
@@ -394,7 +415,7 @@ def _judged(
     """The error of an estimator for pairs that it has not seen."""
     squares = np.zeros(len(pairs))
     is_lit = np.zeros(len(pairs), bool)
-    left = np.zeros(estimator.channels)
+    residual_squares = np.zeros(estimator.channels)
     for number in range(len(pairs)):
         judge = pairs.select(slice(number, number + 1))
         variance: Any = judge.variance
@@ -408,11 +429,11 @@ def _judged(
         squares[number] = max(of_channels.sum() - noise, 0.0) / energy
         # Letters vanish in a picture of few rows.
         is_lit[number] = judge.patterns.any()
-        left += of_channels
+        residual_squares += of_channels
     return _Estimate(
         estimator=estimator,
         squares=squares[is_lit],
-        scales=estimator.scale_of_variance(pairs.patterns, left),
+        scales=estimator.scale_of_variance(pairs.patterns, residual_squares),
         wrong_patterns=wrong_patterns,
     )
 

@@ -47,7 +47,7 @@ class SketchPictures:
         self._patterns = ScratchFrames((pixels,), np.uint8)
         self._photographs = ScratchFrames((pixels, grid.channels), np.float32)
         self._variance = ScratchFrames((pixels, grid.channels), np.float32)
-        self._patterns.extend(1)[0] = 1
+        self._patterns.extend(1)[0] = grid.light_of(np.ones(grid.grid, np.float32)).ravel()
         self._photographs.extend(1)[0] = grid.white.value.T * self._light
         self._variance.extend(1)[0] = grid.white.variance.T * self._light**2
 
@@ -82,7 +82,7 @@ class SketchPictures:
         for start in range(0, len(shown), BATCH_SIZE):
             batch = list(shown[start : start + BATCH_SIZE])
             for pattern, picture in zip(batch, self._log.take(batch), strict=True):
-                patterns[frame] = pattern.ravel()
+                patterns[frame] = self._grid.light_of(pattern).ravel()
                 photographs[frame] = picture.value.T * self._light
                 noise = np.where(picture.known, picture.variance + self._grid.ambient, UNKNOWN)
                 variance[frame] = noise.T * self._light**2

@@ -50,13 +50,13 @@ def with_change(
     if centres is not None:
         windows = replace(windows, nodes=windows.nodes[centres])
     sums = sums_under_hats(T.W, list(patterns))
-    left = pictures - T.products(patterns)
+    residuals = pictures - T.products(patterns)
     is_own = windows.nodes == np.arange(len(windows.nodes))[:, None]
     cores = []
     own = []
     for channel, core in enumerate(T.cores):
         light = np.maximum(white[:, channel], 1e-3 * white[:, channel].max()) * FIRST_CHANGE
-        residual = np.ascontiguousarray(left[:, :, channel].T)
+        residual = np.ascontiguousarray(residuals[:, :, channel].T)
         noise = np.ascontiguousarray(variance[:, :, channel].T)
         prior = learn_prior(windows, sums, residual, light, progress, noise)
         rows = solve_rows(windows, sums, residual, prior, progress, noise)

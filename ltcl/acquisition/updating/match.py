@@ -69,16 +69,16 @@ def match_rows(
     centres = np.arange(pixels)
     gain = np.ones((pixels, channels))
     for rows in _chunks(chosen, pixels):
-        left = np.zeros((len(rows), pixels))
+        residual = np.zeros((len(rows), pixels))
         gains = np.zeros((channels, len(rows), pixels))
         for channel in range(channels):
             seen = pictures[:, rows, channel]
             products = np.maximum(seen.T @ foretold[:, :, channel], 0.0)
             gains[channel] = products / energy[:, channel]
-            left += (seen**2).sum(axis=0)[:, None] - products * gains[channel]
+            residual += (seen**2).sum(axis=0)[:, None] - products * gains[channel]
         numbers = np.arange(len(rows))
-        best = left.argmin(axis=1)
-        is_better = left[numbers, best] < MAX_LEFT_RATIO * left[numbers, rows]
+        best = residual.argmin(axis=1)
+        is_better = residual[numbers, best] < MAX_LEFT_RATIO * residual[numbers, rows]
         best = np.where(is_better, best, rows)
         centres[rows] = best
         gain[rows] = gains[:, numbers, best].T

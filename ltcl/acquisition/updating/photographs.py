@@ -41,14 +41,19 @@ def fitted_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     7
     """
     random = np.random.default_rng(SEED)
-    patterns: list[np.ndarray] = [like_nature(grid, random) > 0 for _ in range(NATURE_PATTERNS)]
+    h, w = grid
+    patterns = []
+    for _ in range(NATURE_PATTERNS):
+        is_lit = like_nature(grid, random) > 0
+        patterns.append(is_lit.astype(np.float32))
     for side in SQUARES:
         size = min(side, max(min(grid) // 2, 1))
-        height, width = (-(-length // size) for length in grid)
-        squares = random.permutation(np.arange(height * width) % 2 == 0).reshape(height, width)
-        picture = np.kron(squares, np.ones((size, size), bool))
-        patterns.append(picture[: grid[0], : grid[1]])
-    return [pattern.astype(np.float32) for pattern in patterns]
+        rows = -(-h // size)
+        columns = -(-w // size)
+        squares = random.permutation(np.arange(rows * columns) % 2 == 0).reshape(rows, columns)
+        is_lit = np.kron(squares, np.ones((size, size), bool))
+        patterns.append(is_lit[:h, :w].astype(np.float32))
+    return patterns
 
 
 def judge_places(grid: tuple[int, int]) -> list[int]:

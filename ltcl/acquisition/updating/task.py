@@ -211,8 +211,10 @@ class Update:
     def judgement(self) -> str:
         """A line that says if the update holds, and what must be measured again."""
         place = _place(self.failing)
+        if self.holds and place:
+            return f"the update holds; but {place}"
         if self.holds:
-            return f"the update holds; but {place}" if place else "the update holds"
+            return "the update holds"
         if place:
             return f"the update does not hold: {place}; a new scan is needed"
         return "the update does not hold; a new scan is needed"
@@ -506,7 +508,8 @@ def _judged_errors(pictures: _Pictures, explained: np.ndarray) -> np.ndarray:
 
 def _flat(patterns: Sequence[np.ndarray]) -> np.ndarray:
     """Patterns (k, N) of pictures (h, w)."""
-    return np.stack([np.ravel(pattern) for pattern in patterns]).astype(np.float64)
+    rows = [np.ravel(pattern) for pattern in patterns]
+    return np.stack(rows).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -676,7 +679,7 @@ class _Judgement:
 
     @property
     def ratio(self) -> float:
-        """By how much errors have grown since the scan, at least 1."""
+        """Growth of the errors since the scan, at least 1."""
         if math.isnan(self.previous_error) or self.previous_error == 0.0:
             return 1.0
         return max(self.error / self.previous_error, 1.0)
@@ -775,7 +778,10 @@ def _previous_errors(previous: BlockStore, grid: tuple[int, int]) -> np.ndarray:
     if len(errors) == sketch.JUDGES:
         return errors[judge_places(grid)]
     # Of a sketch that left out one of its judges, which is not known, the mean.
-    return np.full(JUDGES, math.sqrt((errors**2).mean()) if len(errors) else math.nan)
+    error = math.nan
+    if len(errors):
+        error = math.sqrt((errors**2).mean())
+    return np.full(JUDGES, error)
 
 
 def _failing_cells(

@@ -149,27 +149,27 @@ class _Warp:
     def core(self, C: Any) -> scipy.sparse.csr_array:
         """C' of a channel."""
         light = _row_light(self.rows @ C, self.levels)
-        parts: list[Any] = []
+        cores: list[Any] = []
         first = 0
         for level, (height, width) in enumerate(self.levels):
             count = height * width
-            part = scipy.sparse.csr_array(C[:, first : first + count])
+            level_core = scipy.sparse.csr_array(C[:, first : first + count])
             first += count
             if level == 0:
-                near, far = self._split(part)
+                near, far = self._split(level_core)
                 if far.nnz:
                     near = near + self.rows @ far @ self._read_at(0, 0)
-                parts.append(near)
+                cores.append(near)
                 continue
-            rows = self.rows @ part
+            rows = self.rows @ level_core
             nodes = self._read_at(level, level)
-            parts.append(rows @ nodes)
+            cores.append(rows @ nodes)
             # What the finer nodes between show beyond that, as at a crease.
             finer = level - 1
             missed = self._read_at(level, finer) - nodes @ _between(self.levels, level)
             correction = _notable(rows @ missed, NOTABLE_LIGHT * light / 4.0**finer)
-            parts[finer] = parts[finer] + correction
-        return without_negligible(scipy.sparse.csr_array(scipy.sparse.hstack(parts)))
+            cores[finer] = cores[finer] + correction
+        return without_negligible(scipy.sparse.csr_array(scipy.sparse.hstack(cores)))
 
     def _read_at(self, level: int, nodes: int) -> scipy.sparse.csr_array:
         """Hats of a level at the old places of the nodes of a level, (nodes of both)."""
@@ -179,10 +179,10 @@ class _Warp:
         places = interpolation(old_row / size, old_column / size, self.levels[level], to_rim=True)
         return scipy.sparse.csr_array(places.T)
 
-    def _split(self, part: Any) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
+    def _split(self, level_core: Any) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
         """Entries near the diagonal, moved along with it, and all others as they were."""
         height, width = self.grid
-        entries = scipy.sparse.coo_array(part)
+        entries = scipy.sparse.coo_array(level_core)
         row, column = np.divmod(entries.row, width)
         to_row, to_column = np.divmod(entries.col, width)
         down = to_row - row
@@ -199,7 +199,7 @@ class _Warp:
         is_there = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         i = i[is_there]
         places = i, (row * width)[is_there] + column[is_there]
-        shape = part.shape
+        shape = level_core.shape
         moved_entries = moved[i, k[is_there]], places
         far = entries.data[~is_near], (entries.row[~is_near], entries.col[~is_near])
         return (

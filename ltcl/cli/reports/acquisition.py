@@ -147,6 +147,32 @@ class ScanReport(FolderReport):
 
 
 @dataclass(kw_only=True)
+class PlansReport(FolderReport):
+    """`ltcl acquire plan` of several projectors."""
+
+    projectors: Annotated[dict[str, PlanReport], "Plans by the name of the projector."]
+
+
+@dataclass(kw_only=True)
+class ScansReport(FolderReport):
+    """`ltcl acquire report` of several projectors."""
+
+    projectors: Annotated[dict[str, ScanReport], "Reports by the name of the projector."]
+
+
+@dataclass(kw_only=True)
+class ProjectorsReport(FolderReport):
+    """`ltcl acquire run` of several projectors, when all are scanned."""
+
+    projectors: Annotated[list[str], "Names of the projectors, in the order of their scans."]
+    stores: Annotated[list[Path], "Folders of their transports."]
+    movements: Annotated[
+        dict[str, float],
+        "Movement of the camera in its pixels before the scan of that name, and at the end.",
+    ]
+
+
+@dataclass(kw_only=True)
 class NextPhotograph(Report):
     """The photograph to take."""
 

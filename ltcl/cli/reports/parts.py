@@ -30,15 +30,6 @@ Files = Annotated[list[str], "Files that this run wrote, relative to `folder`."]
 
 
 @dataclass(kw_only=True)
-class ErrorReport(Report):
-    """A command that failed; the exit code is not 0."""
-
-    error: Annotated[str, "The problem in one line, as on stderr."]
-    type: Annotated[str, "A class in `ltcl.errors`, `UsageError`, or another exception."]
-    exit_code: Annotated[int, "Exit code; the page on exit codes lists all."]
-
-
-@dataclass(kw_only=True)
 class Versions(Report):
     """Versions that a result can depend on."""
 

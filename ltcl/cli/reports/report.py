@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 
 @dataclass(kw_only=True)
@@ -46,3 +46,12 @@ def document(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: document(entry) for name, entry in value.items()}
     return value
+
+
+@dataclass(kw_only=True)
+class ErrorReport(Report):
+    """A command that failed; the exit code is not 0."""
+
+    error: Annotated[str, "The problem in one line, as on stderr."]
+    type: Annotated[str, "A class in `ltcl.errors`, `UsageError`, or another exception."]
+    exit_code: Annotated[int, "Exit code; the page on exit codes lists all."]

@@ -14,7 +14,7 @@ import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from ltcl.cli.reports import acquisition, export, parts, pictures, program, transports
+from ltcl.cli.reports import acquisition, export, parts, pictures, program, report, transports
 from ltcl.cli.reports.report import Report
 
 DESCRIPTION = (
@@ -36,6 +36,7 @@ COMMANDS: dict[str, Any] = {
     "analyze": Annotated[list[transports.AnalyzedFile], "`ltcl analyze`: one entry for each file."],
     "convert": transports.ConvertReport,
     "align": transports.AlignReport,
+    "combine": transports.CombineReport,
     "compress": transports.CompressReport,
     "invert": transports.InvertReport,
     "denoise": transports.DenoiseReport,
@@ -50,10 +51,14 @@ COMMANDS: dict[str, Any] = {
     "play": program.PlayReport,
     "show": program.ShowReport,
     "export": export.ExportReport,
-    "acquire-plan": acquisition.PlanReport,
+    "acquire-plan": Annotated[
+        acquisition.PlanReport | acquisition.PlansReport,
+        "`ltcl acquire plan`: of one projector, or of several by their names.",
+    ],
     "acquire-run": Annotated[
-        acquisition.ScanReport | acquisition.PhotographMissing,
-        "`ltcl acquire run`: the report of the finished scan, or the next photograph.",
+        acquisition.ScanReport | acquisition.ProjectorsReport | acquisition.PhotographMissing,
+        "`ltcl acquire run`: the report of the finished scan, or of the scans of several "
+        "projectors, or the next photograph.",
     ],
     "acquire-aim": acquisition.AimReport,
     "acquire-fit": acquisition.FitReport,
@@ -62,10 +67,13 @@ COMMANDS: dict[str, Any] = {
         acquisition.UpdateReport | acquisition.PhotographMissing,
         "`ltcl acquire update`: the new transport and its error, or the next photograph.",
     ],
-    "acquire-report": acquisition.ScanReport,
+    "acquire-report": Annotated[
+        acquisition.ScanReport | acquisition.ScansReport,
+        "`ltcl acquire report`: of one projector, or of several by their names.",
+    ],
 }
 PARTS: dict[str, type[Report]] = {
-    "error": parts.ErrorReport,
+    "error": report.ErrorReport,
     "versions": parts.Versions,
     "device": parts.Device,
     "transport": parts.TransportFacts,
@@ -81,6 +89,8 @@ PARTS: dict[str, type[Report]] = {
     "analysis": transports.AnalysisReport,
     "channel_analysis": transports.ChannelAnalysisReport,
     "photograph_missing": acquisition.PhotographMissing,
+    "plan": acquisition.PlanReport,
+    "scan": acquisition.ScanReport,
 }
 JSON_TYPES = {
     str: "string",
@@ -171,7 +181,10 @@ def _describe_union(kinds: tuple[Any, ...]) -> dict[str, Any]:
         if choice.keys() != {"type"}:
             return {"anyOf": choices}
         name = choice["type"]
-        names |= dict.fromkeys([name] if isinstance(name, str) else name)
+        own_names = name
+        if isinstance(name, str):
+            own_names = [name]
+        names |= dict.fromkeys(own_names)
     return {"type": [*names]}
 
 

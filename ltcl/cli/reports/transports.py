@@ -9,13 +9,12 @@ from typing import Annotated, Literal
 
 from ltcl.cli.reports.parts import (
     Channels,
-    ErrorReport,
     Heading,
     ProjectorGrid,
     Shape,
     VerdictReport,
 )
-from ltcl.cli.reports.report import Report
+from ltcl.cli.reports.report import ErrorReport, Report
 
 SolutionError = Annotated[float, "Bound on the error of solutions, by `--norm`."]
 ErrorBound = Annotated[float, "Bound on the error of solutions for any light."]
@@ -234,6 +233,25 @@ class AlignReport(Heading):
     seen: Annotated[float, "Share of the projector's pixels that the camera sees."]
     decoded: Annotated[float, "Share of the camera's pixels whose place is known."]
     pictures: Annotated[list[Path], "Aligned pictures, in their order."]
+
+
+@dataclass(kw_only=True)
+class CombineReport(Report):
+    """`ltcl combine`."""
+
+    out: Annotated[Path, "File that was written."]
+    scans: Annotated[list[Path], "Transports of the projectors, in their order."]
+    grids: Annotated[list[list[int]], "Pixels of each pattern: height, width."]
+    camera_grid: Annotated[tuple[int, int], "Height and width of the camera's pictures."]
+    channels: Channels
+    fed: Annotated[
+        list[list[int]], "Height and width of the codes of each projector; empty without scans."
+    ]
+    contrast: Annotated[float | None, "Light of white over that of black; null if not known."]
+    contrast_uniform: Annotated[float | None, "The same with black lifted to one level."]
+    differences: Annotated[
+        list[float], "Deviation of the colours of each projector from their mean, relative."
+    ]
 
 
 @dataclass(kw_only=True)

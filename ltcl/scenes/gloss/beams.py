@@ -25,8 +25,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy  # its subpackage stats is loaded at the first use
 import scipy.sparse
-import scipy.stats
 
 from ltcl import checks
 from ltcl.scenes.gloss import brdf

@@ -50,7 +50,10 @@ def colour_codes(calibration: Calibration, size: int) -> np.ndarray:
 def _codes(calibration: Calibration, light: np.ndarray) -> np.ndarray:
     """Codes of the projector for light (n, 3) relative to white."""
     response = calibration.projector
-    codes = response.codes(light[None] if response.channels == 3 else light)
+    samples = light
+    if response.channels == 3:
+        samples = light[None]
+    codes = response.codes(samples)
     return np.reshape(codes, light.shape)
 
 

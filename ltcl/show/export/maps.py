@@ -15,7 +15,6 @@ from ltcl.show.export.projector import ExportedProjector
 
 # A coordinate that lies in no picture: OpenCV's remap shows its border there.
 OUTSIDE = -1.0
-LARGEST_CODE = np.iinfo(np.uint16).max
 
 
 def write_maps(folder: Path, projector: ExportedProjector) -> list[str]:
@@ -82,6 +81,7 @@ def write_masks(folder: Path, projector: ExportedProjector) -> list[str]:
     return files
 
 
-def mask_codes(mask: np.ndarray) -> np.ndarray:
-    """Codes of 16 bits of a mask in [0, 1]."""
-    return np.rint(LARGEST_CODE * mask).astype(np.uint16)
+def mask_codes(mask: np.ndarray, bits: int = 16) -> np.ndarray:
+    """Codes of 8 or 16 bits of a mask in [0, 1]."""
+    dtype = np.uint8 if bits == 8 else np.uint16
+    return np.rint(np.iinfo(dtype).max * mask).astype(dtype)

@@ -50,7 +50,8 @@ def write_mesh(folder: Path, projector: ExportedProjector, remark: str) -> list[
             number[row + 1, column + 1],
             number[row, column + 1],
         ]
-        lines.append("f " + " ".join(f"{corner}/{corner}" for corner in corners))
+        words = [f"{corner}/{corner}" for corner in corners]
+        lines.append("f " + " ".join(words))
     name = f"{projector.name}.obj"
     with replace_file(folder / name) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -60,4 +61,6 @@ def write_mesh(folder: Path, projector: ExportedProjector, remark: str) -> list[
 def _places(side: int, step: int) -> np.ndarray:
     """Every `step`-th pixel, and the last one."""
     places = np.arange(0, side, step)
-    return places if places[-1] == side - 1 else np.append(places, side - 1)
+    if places[-1] == side - 1:
+        return places
+    return np.append(places, side - 1)

@@ -20,23 +20,15 @@ reached by that projector.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from ltcl.acquisition import Calibration, Correspondence
-from ltcl.acquisition.calibration import stored_map
-from ltcl.acquisition.captures.map_file import read_map
-from ltcl.acquisition.geometry import Resampling
-from ltcl.errors import FileError, InputError
-from ltcl.store import BlockStore
+from ltcl.show.export.scan import ExportedScan, read_scans
 
-# Files of `ltcl acquire`, `ltcl acquire import` and `ltcl simulate` in a folder.
-STORE = "transport.zarr"
-PROJECT = "acquisition.toml"
-MAP = "map.npz"
 # Quantile of the relative black that counts as the largest.
 BLACK_QUANTILE = 0.999
 
@@ -84,31 +76,8 @@ class ExportedProjector:
         return np.isfinite(self.camera_x)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Scan:
-    """What is read of a scan."""
-
-    name: str
-    mapping: Correspondence
-    resampling: Resampling
-    calibration: Calibration | None
-
-
-def read_projectors(paths: Sequence[Path]) -> list[ExportedProjector]:
-    """Read scans of one camera, one for each projector.
-
-    A scan is the store or the folder of `ltcl acquire run`, or the folder of `ltcl acquire import`.
-
-    FileError for other files; InputError if the cameras have different pixels.
-    """
-    scans = [_read_scan(path, number) for number, path in enumerate(paths, 1)]
-    camera = scans[0].mapping.camera_grid
-    for path, scan in zip(paths, scans, strict=True):
-        if scan.mapping.camera_grid != camera:
-            raise InputError(
-                f"{path}: has a camera of {scan.mapping.camera_grid} pixels; it must be {camera}, "
-                "that of the first scan"
-            )
+def share_light(scans: Sequence[ExportedScan]) -> list[ExportedProjector]:
+    """Share the light between the projectors of scans with one camera."""
     shares = _shares([scan.mapping for scan in scans])
     missing = _missing_black(scans, shares)
     projectors = []
@@ -117,34 +86,12 @@ def read_projectors(paths: Sequence[Path]) -> list[ExportedProjector]:
     return projectors
 
 
-def transport_path(path: Path) -> Path | None:
-    """The file of the transport of a scan; None if photographs were imported."""
-    if (path / PROJECT).exists():
-        return path / STORE
-    return None if (path / MAP).exists() else path
+def read_projectors(paths: Sequence[str | os.PathLike[str]]) -> list[ExportedProjector]:
+    """Read scans of one camera, one for each projector, or the folder of several.
 
-
-def _read_scan(path: Path, number: int) -> _Scan:
-    name = f"projector_{number}"
-    if (path / MAP).is_file():
-        mapping = read_map(path / MAP)
-        return _Scan(
-            name=name, mapping=mapping, resampling=Resampling.of(mapping), calibration=None
-        )
-    store = path / STORE if (path / PROJECT).exists() else path
-    if not store.is_dir():
-        raise FileError(
-            f"{store}: is no store of 'ltcl acquire run' and no folder of 'ltcl acquire import'; "
-            "a scan must be one of them"
-        )
-    opened = BlockStore.open(store)
-    calibration = Calibration.of(opened)
-    return _Scan(
-        name=name,
-        mapping=stored_map(opened),
-        resampling=calibration.resampling,
-        calibration=calibration,
-    )
+    Errors are those of `read_scans`.
+    """
+    return share_light(read_scans(paths))
 
 
 def _shares(mappings: Sequence[Correspondence]) -> list[np.ndarray]:
@@ -163,7 +110,7 @@ def _shares(mappings: Sequence[Correspondence]) -> list[np.ndarray]:
     return [(distance * scale).astype(np.float32) for distance in distances]
 
 
-def _missing_black(scans: Sequence[_Scan], shares: Sequence[np.ndarray]) -> np.ndarray:
+def _missing_black(scans: Sequence[ExportedScan], shares: Sequence[np.ndarray]) -> np.ndarray:
     """Light that each camera pixel lacks for an even black, relative to white, (H, W)."""
     black = np.zeros(shares[0].shape)
     white = np.zeros(shares[0].shape)
@@ -179,7 +126,7 @@ def _missing_black(scans: Sequence[_Scan], shares: Sequence[np.ndarray]) -> np.n
     return np.where(is_lit, np.clip(largest - relative, 0.0, 1.0), 0.0).astype(np.float32)
 
 
-def _black_share(scan: _Scan) -> float:
+def _black_share(scan: ExportedScan) -> float:
     """Black of a projector relative to its white: the slope of ambient light over white."""
     assert scan.calibration is not None  # noqa: S101 - the caller has seen to it
     white = _grey(scan.calibration, "white").ravel()
@@ -198,7 +145,7 @@ def _grey(calibration: Calibration, name: str) -> np.ndarray:
     return value if value.ndim == 2 else value.mean(axis=-1)
 
 
-def _on_projector(scan: _Scan, share: np.ndarray, missing: np.ndarray) -> ExportedProjector:
+def _on_projector(scan: ExportedScan, share: np.ndarray, missing: np.ndarray) -> ExportedProjector:
     """Bring a share and the missing black from the camera's pixels to those of the projector."""
     is_seen = scan.resampling.seen
     masks = np.stack([share, share * missing], axis=-1)
@@ -215,7 +162,7 @@ def _on_projector(scan: _Scan, share: np.ndarray, missing: np.ndarray) -> Export
     )
 
 
-def _inverse_map(scan: _Scan) -> tuple[np.ndarray, np.ndarray]:
+def _inverse_map(scan: ExportedScan) -> tuple[np.ndarray, np.ndarray]:
     """Column and row of the camera at the centre of each projector pixel, (h, w).
 
     Means over the camera pixels of a projector pixel belong to the mean of their own coordinates,

@@ -7,6 +7,9 @@ by products with S only, in four steps: check the inputs, undo the light, bring 
 bounds, judge the result. Where the light exceeds the projector's bounds, clamping it is not the
 best: min ||W (T l_in + background - gain * desired)|| over the patterns within the bounds is solved
 from there on. Where T has no S, it is solved from no light on.
+
+The prepared frames of `Compensator` have the same checks, problem and steps within the bounds. Only
+here light is undone to a residual that is proved, and the result comes with its evidence.
 """
 
 from __future__ import annotations
@@ -19,11 +22,14 @@ from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.device import Array
 from ltcl.errors import ConvergenceError
+from ltcl.interop.calls import Differentiable
 from ltcl.operators import Operator
 from ltcl.operators.diagonal_blocks import are_small, joined_once
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
+from ltcl.tasks.compensation.derivative import CompensationDerivative
 from ltcl.tasks.compensation.gain import exact_gain, gain_within_loss
 from ltcl.tasks.compensation.inputs import CompensationRequest, check_inputs
 from ltcl.tasks.compensation.problem import (
@@ -47,6 +53,16 @@ UNITS_RATIO = 4.0
 EXPLAINED_DEVIATIONS = 3.0
 
 
+def _derivative(T: Any, desired: Any, **arguments: Any) -> CompensationDerivative:
+    return CompensationDerivative(compensate, T, desired, **arguments)
+
+
+@checks.takes_arrays(
+    "desired",
+    "background",
+    "weights",
+    differentiable=Differentiable(("desired", "background"), _derivative),
+)
 def compensate(
     T: Transport,
     desired: Any,
@@ -177,12 +193,13 @@ class StartingLight:
 class BoundedLight:
     """Light (N, k) of each system within the bounds, and the solves that it took.
 
-    `frame_clipped`, (frames,), is the share of values of lit pixels that are at a bound and would
-    go beyond it.
+    `clipped_values`, (N, k) bool of each system, are at a bound and would go beyond it; None where
+    there are none. `frame_clipped`, (frames,), is their share of the values of lit pixels.
     """
 
     light: Columns
     solves: tuple[Bounded, ...]
+    clipped_values: list[np.ndarray | None]
     frame_clipped: np.ndarray
 
     @property
@@ -230,6 +247,11 @@ def _solve_in_scene(request: CompensationRequest, targets: Columns) -> Columns:
     if len(targets) != T.channels:
         targets = np.split(targets[0], 3)
     targets = [np.ascontiguousarray(target) for target in targets]
+    if request.inverse is not None:
+        direct = []
+        for channel, target in enumerate(targets):
+            direct.append(request.inverse.solve(target, channel).x)
+        return direct
     solutions = solve_each(T.scene.systems, targets, rtol=request.problem.settings.rtol)
     return [solution.x for solution in solutions]
 
@@ -250,9 +272,10 @@ def _undo_light_at_gain(request: CompensationRequest, gain: float) -> StartingLi
     solutions = _solve_channels(request, problem.light_to_add(gain))
     # S^-1 meets every pixel but masked ones, which count only where weights say so.
     is_on_target = not problem.counts_masked_pixels
+    undone = [solution.x for solution in solutions]
     return StartingLight(
         gain=gain,
-        light=_projector_light(request, [s.x for s in solutions]),
+        light=_projector_light(request, undone),
         solutions=solutions,
         is_on_target=is_on_target and _has_undone_light(solutions),
     )
@@ -264,8 +287,13 @@ def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
     columns = problem.desired[0].shape[1]
     sides = [np.hstack(pair) for pair in zip(problem.desired, problem.background, strict=True)]
     solutions = _solve_channels(request, sides)
-    slopes = _projector_light(request, [s.x[:, :columns] for s in solutions])
-    shifts = _projector_light(request, [s.x[:, columns:] for s in solutions])
+    undone_desired = []
+    undone_background = []
+    for solution in solutions:
+        undone_desired.append(solution.x[:, :columns])
+        undone_background.append(solution.x[:, columns:])
+    slopes = _projector_light(request, undone_desired)
+    shifts = _projector_light(request, undone_background)
     gain = None
     if request.is_exact_gain_allowed:
         gain = exact_gain(slopes, shifts, problem.limits)
@@ -274,10 +302,11 @@ def _undo_light_at_largest_gain(request: CompensationRequest) -> StartingLight:
         gain, light = gain_within_loss(problem, request.loss, (slopes, shifts))
     else:
         light = subtract(multiply(gain, slopes), shifts)
+    scaled = [_solution_at_gain(solution, gain) for solution in solutions]
     return StartingLight(
         gain=gain,
         light=light,
-        solutions=tuple(_solution_at_gain(s, gain) for s in solutions),
+        solutions=tuple(scaled),
         is_on_target=is_on_target,
     )
 
@@ -332,24 +361,37 @@ def _bring_within_bounds(request: CompensationRequest, start: StartingLight) -> 
     limits = problem.limits
     frames = request.shape.frame_count
     light: Columns = []
-    solves: list[Bounded] = []
-    clipped = np.zeros(frames)
+    clipped_values: list[np.ndarray | None] = []
+    to_solve = {}
     for index, unbounded in enumerate(start.light):
         nearest = limits.clip(unbounded)
         is_clipped = limits.exceeded(unbounded)
         is_best = start.is_on_target and is_clipped is None
         if not is_best and not request.clamp:
-            nearest, solution = problem.nearest(index, start.gain, nearest, problem.settings)
-            if problem.settings.throw and solution.status is Status.MAXITER:
-                raise ConvergenceError(str(solution), solution)
-            solves.append(solution)
-            is_at_bound = (nearest <= limits.low) | (nearest >= limits.highest)
-            is_clipped = solution.saturated & is_at_bound & ~limits.masked[:, None]
+            to_solve[index] = nearest
         light.append(nearest)
+        clipped_values.append(is_clipped)
+    solves: list[Bounded] = []
+    solved = problem.nearest_each(start.gain, to_solve, problem.settings)
+    for index, (nearest, solution) in solved.items():
+        if problem.settings.throw and solution.status is Status.MAXITER:
+            raise ConvergenceError(str(solution), solution)
+        solves.append(solution)
+        # The device rounds light at a bound to a neighbour of it.
+        is_clipped = solution.saturated & limits.are_at_bound(nearest)
+        light[index] = np.where(is_clipped, limits.nearer_bound(nearest), nearest)
+        clipped_values[index] = is_clipped
+    clipped = np.zeros(frames)
+    for is_clipped in clipped_values:
         if is_clipped is not None:
             counts = np.reshape([np.count_nonzero(column) for column in is_clipped.T], (frames, -1))
             clipped += counts.mean(axis=1) / np.count_nonzero(~limits.masked)
-    return BoundedLight(light=light, solves=tuple(solves), frame_clipped=clipped / len(start.light))
+    return BoundedLight(
+        light=light,
+        solves=tuple(solves),
+        clipped_values=clipped_values,
+        frame_clipped=clipped / len(start.light),
+    )
 
 
 def _judge(
@@ -370,6 +412,9 @@ def _judge(
     solutions = start.solutions
     if not solutions:
         solutions = bounded.solves
+    solution = solutions
+    if len(solutions) == 1:
+        solution = solutions[0]
     return Compensation(
         pattern=pattern,
         gain=start.gain,
@@ -378,7 +423,7 @@ def _judge(
         gap=max(error - _least_error(problem, bounded), 0.0) / size,
         frame_errors=frame_errors / np.where(frame_sizes > 0, frame_sizes, black_size),
         frame_clipped=bounded.frame_clipped,
-        solution=solutions[0] if len(solutions) == 1 else solutions,
+        solution=solution,
         limited=bounded.solves,
         transport_error=request.transport_error,
         rtol=problem.settings.rtol,
@@ -416,6 +461,7 @@ def _gather_evidence(
         missing=missing,
         appearance=appearance,
         weights=problem.weights,
+        clipped_values=bounded.clipped_values,
         explained=explained,
         solving=request.T,
         reference=reference,
@@ -489,7 +535,8 @@ def _warn_of_units(desired: Any, evidence: Evidence) -> None:
         return
     highest = max(float(c.max()) for c in evidence.target)
     reached = max(float(c.max()) for c in evidence.appearance)
-    if highest > UNITS_RATIO * reached:
+    # Bounds below 0 leave no light to compare with.
+    if 0.0 < UNITS_RATIO * reached < highest:
         logger.warning(
             "desired reaches %.3g, the scene %.3g at most; %s",
             highest,

@@ -11,9 +11,10 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array
 from ltcl.errors import InputError, InputTypeError
+from ltcl.interop.arrays import giver, kind_of, memory_of
 from ltcl.solvers import Inverse
 from ltcl.tasks.compensation.codes import (
     AUTO,
@@ -28,12 +30,13 @@ from ltcl.tasks.compensation.codes import (
     CODE_TYPES,
     DECODES,
     SRGB,
+    CodeTable,
     code_table,
     light_of_codes,
     srgb_light,
 )
 from ltcl.tasks.compensation.compensate import compensate
-from ltcl.tasks.compensation.inputs import check_inputs
+from ltcl.tasks.compensation.inputs import CompensationRequest, check_inputs
 from ltcl.tasks.compensation.prepared import PreparedFrames, Slot
 from ltcl.transport.transport import Transport
 
@@ -45,7 +48,7 @@ BRIGHT_SHARE = 0.005
 MAX_LATENCIES = 10_000
 LATE = ("wait", "drop")
 MAX_DEPTH = 64
-# Beyond, squares of light leave float32.
+# Beyond, in units of what the bounds allow, squares of light leave float32.
 MAX_LIGHT = 1e15
 MAX_GAIN = 1e15
 
@@ -64,7 +67,8 @@ class FrameStatistics:
     gain : float
         Gain of the last frame.
     products : int
-        Products with R that each frame takes at least.
+        Products with R that a frame takes at least; frames between two whose bounces are computed
+        take none.
     """
 
     frames: int
@@ -118,6 +122,13 @@ class Compensator:
     warm : bool
         Begin the projected steps with the pattern of the frame before, where that is nearer than
         the clamped one. False gives each frame the same pattern whatever came before.
+    bounces_every : int
+        The light of bounces is computed of every so many frames. It stands for that of the frames
+        in between, scaled by the gain: these take no product with R, and their direct light is
+        their own. With light b to add, after b' whose bounces are kept, the error of such a frame
+        is R (b - b'): the light that bounces of the change since then. It is 0 in a still film, and
+        after a cut all that bounces is that of the picture before, until the next frame whose
+        bounces are computed.
     decode : "auto", "srgb" or "linear"
         Meaning of the codes of frames; "auto" takes whole numbers as sRGB and floats as linear
         light. Whole numbers have white at the largest code, floats at 1.
@@ -140,6 +151,9 @@ class Compensator:
     ----------
     gain : float
         Gain of the next frame, which may be set.
+    bounds : (low, high)
+        Bounds of the next frame, which may be set, too: this waits for frames on their way. Until
+        the next frame is given, `light` and `judge` then raise InputError.
     rtol : float
         Tolerance, as given, or what was chosen.
     statistics : FrameStatistics
@@ -148,13 +162,18 @@ class Compensator:
     ------
     InputError, InputTypeError
         As in `ltcl.compensate`; another name of a curve or type, gain="auto" without a film, or
-        a T whose light cannot be undone in a fixed number of steps, with ``clamp=True``.
+        a T whose light cannot be undone in a fixed number of steps, with ``clamp=True`` or
+        ``bounces_every`` above 1, which is also refused for a T without S and for several
+        projectors.
 
     Notes
     -----
     Without an inverse, light is undone by as many steps of Chebyshev's iteration as probes need:
     the light of white, of a random pattern and a random picture are within half of `rtol`. What a
     frame has reached is told by `judge`, when it is asked.
+
+    Where light is beyond the bounds and `clamp` is False, projected steps follow in each frame,
+    also in one in between: they take products with T, and lower its error.
 
     Threads that call a compensator wait for each other. A frame may be an array of the device of T,
     and so may `out`.
@@ -169,6 +188,12 @@ class Compensator:
     >>> future = compensator.submit(numpy.array([[0.15, 0.15]]))
     >>> future.result().round(2).tolist(), compensator.statistics.frames
     ([[0.25, 0.25]], 2)
+
+    In each second frame bounces are those of the frame before; a still film shows no difference:
+
+    >>> half = ltcl.Compensator(T, bounces_every=2, encode="linear", dtype="float32")
+    >>> [half(numpy.array([[light, light]])).round(2).tolist() for light in (0.3, 0.3)]
+    [[[0.5, 0.5]], [[0.5, 0.5]]]
     """
 
     def __init__(
@@ -184,6 +209,7 @@ class Compensator:
         clamp: bool = False,
         deadline_ms: float | None = None,
         warm: bool = True,
+        bounces_every: int = 1,
         decode: str = AUTO,
         encode: Any = SRGB,
         dtype: str = "uint8",
@@ -204,11 +230,12 @@ class Compensator:
         self._frame_change = change ** (1.0 / checks.number("fps", fps, above=0.0))
         self._clamp = checks.flag("clamp", clamp)
         self._is_warm = checks.flag("warm", warm)
+        self._bounces_every = checks.count("bounces_every", bounces_every)
         self.T = T
         self._options = {
-            "bounds": bounds,
-            "background": background,
-            "weights": weights,
+            "bounds": checks.interval("bounds", bounds),
+            "background": _own_picture("background", background),
+            "weights": _own_picture("weights", weights),
             "method": "auto",
             "rtol": rtol,
             "exact": None,
@@ -226,19 +253,21 @@ class Compensator:
         for value in (background, weights):
             self._is_coloured |= np.ndim(value) > 2
         # Checks all arguments, before anything is uploaded.
-        request = self._request(1)
+        request = self._request(1, self._options)
         self.rtol = request.problem.settings.rtol
-        if self.follows_gain and not T.is_square:
+        if self.follows_gain and not T.is_square and T.scene is T:
             raise InputError(
                 "gain is 'follow', but this T has no S, whose light it follows; give a number"
             )
+        if self._bounces_every > 1:
+            _check_keeps_bounces(T, self._bounces_every)
         self._encode = encode
-        high = float(request.problem.limits.high)
-        self._white = high if high > 0.0 else 1.0
-        code_table(encode, self._dtype, self._channels(1), self._white)
+        self._white = _white_of(request)
+        self._code_table(1, self._white)
         self._prepared: dict[tuple[int, str], PreparedFrames] = {}
         # Of the last frame.
         self._last: tuple[PreparedFrames, float] | None = None
+        self._last_colours = 0
         if self.follows_gain and film is not None:
             raise InputError("film is given, but gain is 'follow'; a film belongs to 'auto'")
         if not self.follows_gain:
@@ -263,17 +292,49 @@ class Compensator:
     def gain(self, value: float) -> None:
         self._gain = checks.number("gain", value, above=0.0, most=MAX_GAIN)
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The bounds of the next frame, which may be set; InputError as in `ltcl.compensate`."""
+        return self._options["bounds"]
+
+    @bounds.setter
+    def bounds(self, value: tuple[float, float]) -> None:
+        options = {**self._options, "bounds": checks.interval("bounds", value)}
+        with self._lock:
+            self._wait_for_all()
+            kinds = list(self._prepared)
+            frames = list(self._prepared.values())
+            requests = [self._request(colours, options) for colours, _ in kinds]
+            white = _white_of(requests[0])
+            if all(map(PreparedFrames.takes_bounds, frames, requests)):
+                for (colours, _), prepared, request in zip(kinds, frames, requests, strict=True):
+                    prepared.set_bounds(request, self._code_table(colours, white))
+            else:
+                # What is refused here leaves all as it was.
+                colours, dtype = kinds[0]
+                first = self._prepare_anew(requests[0], colours, np.dtype(dtype), white)
+                self._prepared = {kinds[0]: first}
+            self._options = options
+            self._white = white
+            self._last = None
+
     # Preparation.
 
     def _channels(self, colours: int) -> int:
         """Channels of the light of frames of so many colours."""
         return 3 if self._is_coloured else colours
 
-    def _request(self, colours: int) -> Any:
+    def _code_table(self, colours: int, white: float) -> CodeTable:
+        """The codes of the projector's light for frames of so many colours."""
+        return code_table(self._encode, self._dtype, self._channels(colours), white)
+
+    def _request(self, colours: int, options: dict[str, Any]) -> CompensationRequest:
         """Checked inputs for black pictures of so many colours, or of three if it must be."""
         grid = getattr(self.T, "camera_grid", (1, 1))
         shape = (*grid, 3) if self._channels(colours) == 3 else grid
-        return check_inputs(self.T, np.zeros(shape, np.float32), gain=1.0, **self._options)
+        request = check_inputs(self.T, np.zeros(shape, np.float32), gain=1.0, **options)
+        request.problem.check_range(1.0)
+        return request
 
     def _find_gain(self, gain: Any, film: Iterable[Any] | None) -> float:
         """The gain of all frames."""
@@ -292,12 +353,14 @@ class Compensator:
 
     def _light_of_film(self, film: Iterable[Any]) -> np.ndarray:
         """Linear light of all frames, (k, h, w) or (k, h, w, 3)."""
-        if not isinstance(film, Iterable):
-            raise InputTypeError(f"film is {checks.shown(film)}; it must be frames")
+        if isinstance(film, str | bytes | Path) or not isinstance(film, Iterable):
+            raise InputTypeError(
+                f"film is {checks.shown(film)}; it must be frames, such as a list of arrays"
+            )
         light = []
         for number, frame in enumerate(film, start=1):
             try:
-                light.append(self._light_of_frame(np.asarray(frame)))
+                light.append(self._light_of_frame(_host_array("frame", frame)))
             except (InputError, InputTypeError) as error:
                 raise type(error)(f"film, frame {number}: {error}") from None
         if not light:
@@ -331,23 +394,30 @@ class Compensator:
         for known in self._prepared.values():
             if known.colours == channels:
                 return known.for_codes(colours, dtype, self._decode)
-        table = code_table(self._encode, self._dtype, channels, self._white)
+        request = self._request(channels, self._options)
+        return self._prepare_anew(request, colours, dtype, self._white)
+
+    def _prepare_anew(
+        self, request: CompensationRequest, colours: int, dtype: np.dtype, white: float
+    ) -> PreparedFrames:
+        """Steps that share nothing with those of other frames."""
         return PreparedFrames(
-            self._request(channels),
+            request,
             frame_colours=colours,
             frame_dtype=dtype,
             decode=self._decode,
             dtype=self._dtype,
-            table=table,
+            table=self._code_table(colours, white),
             is_bounded=not self._clamp,
             is_warm=self._is_warm,
             has_peaks=self.follows_gain,
             slots=self._depth,
+            bounces_every=self._bounces_every,
         )
 
     # Frames.
 
-    def __call__(self, frame: Any, out: np.ndarray | Array | None = None) -> Any:
+    def __call__(self, frame: Any, out: Any = None) -> Any:
         """Codes of the projector for a frame; waits.
 
         Parameters
@@ -359,16 +429,23 @@ class Compensator:
 
         Returns
         -------
-        array
+        array of the kind of the frame
             (h, w) on the projector's grid, or (h, w, 3) where T or the frame is in colour.
         """
         begun_at = time.perf_counter()
         with self._lock:
             self._wait_for_all()
             codes = self._codes_of(frame)
-            self._check_out(out, codes)
+            memory = self._memory_of(out, codes)
             prepared, slot = self._begin(codes, begun_at)
-            return self._end(prepared, slot, out)
+            pattern_codes = self._end(prepared, slot)
+            if isinstance(memory, Array):
+                memory.set(pattern_codes)
+            elif memory is not None:
+                np.copyto(memory, pattern_codes)
+        if out is not None:
+            return out
+        return giver(frame)(pattern_codes)
 
     def submit(self, frame: Any) -> Future[np.ndarray | None]:
         """Take a frame, and give its codes later, in order.
@@ -391,7 +468,8 @@ class Compensator:
             prepared, slot = self._begin(codes, begun_at)
             prepared.keep_within_bounds(slot.begun_at + self._seconds)
             prepared.end(slot)
-            future: Future[Any] = self._collector.submit(self._collect, prepared, slot)
+            give = giver(frame)
+            future: Future[Any] = self._collector.submit(self._collect_as, give, prepared, slot)
             self._on_the_way.append(future)
             return future
 
@@ -410,6 +488,10 @@ class Compensator:
         prepared = self._frames_of(colours, codes.dtype)
         slot = prepared.slots[self._turn % self._depth]
         self._turn += 1
+        if prepared.colours != self._last_colours:
+            # Those that are kept for frames of these colours may be of any frame before.
+            prepared.forget_bounces()
+        self._last_colours = prepared.colours
         prepared.begin(slot, codes, self.gain, begun_at)
         self._last = (prepared, self.gain)
         if not self._has_gain:
@@ -433,34 +515,48 @@ class Compensator:
                 )
             if frame.device is not self.T.device:
                 raise InputError(f"frame is on {frame.device}; it must be on {self.T.device}")
+            # Floats on the device are not read for a check.
+            self._check_brightness(1.0)
             return frame
-        codes = np.asarray(frame)
+        codes = _host_array("frame", frame)
         self._check_frame(codes)
         if codes.dtype.kind != "f":
+            self._check_brightness(1.0)
             return codes
         light = srgb_light(codes) if self._decode == SRGB else codes
         light = checks.finite("frame", light)
-        brightest = float(np.max(np.abs(light)))
-        if brightest * self.gain > MAX_LIGHT:
-            raise InputError(
-                f"frame reaches {brightest:.3g} at a gain of {self.gain:.3g}; light must be at "
-                f"most {MAX_LIGHT:g}"
-            )
+        self._check_brightness(float(np.max(np.abs(light))))
         return light.astype(np.float32, copy=False)
 
-    def _check_out(self, out: Any, codes: np.ndarray | Array) -> None:
-        """Refuse a place that does not take the codes of this frame as they are."""
+    def _check_brightness(self, brightest: float) -> None:
+        """Refuse light, 1 for white of whole numbers, far beyond what the bounds allow."""
+        highest = MAX_LIGHT
+        for prepared in self._prepared.values():
+            highest = min(highest, MAX_LIGHT * prepared.unit)
+        if brightest * self.gain > highest:
+            raise InputError(
+                f"frame reaches {brightest:.3g} at a gain of {self.gain:.3g}; with bounds of "
+                f"{self.bounds} light must be at most {highest:.3g}"
+            )
+
+    def _memory_of(self, out: Any, codes: np.ndarray | Array) -> np.ndarray | Array | None:
+        """The place of the codes of this frame; one that does not take them as they are is refused.
+
+        None where there is none.
+        """
         if out is None:
-            return
+            return None
         colours = self._channels(3 if len(codes.shape) == 3 else 1)
         shape = (*self.T.grid, 3) if colours == 3 else self.T.grid
-        is_place = isinstance(out, (np.ndarray, Array))
-        if not is_place or out.shape != shape or out.dtype.name != self._dtype:
+        memory = out if isinstance(out, Array) else memory_of(out)
+        if memory is None or memory.shape != shape or memory.dtype.name != self._dtype:
             raise InputError(
-                f"out is {checks.shown(out)}; it must be an array {shape} of {self._dtype}"
+                f"out is {checks.shown(out)}; it must be an array {shape} of {self._dtype}, in "
+                "memory that NumPy can write to"
             )
-        if isinstance(out, np.ndarray) and not out.flags.writeable:
+        if isinstance(memory, np.ndarray) and not memory.flags.writeable:
             raise InputError("out is read-only; it must be an array that can be written")
+        return memory
 
     def _check_frame(self, frame: Any) -> None:
         grid = self.T.camera_grid
@@ -471,16 +567,16 @@ class Compensator:
         if frame.dtype.name not in ("uint8", "uint16", "float32", "float64", "float16"):
             raise InputTypeError(f"frame holds {frame.dtype}; it must be uint8, uint16 or floats")
 
-    def _end(self, prepared: PreparedFrames, slot: Slot, out: Any) -> Any:
+    def _end(self, prepared: PreparedFrames, slot: Slot) -> np.ndarray:
         prepared.keep_within_bounds(slot.begun_at + self._seconds)
         prepared.end(slot)
-        codes = self._collect(prepared, slot)
-        if out is None:
-            return codes
-        if isinstance(out, Array):
-            return out.set(codes)
-        np.copyto(out, codes)
-        return out
+        return self._collect(prepared, slot)
+
+    def _collect_as(
+        self, give: Callable[[np.ndarray], Any], prepared: PreparedFrames, slot: Slot
+    ) -> Any:
+        """The codes of a frame in the kind of array that it was."""
+        return give(self._collect(prepared, slot))
 
     def _collect(self, prepared: PreparedFrames, slot: Slot) -> np.ndarray:
         """Wait for the codes of a frame, and take note of it."""
@@ -497,21 +593,22 @@ class Compensator:
         """Begin at the gain of the first frame, which is then computed again."""
         prepared.end(slot)
         prepared.take(slot)
-        wanted = _gain_of_peaks(slot)
+        gain_of_peaks = _gain_of_peaks(slot)
         self._has_gain = True
-        if wanted is None:
+        if gain_of_peaks is None:
             return
-        self.gain = min(wanted, MAX_GAIN)
+        self.gain = min(gain_of_peaks, MAX_GAIN)
+        prepared.forget_bounces()
         prepared.begin(slot, codes, self.gain, slot.begun_at)
         self._last = (prepared, self.gain)
 
     def _follow(self, slot: Slot) -> None:
         """Bring the gain of frames to come nearer to what this one allows."""
-        wanted = _gain_of_peaks(slot)
-        if wanted is not None:
+        gain_of_peaks = _gain_of_peaks(slot)
+        if gain_of_peaks is not None:
             lowest = self.gain / self._frame_change
             highest = self.gain * self._frame_change
-            self.gain = min(max(wanted, lowest), highest, MAX_GAIN)
+            self.gain = min(max(gain_of_peaks, lowest), highest, MAX_GAIN)
 
     # Facts.
 
@@ -540,25 +637,29 @@ class Compensator:
     def light(self) -> np.ndarray:
         """The projector light of the last frame, (h, w) or (h, w, 3) float32.
 
-        InputError before the first frame.
+        InputError before the first frame, also the first one with other bounds.
         """
         with self._lock:
             if self._last is None:
-                raise InputError("no frame was given yet, whose light could be told")
+                raise InputError("no frame was given yet with these bounds; give one first")
             prepared = self._last[0]
             light = prepared.light()
         h, w = self.T.grid
-        return light.reshape((h, w, 3) if prepared.colours == 3 else (h, w))
+        if prepared.colours == 3:
+            shape = (h, w, 3)
+        else:
+            shape = (h, w)
+        return light.reshape(shape)
 
     def judge(self) -> FrameError:
         """The error and the clipped share of the last frame, by a product with T.
 
-        InputError before the first frame.
+        InputError before the first frame, also the first one with other bounds.
         """
         with self._lock:
             self._wait_for_all()
             if self._last is None:
-                raise InputError("no frame was given yet, which could be judged")
+                raise InputError("no frame was given yet with these bounds; give one first")
             error, clipped = self._last[0].judge()
         return FrameError(error=error, clipped=clipped)
 
@@ -567,11 +668,37 @@ class Compensator:
         self._is_closed = True
         self._collector.shutdown(wait=True)
 
+    def __reduce__(self) -> Any:
+        raise InputTypeError(
+            "Compensator lies on a device and cannot be pickled; pickle its T and options, and "
+            "make it where it works, such as in a worker process"
+        )
+
     def __enter__(self) -> Compensator:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _white_of(request: CompensationRequest) -> float:
+    """The light of the largest code."""
+    high = float(request.problem.limits.high)
+    return high if high > 0.0 else 1.0
+
+
+def _own_picture(name: str, value: Any) -> Any:
+    """A copy of a picture, which its owner may change; None and a number as they are."""
+    if value is None or np.ndim(value) == 0:
+        return value
+    return np.array(checks.real(name, value))
+
+
+def _host_array(name: str, value: Any) -> np.ndarray:
+    """An array of any library as NumPy's; what is no array of numbers is refused later."""
+    if kind_of(type(value)) is None:
+        return np.asarray(value)
+    return checks.real(name, value)
 
 
 def _check_dtype(dtype: Any) -> str:
@@ -585,9 +712,23 @@ def _check_dtype(dtype: Any) -> str:
     return name
 
 
+def _check_keeps_bounces(T: Transport, every: int) -> None:
+    """Refuse a T without an S of its own, of whose bounces some frames could do without."""
+    if T.is_square:
+        return
+    if T.scene is not T:
+        raise InputError(
+            f"bounces_every is {every}, but T has several projectors, which share the light of "
+            "each frame; leave it out"
+        )
+    raise InputError(
+        f"bounces_every is {every}, but this T has no S, whose bounces it keeps; leave it out"
+    )
+
+
 def _gain_of_peaks(slot: Slot) -> float | None:
     """The gain at which the light of a frame would reach the upper bound; None for a dark one."""
-    peaks = np.sort(slot.peaks_host)
+    peaks = np.sort(slot.peaks.take())
     place = math.ceil((1.0 - BRIGHT_SHARE) * (len(peaks) - 1))
     peak = float(peaks[place])
     if not peak > 0.0:

@@ -257,7 +257,8 @@ class GainDescent:
         self.is_usable = 0.0 < first_bound < np.inf and self.guess.square > 0.0
         if not self.is_usable:
             return
-        desired_unit = power_of_two(max(float(np.max(np.abs(d))) for d in problem.desired))
+        brightest = max(float(np.max(np.abs(desired))) for desired in problem.desired)
+        desired_unit = power_of_two(brightest)
         picture_unit = power_of_two(first_bound * desired_unit)
         self.gain_unit = picture_unit / desired_unit
         self.systems = []
@@ -372,7 +373,8 @@ class GainDescent:
             system.start(system.descent.x.get() + change * slope, self.gain)
 
     def _read(self) -> _Residual:
-        return _Residual(*np.sum([system.read() for system in self.systems], axis=0))
+        residuals = [system.read() for system in self.systems]
+        return _Residual(*np.sum(residuals, axis=0))
 
     def _step(self) -> None:
         for system in self.systems:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.optimize
+import scipy  # its subpackage optimize is loaded at the first use
 
 from ltcl.errors import InputError
 from ltcl.solvers import SolveSettings, Status
@@ -175,17 +175,14 @@ class GainTrials:
 
         The error of a settled trial is above the least by `accuracy` at most.
         """
-        solved = []
-        for index, light in enumerate(start):
-            if self.is_on_host:
-                solved.append(self._solve_on_host(index, gain))
-            else:
-                solved.append(self._solve_on_device(index, gain, light, accuracy))
+        if self.is_on_host:
+            solved = [self._solve_on_host(index, gain) for index in range(len(start))]
+        else:
+            solved = self._solve_on_device(gain, start, accuracy)
         return self._measure(gain, solved)
 
-    def _solve_on_device(
-        self, index: int, gain: float, start: np.ndarray, accuracy: float
-    ) -> SystemLight:
+    def _solve_on_device(self, gain: float, start: Columns, accuracy: float) -> list[SystemLight]:
+        """The nearest light of all systems, in a limited number of steps."""
         problem = self.problem
         columns = sum(d.shape[1] for d in problem.desired)
         settings = SolveSettings(
@@ -193,14 +190,20 @@ class GainTrials:
             atol=accuracy * gain * self.desired_norm / np.sqrt(columns),
             maxiter=MAX_SOLVE_STEPS,
         )
-        light, solution = problem.nearest(index, gain, start, settings)
-        is_settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
-        return SystemLight(
-            light=light,
-            errors=solution.errors / problem.weight_unit,
-            least=solution.least / problem.weight_unit,
-            is_settled=is_settled,
-        )
+        solved = []
+        for light, solution in problem.nearest_each(
+            gain, dict(enumerate(start)), settings
+        ).values():
+            is_settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
+            solved.append(
+                SystemLight(
+                    light=light,
+                    errors=solution.errors / problem.weight_unit,
+                    least=solution.least / problem.weight_unit,
+                    is_settled=is_settled,
+                )
+            )
+        return solved
 
     def _solve_on_host(self, index: int, gain: float) -> SystemLight:
         """The nearest light of one system by active sets, in float64."""
@@ -242,6 +245,7 @@ class GainTrials:
         for system in solved:
             above_least += float(np.sum(system.errors * (system.errors - system.least)))
 
+        are_settled = all(system.is_settled for system in solved)
         return GainTrial(
             gain=gain,
             light=[system.light for system in solved],
@@ -249,7 +253,7 @@ class GainTrials:
             least=(error - above_least / divisor) / (gain * self.desired_norm),
             slope=inner_product(missing, Wd) / (divisor * self.desired_norm),
             direction=self._direction(subtract(multiply(gain, Wd), missing)),
-            is_settled=all(system.is_settled for system in solved),
+            is_settled=are_settled,
         )
 
     def direction(self, light: Columns) -> PictureDirection:

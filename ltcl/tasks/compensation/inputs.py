@@ -121,22 +121,18 @@ def check_inputs(
     if T.background is not None:
         dark = [light + black for light, black in zip(dark, T.background, strict=True)]
     channel_weights, weight_unit = check_weights(weights, T, shape, columns)
-    if inverse is not None:
-        other_method = None if method == "auto" else method
-        check_inverse(T, inverse, rtol, exact=exact, method=other_method)
-    if rtol is None:
-        rtol = RTOL
-        if T.is_compressed or inverse is not None:
-            rtol = default_rtol(RTOL, T, exact, inverse)
-    settings = check_settings(T, method, rtol, options)
-    if checks.flag("clamp", clamp) and not T.is_square and T.scene is T:
-        raise InputError(
-            "clamp is True, but this T has no S; its light is found within the bounds only"
-        )
+    settings = check_solves(
+        T,
+        method=method,
+        rtol=rtol,
+        exact=exact,
+        inverse=inverse,
+        clamp=clamp,
+        options=options,
+    )
     reference = T
     judging_systems: Sequence[Operator] = ()
     if exact is not None:
-        check_exact(T, exact)
         reference = exact
         judging_systems = exact.systems
     if channel_weights is not None:
@@ -169,6 +165,34 @@ def check_inputs(
         exact=judging_systems,
         clamp=clamp,
     )
+
+
+def check_solves(
+    T: Transport,
+    *,
+    method: str = "auto",
+    rtol: float | None = None,
+    exact: Transport | None = None,
+    inverse: Inverse | None = None,
+    clamp: bool = False,
+    options: dict[str, Any],
+) -> SolveSettings:
+    """Refuse what no picture could be solved with; the settings of the solves."""
+    if inverse is not None:
+        other_method = None if method == "auto" else method
+        check_inverse(T, inverse, rtol, exact=exact, method=other_method)
+    if rtol is None:
+        rtol = RTOL
+        if T.is_compressed or inverse is not None:
+            rtol = default_rtol(RTOL, T, exact, inverse)
+    settings = check_settings(T, method, rtol, options)
+    if checks.flag("clamp", clamp) and not T.is_square and T.scene is T:
+        raise InputError(
+            "clamp is True, but this T has no S; its light is found within the bounds only"
+        )
+    if exact is not None:
+        check_exact(T, exact)
+    return settings
 
 
 def check_gain(gain: Any, loss: Any) -> float | None:

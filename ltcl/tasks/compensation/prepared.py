@@ -17,24 +17,31 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.device import Array, Device, vectors
+from ltcl.device import Array, Device, transfers, vectors
 from ltcl.device.kernels import Kernel, Launch, Queued, in_order
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense, IdentityPlus, Operator, block_diagonal
 from ltcl.operators.epilogue import Epilogue
 from ltcl.solvers.auto import SMALL
-from ltcl.solvers.bounded import Descent, Search
+from ltcl.solvers.bounded import Descent, Search, power_of_two
 from ltcl.solvers.chebyshev import chebyshev_steps
 from ltcl.solvers.survey import survey
 from ltcl.tasks.compensation.codes import CODE_TYPES, CodeTable, light_of_codes
 from ltcl.tasks.compensation.inputs import CompensationRequest
+from ltcl.tasks.compensation.kept_bounces import KeptBounces
 from ltcl.tasks.compensation.problem import BOUNDS_SLACK
 
 # Work-items of a group on a GPU, and spans of pixels for each unit of a CPU.
 GROUP = 64
 SPANS_PER_UNIT = 16
+# Pixels that an item of a CPU takes at a time, channel by channel.
+CPU_BLOCK = 64
 # Pixels whose brightest light counts as one.
 STRIP_PIXELS = 256
+# Light may be so much brighter or darker than its unit.
+MAX_UNIT_CHANGE = 64.0
+# Light that no bound cuts off.
+FREE_LIGHT = 1e30
 # Of the tolerance: what probes may leave after a fixed number of steps, since frames are others.
 PROBE_SHARE = 0.5
 # Steps beyond which fixed steps are given up.
@@ -74,6 +81,14 @@ class LightLayout:
         if self.is_stacked:
             return values.reshape(self.channels, self.pixels).T
         return values.reshape(self.pixels, self.channels)
+
+
+def _unit_of(request: CompensationRequest) -> float:
+    """A power of two near the brightest light that the projector makes."""
+    limits = request.problem.limits
+    brightest = max(abs(limits.low), abs(limits.high))
+    largest_scale = max(float(scale.max()) for _, scale in request.problem.systems)
+    return power_of_two(brightest * largest_scale)
 
 
 class ByInverse:
@@ -175,37 +190,46 @@ class ByFixedSteps:
         """Queue all launches."""
         self._begin()
         stepper = self._stepper
-        # Norms of the steps are not read.
-        stepper.waiting = 0
         stepper.start(self._numbers[0][1])
         for keep, gain in self._numbers[1:]:
             stepper.step(keep, gain)
+        # Norms of the steps are not read.
+        stepper.finish()
         self._finish()
 
 
 class BySharing:
-    """Light of several projectors: direct light by `steps`, clipped as their drive, and shared.
+    """Light of several projectors: direct light, its drive, and the shares of all, within bounds.
 
     A drive within the bounds gives each projector no more than its ceiling.
+
+    Attributes
+    ----------
+    products : int
+    queue : Queued
+        All launches.
+    free, queue_free : Array, Queued
+        Light without bounds, and what leaves it there after `queue`.
     """
 
     def __init__(
-        self, steps: ByInverse | ByFixedSteps, clip: Launch, share: Queued, exceeded: Array
+        self,
+        products: int,
+        queue: Queued,
+        clip: Launch,
+        exceeded: Array,
+        free: Array,
+        queue_free: Queued,
     ) -> None:
-        self.products = steps.products
-        self._steps = steps
+        self.products = products
+        self.queue = queue
+        self.free = free
+        self.queue_free = queue_free
         self._clip = clip
-        self._share = share
         self._exceeded = exceeded
 
-    def queue(self) -> None:
-        """Queue all launches."""
-        self._steps.queue()
-        self._clip()
-        self._share()
-
     def count_clipped(self) -> int:
-        """The number of values of the drive that were beyond the bounds; waits."""
+        """The number of values that were beyond the bounds; waits."""
         self._exceeded.set(np.zeros(1, np.int32))
         self._clip()
         return int(self._exceeded.get()[0])
@@ -234,9 +258,10 @@ class WithinBounds:
         box: Any,
         rtol: float,
         is_warm: bool,
+        planes: int,
     ) -> None:
-        self.descent = Descent(A, columns, weights, box)
-        self._lower, self._upper = (bound[:, None] for bound in box)
+        self.descent = Descent(A, columns, weights, box, planes)
+        self._box = box
         self.target = self.descent.b
         self.x = self.descent.x
         self.start = self.x.like()
@@ -246,6 +271,12 @@ class WithinBounds:
         self._rtol = rtol
         self.errors: np.ndarray | None = None
         self.steps = 0
+
+    def set_box(self, box: Any) -> None:
+        """Take other bounds; the light of the frame before may be outside."""
+        self.descent.set_box(box)
+        self._box = box
+        self._has_last = False
 
     def keep_start(self) -> None:
         """Take the clamped light as it is, where that is the best there is."""
@@ -271,7 +302,7 @@ class WithinBounds:
                 descent.refresh()
         search = Search(descent, self._rtol, deadline=deadline)
         search.run()
-        self.steps = len(search.residuals) - 1
+        self.steps = len(search.history) - 1
         self.errors = search.errors
         if search.is_worse.any():
             self.x.copy_from(self.start)
@@ -287,8 +318,9 @@ class WithinBounds:
         """The number of values at a bound, beyond which a step would go."""
         x = self.x.get()
         # The device rounds light at a bound to a neighbour of it.
-        slack = BOUNDS_SLACK * (self._upper - self._lower)
-        is_at_bound = (x <= self._lower + slack) | (x >= self._upper - slack)
+        lower, upper = (bound[:, None] for bound in self._box)
+        slack = BOUNDS_SLACK * (upper - lower)
+        is_at_bound = (x <= lower + slack) | (x >= upper - slack)
         return int(np.count_nonzero(self.descent.saturated(x) & is_at_bound))
 
 
@@ -296,14 +328,13 @@ class WithinBounds:
 class Slot:
     """Buffers of one frame on its way, on the device and on the host."""
 
-    frame: Array
-    codes: Array
+    frame: transfers.Upload
+    codes: transfers.Download
+    peaks: transfers.Download
     decode: Launch
+    # Of a frame for which the bounces of an earlier one stand.
+    decode_between: Launch | None
     encode: Launch
-    frame_host: np.ndarray
-    codes_host: np.ndarray
-    peaks_host: np.ndarray
-    event: Any = None
     begun_at: float = 0.0
     gain: float = 1.0
 
@@ -327,6 +358,8 @@ class PreparedFrames:
         Whether the brightest light of each strip of pixels is wanted.
     slots : int
         Frames that may be on their way.
+    bounces_every : int
+        Frames from one whose bounces are computed to the next.
     """
 
     def __init__(
@@ -342,6 +375,7 @@ class PreparedFrames:
         is_warm: bool,
         has_peaks: bool,
         slots: int,
+        bounces_every: int = 1,
     ) -> None:
         T = request.T
         self.device: Device = request.problem.systems[0].A.device
@@ -349,7 +383,6 @@ class PreparedFrames:
         self.frame_dtype = np.dtype(frame_dtype)
         self.dtype = dtype
         self._request = request
-        self._table = table
         is_stacked = T.channels == 3
         colours = 3 if is_stacked else frame_colours
         self.colours = colours
@@ -359,10 +392,15 @@ class PreparedFrames:
         self.shown = LightLayout(pixels=h * w, channels=colours, is_stacked=is_stacked)
         self.grid = T.grid
         self.camera_grid = T.camera_grid
-        self.unit = self._find_unit()
+        self.unit = _unit_of(request)
         self._device_tables(decode)
+        self._set_code_table(table)
         self._is_warm = is_warm
+        self._has_peaks = has_peaks
         self._make_steps(is_bounded, has_peaks)
+        self._kept_bounces: KeptBounces | None = None
+        if bounces_every > 1:
+            self._kept_bounces = self._keep_bounces(bounces_every)
         self.slots = [self._slot() for _ in range(slots)]
 
     def for_codes(self, frame_colours: int, frame_dtype: Any, decode: str) -> PreparedFrames:
@@ -374,17 +412,28 @@ class PreparedFrames:
         other.slots = [other._slot() for _ in self.slots]
         return other
 
-    # Preparation.
+    def takes_bounds(self, request: CompensationRequest) -> bool:
+        """True if `set_bounds` takes the bounds of another request; else all is prepared anew.
 
-    def _find_unit(self) -> float:
-        """A power of two near the brightest light that the projector makes."""
-        limits = self._request.problem.limits
-        brightest = max(abs(limits.low), abs(limits.high))
-        largest_scale = max(float(scale.max()) for _, scale in self._request.problem.systems)
-        size = brightest * largest_scale
-        if not size > 0.0:
-            return 1.0
-        return float(np.exp2(np.floor(np.log2(size))))
+        That is so for light of another size, and where it is shared between projectors.
+        """
+        if isinstance(self.direct_steps, BySharing):
+            return False
+        unit = _unit_of(request)
+        return 1.0 / MAX_UNIT_CHANGE <= unit / self.unit <= MAX_UNIT_CHANGE
+
+    def set_bounds(self, request: CompensationRequest, table: CodeTable) -> None:
+        """Take the bounds of another request, and a table for them; nothing may be on its way."""
+        self._request = request
+        self._set_code_table(table)
+        if self.bounded is not None:
+            self.bounded.set_box(self._box())
+        self._judge = self.bounded
+        self._bind_to_bounds()
+        for slot in self.slots:
+            slot.encode = self._bind_encode(slot.codes.array, self.dtype, table)
+
+    # Preparation.
 
     def _device_tables(self, decode: str) -> None:
         """Upload the tables of codes and the factors of light."""
@@ -395,13 +444,17 @@ class PreparedFrames:
         self._subtracts = float(request.problem.has_background)
         self._background_host = background
         self._background = device.upload(background / self.unit)
-        self._starts = device.upload(self._table.starts, np.int32)
-        self._thresholds = device.upload(self._table.thresholds)
         mixing = np.eye(self.colours)
-        self._is_mixed = request.T.mixing is not None
+        # Several projectors share light whose colours are unmixed already.
+        self._is_mixed = request.T.mixing is not None and request.T.scene is request.T
         if request.T.mixing is not None:
             mixing = np.linalg.inv(request.T.mixing)
         self._mixing = device.upload(mixing)
+
+    def _set_code_table(self, table: CodeTable) -> None:
+        self._table = table
+        self._starts = self.device.upload(table.starts, np.int32)
+        self._thresholds = self.device.upload(table.thresholds)
 
     def _set_light_table(self, decode: str) -> None:
         self._light_table = self.device.upload(light_of_codes(decode, self.frame_dtype))
@@ -445,42 +498,47 @@ class PreparedFrames:
             self.direct_steps = self._sharing_steps()
         self._exceeded = device.upload(np.zeros(1), np.int32)
         self._no_excess = np.zeros(1, np.int32)
-        scales = self._scales()
-        self._unknown_scales = device.upload(scales)
-        limits = request.problem.limits
-        # Unknowns of the darkest light that is allowed nearest to none.
-        self._darkest = device.upload(scales * np.clip(0.0, limits.low, limits.high))
+        self._unknown_scales = device.upload(self._scales())
         self._judge: WithinBounds | None = self.bounded
+        self._strips = -(-self.shown.pixels // STRIP_PIXELS)
+        self._find_peaks: Launch | None = None
+        if has_peaks and self.direct_steps is None:
+            raise InputError(
+                f"gain is 'follow', but {MAX_FIXED_STEPS} steps do not undo the light of this "
+                "T, whose brightness it follows; give inverse=ltcl.invert(T), or a number"
+            )
+        self._bind_to_bounds()
+
+    def _bind_to_bounds(self) -> None:
+        """Bind the launches that know the bounds."""
+        limits = self._request.problem.limits
+        # Unknowns of the darkest light that is allowed nearest to none.
+        darkest = self._scales() * np.clip(0.0, limits.low, limits.high)
+        self._darkest = self.device.upload(darkest)
         self._make_final()
         if self.bounded is not None and self.direct_steps is not None:
             self._clip = self._bind_clip(self.bounded)
-        strips = -(-self.shown.pixels // STRIP_PIXELS)
-        self._peaks = device.empty(strips)
-        self._find_peaks: Launch | None = None
-        if has_peaks:
-            if self.direct_steps is None:
-                raise InputError(
-                    f"gain is 'follow', but {MAX_FIXED_STEPS} steps do not undo the light of this "
-                    "T, whose brightness it follows; give inverse=ltcl.invert(T), or a number"
-                )
+        if self._has_peaks:
             self._find_peaks = self._bind_peaks()
 
     def _bounded_steps(self) -> WithinBounds:
         problem = self._request.problem
         A = block_diagonal([system.A for system in problem.systems])
-        scales = self._scales()[:, :1]
-        lower = (scales * problem.limits.low).astype(np.float32)[:, 0]
-        highest = []
-        for _, scale in problem.systems:
-            highest.append(np.broadcast_to(problem.limits.highest, (len(scale), 1)))
-        upper = scales * self.shown.from_channels(highest)[:, :1]
-        upper = upper.astype(np.float32)[:, 0]
         weights = None
         if problem.weights is not None:
             weights = self.seen.from_channels(problem.weights)
         columns = self.seen.shape[1]
         rtol = problem.settings.rtol
-        return WithinBounds(A, columns, weights, (lower, upper), rtol, self._is_warm)
+        planes = len(problem.systems)
+        return WithinBounds(A, columns, weights, self._box(), rtol, self._is_warm, planes)
+
+    def _box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest unknowns of all systems, in units of light."""
+        problem = self._request.problem
+        boxes = [problem.box(index) for index in range(len(problem.systems))]
+        lower = np.concatenate([box[0] for box in boxes]) / self.unit
+        upper = np.concatenate([box[1] for box in boxes]) / self.unit
+        return lower, upper
 
     def _direct_steps(self, direct: Array) -> ByInverse | ByFixedSteps | None:
         """The way from light to add to direct light; None if steps do not converge."""
@@ -505,6 +563,21 @@ class PreparedFrames:
                 f"{rtol:g}; give inverse=ltcl.invert(T), or leave out clamp"
             )
         return None
+
+    def _keep_bounces(self, every: int) -> KeptBounces:
+        """The light of bounces for frames in between, whose background's is found here."""
+        if self.direct_steps is None:
+            raise InputError(
+                f"bounces_every is {every}, but {MAX_FIXED_STEPS} steps do not undo the light of "
+                "this T, whose bounces it keeps; give inverse=ltcl.invert(T), or leave it out"
+            )
+        background = None
+        if self._subtracts:
+            self.target.copy_from(self._background)
+            self.direct_steps.queue()
+            background = self.direct.like()
+            vectors.axpby(1.0, self.direct, -1.0, self.target, background)
+        return KeptBounces(every, self.target, self.direct, background)
 
     def _probes(self, S: Operator) -> np.ndarray:
         """Light of white, of a random pattern, and a random picture, (3, rows, columns)."""
@@ -553,64 +626,125 @@ class PreparedFrames:
         )
 
     def _sharing_steps(self) -> BySharing | None:
-        """The way from light to add to the light of several projectors; None for mixed colours."""
+        """The way from light to add to the light of several projectors; None if all must be lit."""
         request = self._request
         T = request.T
-        if T.couples or request.problem.limits.low > 0.0:
-            if self.bounded is None:
-                raise InputError(
-                    "clamp is True, but projectors that mix colours, or a lower bound above 0, "
-                    "need the solve within the bounds; leave out clamp"
-                )
+        if request.problem.limits.low > 0.0:
+            self._refuse_without_sharing()
             return None
         device = self.device
         direct = device.empty(self.seen.shape)
         steps = self._direct_steps(direct)
         if steps is None:
             return None
-        divisors = self.seen.from_channels([divisor[:, None] for divisor in T.light_of_white])
-        factors = np.divide(self.unit, divisors, out=np.zeros_like(divisors), where=divisors > 0.0)
         drive = device.empty(self.seen.shape)
         exceeded = device.upload(np.zeros(1), np.int32)
-        arguments = self._light_arguments(device.upload(factors), direct)
-        clip = self._bind(
-            self._kernel("clip", "float32", self.seen, MIXED=0),
+        matrix = T.sharing_matrix() / self.unit
+        count = self.seen.channels if self.seen.is_stacked and T.blocks is None else 1
+        share = block_diagonal([CSR(device, matrix)] * count)
+        free = device.empty(self.shown.shape)
+        make_free = in_order(
+            [self._bind_drive(direct, drive, exceeded, FREE_LIGHT), share.bind(drive, free)]
+        )
+        if T.blocks is not None:
+            # Each projector unmixes its colours, before which no bounds are known.
+            clip = self._bind_ceilings(free, exceeded)
+            queue = in_order([steps.queue, make_free, clip])
+            return BySharing(steps.products, queue, clip, exceeded, free, in_order([]))
+        clip = self._bind_drive(direct, drive, exceeded, None)
+        queue = in_order([steps.queue, clip, share.bind(drive, self.direct)])
+        return BySharing(steps.products, queue, clip, exceeded, free, make_free)
+
+    def _bind_drive(
+        self, direct: Array, drive: Array, exceeded: Array, bound: float | None
+    ) -> Launch:
+        """The launch of the drive, with colours unmixed, from direct light; None: the bounds."""
+        T = self._request.T
+        limits = self._request.problem.limits
+        divisors = self.seen.from_channels([divisor[:, None] for divisor in T.light_of_white])
+        factors = np.divide(self.unit, divisors, out=np.zeros_like(divisors), where=divisors > 0.0)
+        arguments = self._light_arguments(self.device.upload(factors), direct)
+        arguments["pixels"] = self.seen.pixels
+        arguments["low"] = limits.low if bound is None else -bound
+        arguments["high"] = limits.high if bound is None else bound
+        return self._bind(
+            self._kernel("clip", "float32", self.seen, MIXED=int(T.mixing is not None)),
             self.seen,
             slack=0.0,
-            scales=device.upload(np.ones(self.seen.shape)),
+            scales=self.device.upload(np.ones(self.seen.shape)),
             x=drive,
             exceeded=exceeded,
-            **arguments | {"pixels": self.seen.pixels},
+            **arguments,
         )
-        matrix = T.sharing_matrix() / self.unit
-        count = self.seen.channels if self.seen.is_stacked else 1
-        share = block_diagonal([CSR(device, matrix)] * count)
-        return BySharing(steps, clip, share.bind(drive, self.direct), exceeded)
+
+    def _bind_ceilings(self, free: Array, exceeded: Array) -> Launch:
+        """The launch that brings light below the ceilings of the projectors, in `direct`."""
+        limits = self._request.problem.limits
+        ceilings = self._request.T.ceilings
+        assert ceilings is not None  # noqa: S101 - several projectors have them
+        columns = self.shown.from_channels([ceilings[:, None]] * self.colours)
+        factors = np.divide(self.unit, columns, out=np.zeros_like(columns), where=columns > 0.0)
+        arguments = self._light_arguments(self.device.upload(factors), free)
+        arguments["low"] = min(limits.low, 0.0)
+        return self._bind(
+            self._kernel("clip", "float32", self.shown, MIXED=0),
+            self.shown,
+            slack=0.0,
+            scales=self.device.upload(columns / self.unit),
+            x=self.direct,
+            exceeded=exceeded,
+            **arguments,
+        )
+
+    def _refuse_without_sharing(self) -> None:
+        """Refuse what needs light before the solve within the bounds."""
+        setting = ""
+        if self.bounded is None:
+            setting = "clamp is True"
+        elif self._has_peaks:
+            setting = "gain is 'follow'"
+        elif self._request.inverse is not None:
+            setting = "inverse is given"
+        if setting:
+            raise InputError(
+                f"{setting}, but bounds begin above 0, where several projectors take the solve "
+                "within the bounds alone; leave it out"
+            )
 
     def _bind_peaks(self) -> Launch:
         """The launch of the peaks, after the light of the background itself is found."""
         assert self.direct_steps is not None  # noqa: S101 - only then is it called
-        shift = self._peaks
+        peaks = self.device.empty(self._strips)
+        shift = peaks
+        # Light of several projectors is clipped before it is shared.
+        free = self.direct
+        if isinstance(self.direct_steps, BySharing):
+            free = self.direct_steps.free
         if self._subtracts:
             self.target.set(np.asarray(self._background_host / self.unit, np.float32))
             self.direct_steps.queue()
+            if isinstance(self.direct_steps, BySharing):
+                self.direct_steps.queue_free()
             shift = self.device.empty(self.shown.shape)
-            shift.set(self.light_of_direct())
+            shift.set(self.light_of_direct(free))
         kernel = self._kernel("peaks", "float32", self.shown, MIXED=int(self._is_mixed))
         return kernel.bind(
-            self._peaks.size,
+            self._strips,
             GROUP,
             span=STRIP_PIXELS,
             shifts=self._subtracts,
             shift=shift,
-            peaks=self._peaks,
-            **self._light_arguments(self._direct_factors, self.direct),
+            peaks=peaks,
+            **self._light_arguments(self._direct_factors, free),
         )
 
     def _kernel(self, name: str, dtype: str, light: LightLayout, **defines: int) -> Kernel:
         """A kernel of frames.cl for codes of a type, and for light that stands so."""
         code = CODE_TYPES[dtype]
-        return self.device.kernel("frames", f"frames_{name}", CODE=code, **light.defines, **defines)
+        block = CPU_BLOCK if self.device.is_cpu else 1
+        return self.device.kernel(
+            "frames", f"frames_{name}", CODE=code, BLOCK=block, **light.defines, **defines
+        )
 
     def _bind(self, kernel: Kernel, light: LightLayout, **arguments: Any) -> Launch:
         """The launch of a kernel: a pixel an item, or some long spans of pixels on a CPU."""
@@ -627,35 +761,55 @@ class PreparedFrames:
         dtype = np.dtype(self.dtype)
         frame = self.device.empty((seen.pixels, self.frame_colours), self.frame_dtype)
         codes = self.device.empty((shown.pixels, self.colours), dtype)
+        decode_between = None
+        if self._kept_bounces is not None:
+            decode_between = self._bind_decode_between(frame, self._kept_bounces)
         return Slot(
-            frame=frame,
-            codes=codes,
+            frame=transfers.upload(frame),
+            codes=transfers.download(codes),
+            peaks=transfers.download(self.device.empty(self._strips)),
             decode=self._bind_decode(frame),
+            decode_between=decode_between,
             encode=self._bind_encode(codes, self.dtype, self._table),
-            frame_host=np.empty(frame.shape, frame.dtype),
-            codes_host=np.empty(codes.shape, codes.dtype),
-            peaks_host=np.zeros(self._peaks.size, np.float32),
         )
 
     def _bind_decode(self, frame: Array) -> Launch:
-        kernel = self._kernel(
+        kernel = self._decode_kernel(KEPT=0)
+        return self._bind(kernel, self.seen, **self._decode_arguments(frame))
+
+    def _bind_decode_between(self, frame: Array, kept: KeptBounces) -> Launch:
+        """The launch of light to add, and of direct light by the bounces of an earlier frame."""
+        background = kept.light if kept.background is None else kept.background
+        return self._bind(
+            self._decode_kernel(KEPT=1),
+            self.seen,
+            share=1.0,
+            kept=kept.light,
+            background_bounces=background,
+            direct=self.direct,
+            **self._decode_arguments(frame),
+        )
+
+    def _decode_kernel(self, **defines: int) -> Kernel:
+        return self._kernel(
             "decode",
             self.frame_dtype.name,
             self.seen,
             COLOURS=self.frame_colours,
             TABLE=int(self._has_table),
+            **defines,
         )
-        return self._bind(
-            kernel,
-            self.seen,
-            pixels=self.seen.pixels,
-            gain=1.0,
-            subtracts=self._subtracts,
-            codes=frame,
-            table=self._light_table,
-            background=self._background,
-            out=self.target,
-        )
+
+    def _decode_arguments(self, frame: Array) -> dict[str, Any]:
+        return {
+            "pixels": self.seen.pixels,
+            "gain": 1.0,
+            "subtracts": self._subtracts,
+            "codes": frame,
+            "table": self._light_table,
+            "background": self._background,
+            "out": self.target,
+        }
 
     def _bind_encode(self, codes: Array, dtype: str, table: CodeTable) -> Launch:
         kernel = self._kernel(
@@ -688,14 +842,28 @@ class PreparedFrames:
         slot.begun_at = begun_at
         slot.gain = gain
         if isinstance(frame, Array):
-            self.device.copy(slot.frame.buffer, frame.buffer, byte_count=slot.frame.nbytes)
+            own = slot.frame.array
+            self.device.copy(own.buffer, frame.buffer, byte_count=own.nbytes)
         else:
-            np.copyto(slot.frame_host, frame.reshape(slot.frame_host.shape))
-            self.device.queue_copy(slot.frame.buffer, slot.frame_host)
+            host = slot.frame.host
+            np.copyto(host, frame.reshape(host.shape))
+            slot.frame.send()
+        kept = self._kept_bounces
+        if kept is not None and slot.decode_between is not None and not kept.are_due:
+            slot.decode_between.set(gain=gain / self.unit, share=kept.reuse(gain))
+            slot.frame.release(slot.decode_between())
+            return
         slot.decode.set(gain=gain / self.unit)
-        slot.decode()
+        slot.frame.release(slot.decode())
         if self.direct_steps is not None:
             self.direct_steps.queue()
+        if kept is not None:
+            kept.keep(gain)
+
+    def forget_bounces(self) -> None:
+        """Let the bounces of the next frame be computed, whatever came before."""
+        if self._kept_bounces is not None:
+            self._kept_bounces.forget()
 
     def keep_within_bounds(self, deadline: float) -> None:
         """Take projected steps, if some light is beyond the bounds; waits for the device."""
@@ -759,21 +927,26 @@ class PreparedFrames:
 
     def end(self, slot: Slot) -> None:
         """Queue the codes and their download."""
-        slot.encode()
+        slot.codes.make_room()
+        encoded = slot.encode()
         if self._find_peaks is not None:
-            self._find_peaks()
-            self.device.queue_copy(slot.peaks_host, self._peaks.buffer)
-        slot.event = self.device.queue_copy(slot.codes_host, slot.codes.buffer)
+            if isinstance(self.direct_steps, BySharing):
+                self.direct_steps.queue_free()
+            slot.peaks.make_room()
+            self._find_peaks.set(peaks=slot.peaks.array)
+            slot.peaks.send(self._find_peaks())
+        slot.codes.send(encoded)
         self.device.flush()
 
     def take(self, slot: Slot) -> np.ndarray:
         """Wait for the codes of a frame; (h, w) or (h, w, 3)."""
-        slot.event.wait()
-        codes = slot.codes_host
-        # The next frame of this slot gets a new array: the caller keeps this one.
-        slot.codes_host = np.empty_like(codes)
+        codes = slot.codes.take()
         h, w = self.grid
-        return codes.reshape((h, w, 3) if self.colours == 3 else (h, w))
+        if self.colours == 3:
+            shape = (h, w, 3)
+        else:
+            shape = (h, w)
+        return codes.reshape(shape)
 
     def light(self) -> np.ndarray:
         """Projector light of the last frame, (pixels, colours) float32."""
@@ -781,9 +954,9 @@ class PreparedFrames:
         self._bind_encode(codes, "float32", CodeTable.of_light())()
         return codes.get()
 
-    def light_of_direct(self) -> np.ndarray:
-        """Projector light without bounds of what stands in `direct`, in its layout."""
-        direct = self.direct.get()
+    def light_of_direct(self, array: Array) -> np.ndarray:
+        """Projector light without bounds of direct light in an array, in its layout."""
+        direct = array.get()
         factors = self._direct_factors.get()
         light = self.shown.to_channels(factors * direct)
         if self._is_mixed:

@@ -20,8 +20,9 @@ import numpy as np
 from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
 from ltcl.operators import Operator, ScaledColumns
+from ltcl.operators.diagonal_blocks import are_small, joined_once
 from ltcl.solvers import SolveSettings
-from ltcl.solvers.bounded import Bounded, minimise
+from ltcl.solvers.bounded import Bounded, BoxProblem, minimise_each
 from ltcl.transport.transport import Transport
 
 # Pictures (M, k) or light (N, k), one array per system.
@@ -90,6 +91,17 @@ class Limits:
         if is_inside.all():
             return None
         return ~is_inside
+
+    def are_at_bound(self, light: np.ndarray) -> np.ndarray:
+        """The values (N, k) that are at a bound up to rounding; masked pixels have none."""
+        slack = np.float64(BOUNDS_SLACK * (self.high - self.low))
+        are_at_bound = (light <= self.low + slack) | (light >= self.highest - slack)
+        return are_at_bound & ~self.masked[:, None]
+
+    def nearer_bound(self, light: np.ndarray) -> np.ndarray:
+        """The bound (N, k) that is nearer to each value, as float32."""
+        is_low = light - self.low < self.highest - light
+        return np.where(is_low, np.float32(self.low), self.highest)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,33 +185,65 @@ class CompensationProblem:
                     f"{MAX_BRIGHTNESS:g}: scale T, desired or bounds"
                 )
 
-    def nearest(
-        self, index: int, gain: float, start: np.ndarray, settings: SolveSettings
-    ) -> tuple[np.ndarray, Bounded]:
-        """The light (N, k) of one system within the limits that comes nearest to the target.
+    def nearest_each(
+        self, gain: float, starts: dict[int, np.ndarray], settings: SolveSettings
+    ) -> dict[int, tuple[np.ndarray, Bounded]]:
+        """The light (N, k) within the limits that comes nearest to the target, from these starts.
 
-        The solve counts the products of all solves of this system before, too.
+        Of each system that has a start, by its index. Small systems are solved at the same time, so
+        that a launch serves all colours. A solve counts the products of all solves of its system
+        before, too.
         """
-        A, scale = self.systems[index]
+        targets = self.light_to_add(gain)
+        problems = []
+        for index, start in starts.items():
+            problems.append(self._box_problem(index, targets[index], start))
+        operators = [self.systems[index].A for index in starts]
+        rules = {"rtol": settings.rtol, "atol": settings.atol, "maxiter": settings.maxiter}
+        solutions: list[Bounded] = []
+        if len(starts) > 1 and settings.callback is None and self.may_join:
+            solutions += minimise_each(joined_once(operators), problems, **rules)
+        else:
+            for A, problem in zip(operators, problems, strict=True):
+                solutions += minimise_each(A, [problem], callback=settings.callback, **rules)
+        nearest = {}
+        for index, problem, solution in zip(starts, problems, solutions, strict=True):
+            nearest[index] = self._light_of_solution(index, problem, solution)
+        return nearest
+
+    @property
+    def may_join(self) -> bool:
+        """True if the systems of all colours may be solved as one, at less cost."""
+        if any(desired.shape[1] != 1 for desired in self.desired):
+            return False
+        return are_small([system.A for system in self.systems])
+
+    def box(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest unknowns of a system within the limits, (N,) float32."""
         limits = self.limits
-        free_scale = np.where(limits.masked, 0.0, scale)[:, None]
+        free_scale = np.where(limits.masked, 0.0, self.systems[index].scale)
         lower = (free_scale * limits.low).astype(np.float32)
-        upper = (free_scale * limits.highest).astype(np.float32)
+        upper = (free_scale * limits.highest[:, 0]).astype(np.float32)
+        return lower, upper
+
+    def _box_problem(self, index: int, target: np.ndarray, start: np.ndarray) -> BoxProblem:
+        """The unknowns of one system within the limits, from a start (N, k) of light."""
+        lower, upper = self.box(index)
         weights = None
         if self.weights is not None:
             weights = self.weights[index]
-        solution = minimise(
-            A,
-            self.light_to_add(gain)[index],
-            lower[:, 0],
-            upper[:, 0],
-            scale[:, None] * start,
+        return BoxProblem(
+            b=target,
+            lower=lower,
+            upper=upper,
+            x0=self.systems[index].scale[:, None] * start,
             weights=weights,
-            rtol=settings.rtol,
-            atol=settings.atol,
-            maxiter=settings.maxiter,
-            callback=settings.callback,
         )
+
+    def _light_of_solution(
+        self, index: int, problem: BoxProblem, solution: Bounded
+    ) -> tuple[np.ndarray, Bounded]:
+        """The light (N, k) of a system's unknowns, and the solve in units of the pictures."""
         self.products[index] += solution.products
         solution = dataclasses.replace(
             solution,
@@ -207,7 +251,8 @@ class CompensationProblem:
             errors=solution.errors * self.weight_unit,
             least=solution.least * self.weight_unit,
         )
-        return self.light_of(index, solution.x, lower, upper), solution
+        light = self.light_of(index, solution.x, problem.lower[:, None], problem.upper[:, None])
+        return light, solution
 
     def light_of(
         self, index: int, x: np.ndarray, lower: np.ndarray, upper: np.ndarray

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from ltcl.interop.arrays import numbers
 from ltcl.solvers import Bounded, Inverse, Solution
-from ltcl.tasks.compensation.problem import Columns, channel_systems, subtract
+from ltcl.tasks.compensation.problem import Columns, channel_systems, stack_channels, subtract
 from ltcl.tasks.requirements import error_note
 from ltcl.transport import frames as layout
 from ltcl.transport.transport import Transport
@@ -29,6 +33,8 @@ class Evidence:
     appearance : list of (M, k), optional
         None if `missing` is what was computed.
     weights : list of (M, k), optional
+    clipped_values : list of (N, k) bool or None
+        Values of each system that are at a bound and would go beyond it.
     explained : list of (k,), optional
         Weighted values of `missing` that the tolerance explains; None if nothing is clipped.
     solving, reference : Transport
@@ -43,6 +49,7 @@ class Evidence:
     missing: Columns
     appearance: Columns | None
     weights: Columns | None
+    clipped_values: list[np.ndarray | None]
     explained: Columns | None
     solving: Transport
     reference: Transport
@@ -73,6 +80,17 @@ class Evidence:
             columns.append(np.where(is_beyond, missing, 0.0))
         return self._picture(columns)
 
+    def free_pixels(self) -> np.ndarray:
+        """Values of the pattern that follow the target: lit ones that no bound holds."""
+        T = self.solving
+        systems = len(self.target)
+        lit = stack_channels([~T.masked[:, None]] * T.channels, systems)
+        free = []
+        for target, is_lit, is_clipped in zip(self.target, lit, self.clipped_values, strict=True):
+            is_free = np.broadcast_to(is_lit, (len(is_lit), target.shape[1]))
+            free.append(is_free if is_clipped is None else is_free & ~is_clipped)
+        return self.shape.pack(free, self.reference.grid)
+
     def _picture(self, columns: Columns) -> np.ndarray:
         return self.shape.pack(columns, self.camera_grid).astype(np.float32, copy=False)
 
@@ -82,7 +100,8 @@ class Compensation:
     """Result of `ltcl.compensate`.
 
     Pictures are linear, float32, with the frames and colours of `desired`. Those of the camera,
-    `appearance`, `target` and `out_of_reach`, are made when they are asked for.
+    `appearance`, `target` and `out_of_reach`, are made when they are asked for. All are arrays of
+    the kind of `desired`. Of a tensor with a gradient `pattern` has one, and so ``T @ pattern``.
 
     Attributes
     ----------
@@ -127,21 +146,35 @@ class Compensation:
     transport_error: float
     rtol: float
     _evidence: Evidence
+    # Pictures in the kind of array of `desired`, where that is not NumPy's.
+    _give: Callable[[np.ndarray], Any] = np.asarray
+
+    def with_arrays(self, give: Callable[[np.ndarray], Any]) -> Compensation:
+        """The same result with pictures of another kind of array."""
+        return dataclasses.replace(self, pattern=give(self.pattern), _give=give)
+
+    def free_pixels(self) -> np.ndarray:
+        """Values of the pattern that follow the target: lit ones that no bound holds, as bool.
+
+        There the derivative of the pattern is that of a solve, elsewhere it is 0.
+        """
+        return self._evidence.free_pixels()
 
     @cached_property
     def patterns(self) -> tuple[np.ndarray, ...]:
         """`pattern` of each projector, where T is of several (`ltcl.combine`); else of the one."""
-        return self._evidence.solving.split(self.pattern)
+        patterns = self._evidence.solving.split(numbers(self.pattern))
+        return tuple(map(self._give, patterns))
 
     @cached_property
     def appearance(self) -> np.ndarray:
         """T pattern + background: what the camera will see, on its grid."""
-        return self._evidence.appearance_picture()
+        return self._give(self._evidence.appearance_picture())
 
     @cached_property
     def target(self) -> np.ndarray:
         """gain * desired."""
-        return self._evidence.target_picture()
+        return self._give(self._evidence.target_picture())
 
     @cached_property
     def out_of_reach(self) -> np.ndarray:
@@ -151,7 +184,7 @@ class Compensation:
         weight * abs(target - appearance) is at most 3 times what ``max(rtol ||W target||, atol)``
         of this frame and colour makes in the root mean square.
         """
-        return self._evidence.out_of_reach_picture()
+        return self._give(self._evidence.out_of_reach_picture())
 
     @cached_property
     def std(self) -> CompensationStd:
@@ -169,7 +202,7 @@ class Compensation:
         return compensation_std(
             evidence.solving,
             evidence.reference.noise,
-            self.pattern,
+            numbers(self.pattern),
             bounds,
             evidence.inverse,
             systems,
@@ -191,4 +224,5 @@ class Compensation:
             "target": self.target,
             "out_of_reach": self.out_of_reach,
         }
+        pictures = {name: numbers(picture) for name, picture in pictures.items()}
         return thumbnails(self, pictures)

@@ -49,7 +49,10 @@ def quantize(C: scipy.sparse.csr_array, allowance: float) -> Packed:
     # The 2-norm of rounding is far below its Frobenius norm, which is that of equal rows at most.
     frobenius = allowance * math.sqrt(rows)
     while True:
-        packed = smallest(C, frobenius / size if size else 0.0)
+        allowed = 0.0
+        if size:
+            allowed = frobenius / size
+        packed = smallest(C, allowed)
         frobenius_of_rounding, norm_of_rounding = packed.difference
         if packed.precision == "float32" or norm_of_rounding <= allowance:
             return packed

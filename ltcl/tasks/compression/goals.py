@@ -131,7 +131,9 @@ class ByTolerance(Goal):
     def frobenius(self, inverse: float, pixels: int) -> float:
         """Estimate the norm that may be dropped; for pictures, if all light loses alike."""
         allowed = self.rtol / inverse
-        return allowed * math.sqrt(pixels) if self.is_of_pictures else allowed
+        if self.is_of_pictures:
+            allowed *= math.sqrt(pixels)
+        return allowed
 
     def bases(self, problem: CompressionProblem, name: str) -> Bases:
         """Bases of a name, with weights where pictures decide."""

@@ -64,12 +64,15 @@ class CompressionProblem:
         for first in first_of_rows.tolist():
             strips.append(self.R.rows(first, first + w)[:, pixels])
         R = np.concatenate(strips)
+        noise = None
+        if self.noise is not None:
+            noise = self.noise[:, pixels]
         return CompressionProblem(
             R=source("R", R, self.R.memory),
             operator=Dense(self.operator.device, R),
             grid=(h, w),
             F=self.F[pixels],
-            noise=None if self.noise is None else self.noise[:, pixels],
+            noise=noise,
         )
 
 

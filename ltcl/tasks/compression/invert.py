@@ -57,7 +57,7 @@ def invert(
 
     Parameters
     ----------
-    T : Transport, square
+    T : Transport, square, or of several projectors, whose scene is inverted
         Measured, or compressed already. A T with wavelets on one side alone, or scanned adaptively,
         is first written in one basis, from N products with it, and the error adds both losses.
     rtol : float
@@ -92,6 +92,7 @@ def invert(
     >>> c.solution.products, c.error <= 2e-2
     (1, True)
     """
+    T = check_transport(T, square=False).scene
     check_transport(T)
     rounding = FLOAT32_UNIT * math.sqrt(T.shape[0])
     rtol = check_rtol(rtol, ROUNDED_TERMS * rounding)

@@ -189,6 +189,9 @@ def source(name: str, matrix: Any, memory: int | None = None, client: Any = None
         return checks.shape(place, rows, (stop - start, columns))
 
     chunks = getattr(matrix, "chunks", None)
+    row_chunks = 1
+    if chunks:
+        row_chunks = chunks[0]
     return SourceRows(
         matrix.shape,
         _fetcher(name, matrix, client, workers_fetch),
@@ -196,7 +199,7 @@ def source(name: str, matrix: Any, memory: int | None = None, client: Any = None
         memory,
         client=client,
         workers_fetch=workers_fetch,
-        chunks=chunks[0] if chunks else 1,
+        chunks=row_chunks,
     )
 
 

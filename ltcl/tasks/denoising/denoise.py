@@ -84,19 +84,21 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
         note = partial(_report_share, report, channel, T.channels)
         channels.append(_denoise_channel(T, channel, note))
         note(1.0)
-    kept = sum(channel.entries is None for channel in channels)
-    if kept:
+    unchanged_count = sum(channel.entries is None for channel in channels)
+    if unchanged_count:
         log.warning(
             "%d of %d channels of T are not changed: nothing shows that pictures become better",
-            kept,
+            unchanged_count,
             T.channels,
         )
-    if kept == T.channels:
+    if unchanged_count == T.channels:
         return T
     matrices = []
     for matrix, channel in zip(T.matrices, channels, strict=True):
         entries = channel.entries
-        matrices.append(_dense(matrix) if entries is None else entries)
+        if entries is None:
+            entries = _dense(matrix)
+        matrices.append(entries)
     shares = np.array([channel.variance_share for channel in channels])
     return _transport_like(T, matrices, _scaled_noise(T.noise, shares))
 

@@ -51,9 +51,9 @@ def first_estimate(problem: DenoisingProblem, note: NoteShare) -> FirstEstimate:
     """Z (M, N) by thresholds, and once more without the entries that stand out of it."""
     pilot = _pilot(problem, note)
     for _ in range(OUTSTANDING_PASSES):
-        found = np.count_nonzero(problem.is_outstanding)
+        outstanding_count = np.count_nonzero(problem.is_outstanding)
         problem = problem.without_outstanding(pilot)
-        if np.count_nonzero(problem.is_outstanding) == found:
+        if np.count_nonzero(problem.is_outstanding) == outstanding_count:
             break
         pilot = _pilot(problem, _ignore_share)
     return FirstEstimate(problem=problem, pilot=pilot)

@@ -32,6 +32,8 @@ PROBES = 32
 BOUNCES = 3
 # Solves on the device.
 SOLVE_RTOL = 1e-3
+# Part of the larger control below which one that is all but a multiple of it is left out.
+MIN_CONTROL_SHARE = 1e-12
 # m of a T is hardly smaller.
 MIN_INVERSE_DIAGONAL = 0.1
 
@@ -156,7 +158,11 @@ def _inverse_diagonal(S: SolvedSystem) -> np.ndarray:
     if S.second_diagonal is not None:
         twice = S.product(once) - once
         control_samples.append(z * twice - S.second_diagonal[:, None])
-    controls = np.stack([control.ravel() for control in control_samples], axis=1)
+    controls = np.stack(control_samples)
     scatter = samples - samples.mean(axis=1, keepdims=True)
-    factors, *_ = np.linalg.lstsq(controls, scatter.ravel())
-    return (samples - (controls @ factors).reshape(samples.shape)).mean(axis=1)
+    # Least squares by the equations of the one or two factors.
+    products = np.einsum("inp,jnp->ij", controls, controls)
+    inverse = np.linalg.pinv(products, rcond=MIN_CONTROL_SHARE, hermitian=True)
+    factors = inverse @ np.einsum("inp,np->i", controls, scatter)
+    means = controls.mean(axis=2)
+    return samples.mean(axis=1) - factors @ means

@@ -39,8 +39,10 @@ EntryVariance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 # Entries to compare at most, in `analyze` and in passing.
 ALL_ENTRIES = 1 << 22
 QUICK_ENTRIES = 1 << 18
-# Cost of an entry that is found by products, in entries that are read.
+# Cost of an entry that is found by products, in entries that are read: of few pixels, and of many.
 PRODUCT_COST = 16
+LARGE_PRODUCT_COST = 64
+LARGE = 1 << 16
 # Conjugate gradients of the fit.
 FIT_STEPS = 200
 FIT_RTOL = 1e-10
@@ -85,7 +87,8 @@ def reciprocity_defect(
     n = len(F)
     if hasattr(T, "between"):
         # An Operator, or the rows of a store.
-        pixels = _sample(lit, n**2, n, entries // PRODUCT_COST, seed)
+        cost = LARGE_PRODUCT_COST if n > LARGE else PRODUCT_COST
+        pixels = _sample(lit, n**2, n, entries // cost, seed)
         light = T.between(pixels, pixels)
     elif isinstance(T, np.ndarray):
         pixels = _sample(lit, T.size, n, entries, seed)

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy  # its subpackage stats is loaded at the first use
 
 from ltcl.errors import InputError
 from ltcl.operators.interreflection import underlying_system
@@ -73,15 +73,25 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
     whose entries cannot be read.
     """
     for T in matrices:
-        has_entries = isinstance(T, ARRAYS) or hasattr(T, "between")
-        if underlying_system(T) is not None or not has_entries:
-            raise InputError(
-                "noise is None, but T is compressed, or an operator, and shows no entries with "
-                "noise; give noise= (--noise) to what it was made from, which keeps it"
-            )
-    channels = [_ChannelEstimator(T, grid, camera_grid).run() for T in matrices]
-    is_known = all(channel.is_known for channel in channels)
-    return Noise.from_channels(channels, "estimated" if is_known else "unknown")
+        _check_entries(T)
+    channels = []
+    origin = "estimated"
+    for T in matrices:
+        channel = _ChannelEstimator(T, grid, camera_grid).run()
+        channels.append(channel)
+        if not channel.is_known:
+            origin = "unknown"
+    return Noise.from_channels(channels, origin)
+
+
+def _check_entries(T: Any) -> None:
+    """InputError if T shows no entries with noise."""
+    has_entries = isinstance(T, ARRAYS) or hasattr(T, "between")
+    if underlying_system(T) is not None or not has_entries:
+        raise InputError(
+            "noise is None, but T is compressed, or an operator, and shows no entries with "
+            "noise; give noise= (--noise) to what it was made from, which keeps it"
+        )
 
 
 class _ChannelEstimator:

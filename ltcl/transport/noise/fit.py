@@ -6,6 +6,7 @@
 Passes take turns: factors of rows and columns by mean ratios, then photons and floor^2 by a
 nonnegative least squares fit of mean ratios in octaves of light. Exact samples are variances, whose
 sums over rows and columns are kept. Others are squares of errors, which count up to 9 variances.
+Rows and columns whose squares are all 0 have the factor 0, and say nothing of the rest.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-import scipy.optimize
+import scipy  # its subpackage optimize is loaded at the first use
 
 # Parts of the samples of a channel: rows, columns, light, and squares, (n,) each.
 Samples = Iterable[Sequence[np.ndarray]]
@@ -34,6 +35,8 @@ CLIPPED_MEAN = 0.995
 MIN_FIRST_BOUNCES = 64
 # Least floor^2, relative to the mean square.
 MIN_FLOOR = 1e-6
+# Squares that count as 0, relative to the largest: products of such factors would underflow.
+ZERO_SHARE = 1e-60
 
 
 @dataclass(kw_only=True)
@@ -79,7 +82,7 @@ class ChannelNoise:
 
 
 def noise_step(shape: tuple[int, int]) -> int:
-    """Of T (M, N), the entries count whose row and column differ by a multiple of this."""
+    """The step of entries of T (M, N) that count: row and column differ by a multiple of it."""
     return max(1, min(shape) // SAMPLES_PER_ROW)
 
 
@@ -105,10 +108,13 @@ class _Fit:
     """State of the fit: factors of rows and columns, photons and floor^2."""
 
     def __init__(self, shape: tuple[int, int], samples: EntrySamples, is_exact: bool) -> None:
-        self.samples = samples
         self.is_exact = is_exact
-        self.rows = np.ones(shape[0])
-        self.columns = np.ones(shape[1])
+        zero = ZERO_SHARE * samples.square.max(initial=0.0)
+        self.rows = _start_factors(shape[0], samples.i, samples.square > zero)
+        self.columns = _start_factors(shape[1], samples.j, samples.square > zero)
+        # Each row and column that is left has a square above 0.
+        samples = samples.select(self._factors_of(samples) > 0.0)
+        self.samples = samples
         self.photons = 0.0
         self.floor2 = 0.0
         if len(samples.square):
@@ -196,12 +202,20 @@ class _Fit:
 
     def direct_factor(self, direct: EntrySamples) -> float:
         """Factor of the variance of the first bounce; 1 with too few samples of it."""
-        if len(direct.i) < (1 if self.is_exact else MIN_FIRST_BOUNCES):
+        expected = self._factors_of(direct) * self.variance_of_light(direct.light)
+        is_noisy = expected > 0.0
+        expected = expected[is_noisy]
+        if len(expected) < (1 if self.is_exact else MIN_FIRST_BOUNCES):
             return 1.0
-        model = self.variance_of_light(direct.light)
-        expected = self._factors_of(direct) * model
-        ratios = direct.square / np.maximum(expected, 1e-300)
+        ratios = direct.square[is_noisy] / expected
         clipped = np.minimum(ratios, MAX_VARIANCES * ratios.mean())
         if not self.is_exact:
             return float(clipped.mean())
         return float(np.average(clipped, weights=expected))
+
+
+def _start_factors(n: int, index: np.ndarray, is_noisy: np.ndarray) -> np.ndarray:
+    """Factors of n rows or columns to begin with: 0 where all samples are without noise, else 1."""
+    samples = np.bincount(index, minlength=n)
+    noisy_samples = np.bincount(index, is_noisy, n)
+    return np.where((samples > 0) & (noisy_samples == 0), 0.0, 1.0)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.ndimage
+import scipy  # its subpackage ndimage is loaded at the first use
 
 # G along one axis of the grid.
 BINOMIAL = [0.25, 0.5, 0.25]

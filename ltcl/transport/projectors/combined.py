@@ -21,7 +21,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
+import scipy  # its subpackage ndimage is loaded at the first use
 import scipy.sparse
 
 from ltcl import checks
@@ -29,9 +29,17 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Product, as_operator
 from ltcl.solvers import solve_each
 from ltcl.transport import frames as layout
+from ltcl.transport.covariance import EntryErrors
+from ltcl.transport.noise import Noise
 from ltcl.transport.projectors.direct_parts import direct_parts
 from ltcl.transport.projectors.gamut import Gamut, common_gamut
 from ltcl.transport.projectors.montage import Montage
+from ltcl.transport.projectors.noise import (
+    JoinedErrors,
+    joined_noise,
+    measured_noises,
+    scene_noise,
+)
 from ltcl.transport.projectors.sharing import (
     ProjectorShare,
     drive_divisors,
@@ -114,38 +122,48 @@ class CombinedTransport(Transport):
         transports: Sequence[Transport],
         *,
         scene: Transport | None = None,
-        blend: Any = "smooth",
+        blend: Any = "auto",
         balance: float = 0.5,
         blacks: Any = None,
         black: str = "measured",
         device: Any = None,
     ) -> None:
-        self.transports = check_members(transports)
+        members = check_members(transports)
+        self.transports = tuple(map(_with_entries, members))
+        # What `ltcl.acquisition.combine_scans` knows of the projectors, for files.
+        self.displays: dict[str, np.ndarray] = {}
         first = self.transports[0]
-        self.montage = Montage(tuple(T.grid for T in self.transports))
+        grids = [T.grid for T in self.transports]
+        self.montage = Montage(tuple(grids))
         self.blend = blend
         self.balance = checks.number("balance", balance, least=0.0, most=1.0)
         self.black = checks.one_of("black", black, ("measured", "uniform"))
         self.given_scene = scene
-        if scene is None:
-            directs = [_direct_of_member(number, T) for number, T in enumerate(self.transports)]
-        else:
+        direct_of = _direct_of_member
+        if scene is not None:
             check_scene(scene, first)
-            directs = [_sparse_member(number, T) for number, T in enumerate(self.transports)]
+            direct_of = _sparse_member
+        directs = [direct_of(number, T) for number, T in enumerate(self.transports)]
         ramps = find_ramps(directs, self.montage.grids, first.camera_grid, blend)
         self.shares: tuple[ProjectorShare, ...] = share_out(directs, ramps, self.balance)
         self.divisors = drive_divisors(self.shares)
-        mixings = [T.mixing for T in self.transports]
-        self.mixings = [np.eye(first.channels) if M is None else M for M in mixings]
+        self.mixings: list[np.ndarray] = []
+        for T in self.transports:
+            self.mixings.append(np.eye(first.channels) if T.mixing is None else T.mixing)
         matrix, mixing = self._side_by_side(first.channels)
+        own_device = None
+        if scene is None:
+            own_device = device
         super().__init__(
             matrix,
             self.montage.grid,
             camera_grid=first.camera_grid,
-            device=device if scene is None else None,
+            device=own_device,
             mixing=mixing,
+            noise=self._joined_noise(),
         )
-        self.masked = self.montage.is_empty
+        is_dark = self.montage.vector([T.masked for T in self.transports])
+        self.masked = self.montage.is_empty | is_dark
         self.ceilings: np.ndarray | None = self.montage.vector([s.ceiling for s in self.shares])
         self.blacks = self._check_blacks(blacks)
 
@@ -158,7 +176,7 @@ class CombinedTransport(Transport):
             "blacks": None if self.blacks is None else self.black_pictures(),
             "black": self.black,
         }
-        return _combine_again, (self.transports, options)
+        return _combine_again, (self.transports, options, self.displays)
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{h} x {w}" for h, w in self.montage.grids)
@@ -175,21 +193,21 @@ class CombinedTransport(Transport):
         if is_mixed_alike:
             matrices = []
             for channel in range(channels):
-                parts = [self._part(T, channel) for T in self.transports]
-                matrices.append(self._under_scene(channel, self.montage.columns(parts)))
+                columns = [self._matrix_of_projector(T, channel) for T in self.transports]
+                matrices.append(self._under_scene(channel, self.montage.columns(columns)))
             return matrices, self.transports[0].mixing
         rows = []
         for c in range(channels):
             row = []
             for d in range(channels):
-                parts = []
+                columns = []
                 for T, mixing in zip(self.transports, self.mixings, strict=True):
-                    parts.append(self._part(T, c) * mixing[c, d])
-                row.append(self._under_scene(c, self.montage.columns(parts)))
+                    columns.append(self._matrix_of_projector(T, c) * mixing[c, d])
+                row.append(self._under_scene(c, self.montage.columns(columns)))
             rows.append(row)
         return rows, None
 
-    def _part(self, T: Transport, channel: int) -> Any:
+    def _matrix_of_projector(self, T: Transport, channel: int) -> Any:
         """The matrix of one projector and channel, as an array or a csr_array."""
         return _in_memory(T.matrices[channel])
 
@@ -199,6 +217,27 @@ class CombinedTransport(Transport):
             return matrix
         S = self.given_scene.systems[channel]
         return Product(S, as_operator(matrix, S.device))
+
+    def _joined_noise(self) -> Noise | None:
+        """The noise of all projectors; None if it is not known, or that of direct light alone."""
+        if self.given_scene is not None:
+            return None
+        matrices = []
+        for T in self.transports:
+            matrices.append(
+                [self._matrix_of_projector(T, channel) for channel in range(T.channels)]
+            )
+        return joined_noise(self.transports, matrices, self.montage)
+
+    def errors_of(self, noise: Noise, inverse: Any = None) -> EntryErrors:
+        """The errors of the entries: those of the scans, where these tell them."""
+        noises = measured_noises(self.transports)
+        if noises is None or noise is not self.measured_noise:
+            return EntryErrors(self, noise, inverse)
+        members = []
+        for T, own in zip(self.transports, noises, strict=True):
+            members.append(EntryErrors(T, own))
+        return JoinedErrors(self, noise, members, self.montage, self.mixings)
 
     def _check_blacks(self, blacks: Any) -> list[np.ndarray] | None:
         """The sum (M, 1) of the blacks of all projectors, for each channel."""
@@ -221,9 +260,10 @@ class CombinedTransport(Transport):
                 f"blacks[{number}]", picture, self.camera_grid, self.channels
             )
             if columns[0].shape[1] != 1:
+                colour = " in grey" if self.channels == 1 else ""
                 raise InputError(
                     f"blacks[{number}] has shape {np.shape(picture)}; it must be one picture "
-                    f"{self.camera_grid}" + (" in grey" if self.channels == 1 else "")
+                    f"{self.camera_grid}{colour}"
                 )
             total = [sum_ + column for sum_, column in zip(total, columns, strict=True)]
         return total
@@ -253,12 +293,28 @@ class CombinedTransport(Transport):
         return self.divisors
 
     def sharing_matrix(self) -> scipy.sparse.csr_array:
-        """Patterns (N, M) of all projectors from the light, over `light_of_white`, of the scene."""
+        """Patterns (N, M) of all projectors from the light, over `light_of_white`, of the scene.
+
+        (3 N, 3 M), channel below channel, where projectors mix colours each in its own way.
+        """
         rows = []
         for share in self.shares:
             weighted = scipy.sparse.diags_array(share.own) @ share.back
             rows.append(scipy.sparse.csr_array(weighted.T))
-        return scipy.sparse.csr_array(self.montage.columns(rows).T)
+        matrix = scipy.sparse.csr_array(self.montage.columns(rows).T)
+        if self.blocks is None:
+            return matrix
+        unmixings = [np.linalg.inv(mixing) for mixing in self.mixings]
+        blocks = []
+        for c in range(3):
+            row = []
+            for d in range(3):
+                factors = []
+                for share, unmixing in zip(self.shares, unmixings, strict=True):
+                    factors.append(np.full(len(share.own), unmixing[c, d]))
+                row.append(scipy.sparse.diags_array(self.montage.vector(factors)) @ matrix)
+            blocks.append(row)
+        return scipy.sparse.csr_array(scipy.sparse.block_array(blocks))
 
     @cached_property
     def black_level(self) -> np.ndarray:
@@ -291,7 +347,7 @@ class CombinedTransport(Transport):
 
     @cached_property
     def contrast(self) -> Contrast | None:
-        """What a uniform black costs; None if blacks are unknown."""
+        """The contrast with and without a uniform black; None if blacks are unknown."""
         if self.blacks is None:
             return None
         measured = []
@@ -313,7 +369,8 @@ class CombinedTransport(Transport):
         """The colours that all projectors have in common, and how far these differ."""
         whites = []
         for share in self.shares:
-            whites.append(np.stack([share.white(channel) for channel in range(self.channels)]))
+            white = [share.white(channel) for channel in range(self.channels)]
+            whites.append(np.stack(white))
         return common_gamut(whites, self.mixings)
 
     @property
@@ -342,14 +399,33 @@ class CombinedTransport(Transport):
             self.camera_grid,
             first_bounce=is_lit.astype(np.float64),
             device=self._requested_device,
+            noise=self._scene_noise(systems),
         )
 
-    def _bounce(self, T: Transport, share: ProjectorShare, channel: int) -> Any:
-        """(T_k - F_k) Q_k of one channel, (M, M)."""
+    def _scene_noise(self, systems: Sequence[Any]) -> Noise | None:
+        """The noise of S; None if that of some scan was not measured."""
+        noises = measured_noises(self.transports)
+        if noises is None:
+            return None
+        matrices = []
+        directs = []
+        sharing = []
+        for T, share in zip(self.transports, self.shares, strict=True):
+            matrices.append([_in_memory(T.matrices[channel]) for channel in range(self.channels)])
+            directs.append(share.direct)
+            sharing.append([self._sharing(share, channel) for channel in range(self.channels)])
+        return scene_noise(noises, matrices, directs, sharing, systems)
+
+    def _sharing(self, share: ProjectorShare, channel: int) -> scipy.sparse.csr_array:
+        """Q_k (N_k, M) of one channel: the pattern of a projector from direct light."""
         divisor = self.divisors[channel]
         inverses = np.divide(1.0, divisor, out=np.zeros_like(divisor), where=divisor > 0.0)
         Q = scipy.sparse.diags_array(share.own) @ share.back @ scipy.sparse.diags_array(inverses)
-        Q = scipy.sparse.csr_array(Q)
+        return scipy.sparse.csr_array(Q)
+
+    def _bounce(self, T: Transport, share: ProjectorShare, channel: int) -> Any:
+        """(T_k - F_k) Q_k of one channel, (M, M)."""
+        Q = self._sharing(share, channel)
         matrix = _in_memory(T.matrices[channel])
         direct: Any = share.direct[channel] @ Q
         if scipy.sparse.issparse(matrix):
@@ -371,7 +447,8 @@ class CombinedTransport(Transport):
             shared.append(own)
         channels = []
         for channel in range(self.channels):
-            channels.append(self.montage.vector([own[channel] for own in shared]))
+            patterns = [own[channel] for own in shared]
+            channels.append(self.montage.vector(patterns))
         if self.couples:
             return [np.concatenate(channels)]
         return channels
@@ -396,7 +473,7 @@ class CombinedTransport(Transport):
 def combine(
     transports: Sequence[Transport],
     *,
-    blend: Any = "smooth",
+    blend: Any = "auto",
     balance: float = 0.5,
     blacks: Any = None,
     black: str = "measured",
@@ -411,10 +488,11 @@ def combine(
         T_k of each projector alone, of one camera that did not move: all of one `camera_grid`, in
         grey or in colour. Projectors may differ in resolution, brightness and mixing, and may miss
         parts of the scene.
-    blend : "smooth", "linear" or a sequence of arrays (h, w)
-        Weights of the pixels of each projector: the square of the distance to its border, in its
-        own pixels, or the distance itself; or your own. Borders count where another projector
-        lights the scene beyond.
+    blend : "auto", "smooth", "linear" or a sequence of arrays (h, w)
+        Weights of the pixels of each projector: "smooth" is the square of the distance to its
+        border, in its own pixels, "linear" the distance itself, "auto" smooth unless an overlap is
+        narrower than 16 pixels; or your own. Borders count where another projector lights the scene
+        beyond.
     balance : float
         From 0, all light of all projectors counts where they overlap, to 1, as soft as possible
         near borders: a projector gives its full light where its weight is at least this part of the
@@ -462,8 +540,12 @@ def combine(
     )
 
 
-def _combine_again(transports: Sequence[Transport], options: dict[str, Any]) -> CombinedTransport:
-    return CombinedTransport(transports, **options)
+def _combine_again(
+    transports: Sequence[Transport], options: dict[str, Any], displays: dict[str, np.ndarray]
+) -> CombinedTransport:
+    T = CombinedTransport(transports, **options)
+    T.displays = displays
+    return T
 
 
 def check_members(transports: Any) -> tuple[Transport, ...]:
@@ -507,7 +589,25 @@ def check_scene(scene: Any, first: Transport) -> None:
 
 def _in_memory(matrix: Any) -> Any:
     """An array or a csr_array from rows of a store, or the matrix itself."""
-    return matrix.tocsr() if hasattr(matrix, "row_blocks") else matrix
+    if hasattr(matrix, "row_blocks"):
+        return matrix.tocsr()
+    return matrix
+
+
+def _with_entries(T: Transport) -> Transport:
+    """T, or the entries of a compressed one, such as a sketch; MemoryLimitError if too many."""
+    if not T.is_compressed:
+        return T
+    matrices = T.to_numpy().astype(np.float32, copy=False)
+    return Transport(
+        list(matrices) if T.channels == 3 else matrices,
+        T.grid,
+        T.first_bounce,
+        on_dark="mask",
+        device=T.device,
+        mixing=T.mixing,
+        noise=T.measured_noise,
+    )
 
 
 def _entries(number: int, T: Transport) -> list[Any]:

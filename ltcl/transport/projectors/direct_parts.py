@@ -59,10 +59,10 @@ def direct_parts(
             values[channel].append(np.where(is_direct[:, None] & (window >= 0), light, 0.0))
     columns = np.concatenate(pixels)
     shape = (len(columns), grid[0] * grid[1])
-    parts = []
+    matrices_of_channels = []
     for channel_values in values:
-        parts.append(_sparse(np.concatenate(channel_values), columns, shape))
-    return tuple(parts)
+        matrices_of_channels.append(_sparse(np.concatenate(channel_values), columns, shape))
+    return tuple(matrices_of_channels)
 
 
 def _row_blocks(matrices: Sequence[Any]) -> Iterator[tuple[int, list[np.ndarray]]]:

@@ -67,11 +67,11 @@ class Gamut:
         return values @ self.primaries.T
 
     def __str__(self) -> str:
-        parts = []
+        deviations = []
         for number, difference in enumerate(self.differences, start=1):
-            parts.append(f"projector {number} by {difference:.1%}")
+            deviations.append(f"projector {number} by {difference:.1%}")
         return (
-            f"projectors differ from their mean: {', '.join(parts)}; "
+            f"projectors differ from their mean: {', '.join(deviations)}; "
             f"common primaries are moved {self.desaturation:.1%} towards white"
         )
 

@@ -67,12 +67,12 @@ class Montage:
     def vector(self, values: Sequence[np.ndarray]) -> np.ndarray:
         """Values (N_k, ...) of the pixels of each projector in the picture, (N, ...); else 0."""
         whole = np.zeros((self.pixels, *values[0].shape[1:]), np.result_type(*values))
-        for places, part in zip(self.places, values, strict=True):
-            whole[places] = part
+        for places, own in zip(self.places, values, strict=True):
+            whole[places] = own
         return whole
 
     def columns(self, matrices: Sequence[Any]) -> Any:
-        """One matrix (M, N) from (M, N_k) of each projector: sparse if all are, else float32."""
+        """Join (M, N_k) of each projector into a matrix (M, N): sparse if all are, else float32."""
         shape = (matrices[0].shape[0], self.pixels)
         if any(not scipy.sparse.issparse(matrix) for matrix in matrices):
             checks.fits_host("T of all projectors", 4 * shape[0] * shape[1])

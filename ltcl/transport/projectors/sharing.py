@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How light is shared out between projectors: smooth weights that fall to zero at their borders.
+"""Shares of the light for each projector: smooth weights that fall to zero at their borders.
 
 With the distance of each projector pixel to the border beyond which other projectors light the
-scene alone, in its own pixels, rho_k = distance^2 is as smooth where it ends as in between. Camera
-pixel i sees
+scene alone, in its own pixels, rho_k = distance^2 is as smooth where it ends as in between; where
+projectors overlap by few pixels rho_k = distance is less steep. Camera pixel i sees
 
     a_k = (F_k rho_k) / (F_k 1),    sigma_k = a_k / max_j a_j
 
@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
+import scipy  # its subpackage ndimage is loaded at the first use
 import scipy.sparse
 
 from ltcl import checks
@@ -34,6 +34,8 @@ from ltcl.errors import InputError
 
 # Powers of the distance to the border.
 BLENDS = {"smooth": 2.0, "linear": 1.0}
+# Width in projector pixels from which smooth weights make the weaker seam, after a small shift.
+WIDE_OVERLAP = 16.0
 # Times the mean direct light of a projector: dimmer camera pixels are not lit by it.
 MIN_SEEN_SHARE = 0.02
 # Share of a projector pixel's light that falls beside what others light alone, at a border.
@@ -102,19 +104,10 @@ def find_borders(
     other one lights the scene, and the border of the camera's picture, are none.
     """
     totals = [_total(direct) for direct in directs]
-    are_lit = []
-    for total in totals:
-        white = _row_sums(total)
-        mean = float(white.sum()) / max(np.count_nonzero(white), 1)
-        picture = white.reshape(camera_grid)
-        # At half of the light beside it, a projector ends.
-        beside = scipy.ndimage.maximum_filter(picture, LIT_REACH, mode="nearest")
-        is_lit = (picture > MIN_SEEN_SHARE * mean) & (picture > 0.5 * beside)
-        are_lit.append(is_lit | np.asarray(scipy.ndimage.binary_closing(is_lit, EIGHT), bool))
+    are_lit = _lit_pictures(totals, camera_grid)
     borders = []
     for number, (total, grid) in enumerate(zip(totals, grids, strict=True)):
-        others = [is_lit for other, is_lit in enumerate(are_lit) if other != number]
-        is_taken_over = np.logical_or.reduce(others) & ~are_lit[number]
+        is_taken_over = _lit_by_others(are_lit, number) & ~are_lit[number]
         neighbours = scipy.ndimage.convolve(is_taken_over.astype(int), EIGHT, mode="constant")
         # A single pixel is noise.
         is_taken_over &= neighbours > 1
@@ -126,6 +119,50 @@ def find_borders(
     return borders
 
 
+def _lit_pictures(
+    totals: Sequence[scipy.sparse.csr_array], camera_grid: tuple[int, int]
+) -> list[np.ndarray]:
+    """Camera pixels (H, W) that each projector lights."""
+    are_lit = []
+    for total in totals:
+        white = _row_sums(total)
+        mean = float(white.sum()) / max(np.count_nonzero(white), 1)
+        picture = white.reshape(camera_grid)
+        # At half of the light beside it, a projector ends.
+        beside = scipy.ndimage.maximum_filter(picture, LIT_REACH, mode="nearest")
+        is_lit = (picture > MIN_SEEN_SHARE * mean) & (picture > 0.5 * beside)
+        are_lit.append(is_lit | np.asarray(scipy.ndimage.binary_closing(is_lit, EIGHT), bool))
+    return are_lit
+
+
+def _lit_by_others(are_lit: Sequence[np.ndarray], number: int) -> np.ndarray:
+    """Camera pixels (H, W) that another projector than this one lights."""
+    others = [is_lit for other, is_lit in enumerate(are_lit) if other != number]
+    return np.logical_or.reduce(others)
+
+
+def overlap_width(
+    directs: Sequence[Sequence[scipy.sparse.csr_array]],
+    distances: Sequence[np.ndarray],
+    camera_grid: tuple[int, int],
+) -> float:
+    """The width of the narrowest overlap in projector pixels; 0 where no projectors overlap.
+
+    `distances`, (N_k,), are those to the border at which others take over. Across an overlap their
+    mean is half of its width.
+    """
+    totals = [_total(direct) for direct in directs]
+    are_lit = _lit_pictures(totals, camera_grid)
+    widths = []
+    for number, (total, distance) in enumerate(zip(totals, distances, strict=True)):
+        light = _row_sums(scipy.sparse.csr_array(total.T))
+        is_shared = _lit_by_others(are_lit, number).ravel().astype(np.float64)
+        overlaps = (light > 0.0) & (np.asarray(total.T @ is_shared) > 0.5 * light)
+        if overlaps.any():
+            widths.append(2.0 * float(distance[overlaps].mean()))
+    return min(widths, default=0.0)
+
+
 def find_ramps(
     directs: Sequence[Sequence[scipy.sparse.csr_array]],
     grids: Sequence[tuple[int, int]],
@@ -135,13 +172,16 @@ def find_ramps(
     """The weights of the pixels of each projector: by name, or the checked arrays of the caller."""
     ramps = []
     if isinstance(blend, str):
-        power = BLENDS[checks.one_of("blend", blend, BLENDS)]
-        for is_border in find_borders(directs, grids, camera_grid):
-            ramps.append(border_distance(is_border).ravel() ** power)
-        return ramps
+        name = checks.one_of("blend", blend, ("auto", *BLENDS))
+        borders = find_borders(directs, grids, camera_grid)
+        distances = [border_distance(is_border).ravel() for is_border in borders]
+        if name == "auto":
+            width = overlap_width(directs, distances, camera_grid)
+            name = "smooth" if width >= WIDE_OVERLAP else "linear"
+        return [distance ** BLENDS[name] for distance in distances]
     if not isinstance(blend, (list, tuple)) or len(blend) != len(grids):
         raise InputError(
-            f"blend is {checks.shown(blend)}; it must be one of {', '.join(BLENDS)}, "
+            f"blend is {checks.shown(blend)}; it must be one of auto, {', '.join(BLENDS)}, "
             f"or one array for each of {len(grids)} projectors"
         )
     for number, (ramp, grid) in enumerate(zip(blend, grids, strict=True)):
@@ -157,8 +197,8 @@ def find_ramps(
 def _total(direct: Sequence[scipy.sparse.csr_array]) -> scipy.sparse.csr_array:
     """The sum of all channels."""
     total = direct[0]
-    for part in direct[1:]:
-        total = total + part
+    for channel in direct[1:]:
+        total = total + channel
     return scipy.sparse.csr_array(total)
 
 

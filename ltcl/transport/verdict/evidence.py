@@ -201,7 +201,10 @@ class Evidence:
             if not math.isnan(change):
                 yield Measure(f"resolution_{k}", change)
         largest = float(spreads.choice.max())
-        yield Measure("spread", largest if system.has_diagonal_of_T else 0.0)
+        spread = 0.0
+        if system.has_diagonal_of_T:
+            spread = largest
+        yield Measure("spread", spread)
 
     def _relative_error(
         self, name: str, channel: int, light: np.ndarray, deviation: np.ndarray

@@ -62,8 +62,8 @@ class HostErrors(EntryErrors):
         """T of a channel times float32 patterns (N, k), or (3 N, k) of blocks."""
         if self.T.blocks is not None:
             matrices = channel_matrices(self.T, channel)
-            parts = np.split(patterns, len(matrices))
-            return sum(A @ part for A, part in zip(matrices, parts, strict=True))
+            drives = np.split(patterns, len(matrices))
+            return sum(A @ drive for A, drive in zip(matrices, drives, strict=True))
         if self.T.is_square:
             is_lit = self.systems[channel].F > 0
             patterns = np.where(is_lit[:, None], patterns, np.float32(0.0))

@@ -160,11 +160,12 @@ def _judge(numbers: dict[str, float], places: Mapping[str, str]) -> Verdict:
     is_good_for_compensation = not spoils_compensation
     is_good_for_bounces = not spoils_bounces
     uses = _describe_uses(is_good_for_compensation, is_good_for_bounces, refused)
+    causes = [finding.name for finding in findings]
     return Verdict(
         text=f"{uses}. {_explain(findings, numbers)}.",
         compensation=is_good_for_compensation,
         bounces=is_good_for_bounces,
-        causes=tuple(finding.name for finding in findings),
+        causes=tuple(causes),
         numbers=numbers,
     )
 

@@ -2,12 +2,13 @@
 // Bounces: a picture as a sum of direct light and bounces, which sliders mix in the shader.
 
 import { Layers, draw } from "./gl.js";
-import { look, Panel } from "./panel.js";
+import { Panel } from "./panel.js";
 
 const SECONDS = 1.2; // of a step of the film
 
-export function bounces({ $, ask, press, hello }) {
-  const mix = new Panel($("bounces-mix"), { title: "Mixed light", grid: hello.camera_grid });
+export function bounces(app) {
+  const { $, ask, press, hello } = app;
+  const mix = new Panel(app, $("bounces-mix"), { title: "Mixed light", grid: hello.camera_grid });
   const deviation = new Layers(), stack = $("bounces-stack"), source = $("bounces-source");
   let sliders = [], film = null, turn = 0;
   if (source.options.length > 1) source.selectedIndex = 1;

@@ -3,15 +3,18 @@
 
 import { Panel } from "./panel.js";
 
+const KEPT = 60000; // ms in which the browser begins to save a file
+
 const percent = (share) => (share && share < 1e-5 ? "below 0.001 %" : `${(100 * share).toPrecision(3)} %`);
 
-export function compensate({ $, ask, hello }) {
-  const panel = (name, title, grid, act) => new Panel($(`compensate-${name}`), { title, grid, act });
+export function compensate(app) {
+  const { $, ask, hello } = app;
+  const panel = (name, title, grid, act, parts) => new Panel(app, $(`compensate-${name}`), { title, grid, act, parts });
   const wipe = panel("wipe", "Predicted appearance", hello.camera_grid, (kind, row, col, event) => {
     if (kind === "press" || kind === "drag" || event?.key) part((col + 0.5) / hello.camera_grid[1]);
   });
   const target = panel("target", "Desired", hello.camera_grid);
-  const pattern = panel("pattern", "Pattern", hello.grid);
+  const pattern = panel("pattern", hello.projectors.length ? "Patterns" : "Pattern", hello.grid, undefined, hello.projectors);
   const reach = panel("reach", "Out of reach", hello.camera_grid);
   const line = document.createElement("span"), source = $("compensate-source");
   let solved = null, solves = 0; // the last certified compensation, and how many were asked for
@@ -32,10 +35,16 @@ export function compensate({ $, ask, hello }) {
     return { picture: Number(source.value), gain, bounds: [low, high], resize: $("compensate-resize").value };
   };
 
-  // While the slider moves: as good as there is time for.
+  function showNumbers() {
+    for (const name of ["gain", "low", "high"]) {
+      $(`compensate-${name}-value`).textContent = $(`compensate-${name}`).value;
+    }
+  }
+
+  // While a slider moves: as good as there is time for.
   async function adjust() {
     if (!source.value) return;
-    $("compensate-gain-value").textContent = $("compensate-gain").value;
+    showNumbers();
     const before = solves, answer = await ask("adjust", settings());
     if (!answer || !solved || before !== solves) return; // a solve was asked for since then
     const { arrays } = answer;
@@ -90,9 +99,27 @@ export function compensate({ $, ask, hello }) {
     $("compensate-residuals").firstElementChild.setAttribute("points", points.join(" "));
   }
 
-  for (const name of ["auto", "low", "high"]) $(`compensate-${name}`).oninput = solve;
-  $("compensate-gain").oninput = adjust;
-  $("compensate-gain").onchange = solve;
+  // Files of the last compensation, one after the other: a newer question would take the place of an older one.
+  let saved = Promise.resolve();
+  const save = (name) => { saved = saved.then(() => download(name)); };
+
+  async function download(name) {
+    const answer = await ask("result", { name });
+    if (!answer) return;
+    const href = URL.createObjectURL(new Blob([answer.arrays.content]));
+    Object.assign(document.createElement("a"), { href, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(href), KEPT);
+  }
+
+  for (const button of $("compensate-downloads").querySelectorAll("button")) {
+    button.onclick = () => save(button.dataset.file);
+  }
+  $("compensate-auto").oninput = solve;
+  for (const name of ["gain", "low", "high"]) {
+    // The largest gain of other bounds takes a solve.
+    $(`compensate-${name}`).oninput = () => ($("compensate-auto").checked ? solve() : adjust());
+    $(`compensate-${name}`).onchange = solve;
+  }
   source.onchange = solve;
   return { start: solve };
 }

@@ -1,46 +1,48 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The socket: questions with an answer each, news from the server, and trying again when it is gone.
+// Questions with an answer each, and news from Python, over any carrier: a socket, or the kernel of a notebook.
 
 import { decode, encode } from "./messages.js";
 
-const LONGEST_WAIT = 5000; // ms between two tries
 const AT_ONCE = { bounces: Infinity, compensate: Infinity }; // a newer one of these ends the one under way
 
 export class Connection extends EventTarget {
-  // Events: "open" (its detail is what the server says of T), "lost", "busy", "ready", and pushes by name.
-  constructor() {
+  // `carrier` has `isOpen`, `send(message)`, `close()` and `listen({ message, lost, waiting })`: it opens itself,
+  // and again, and tells of each message, a string or an ArrayBuffer; in words, that the other side is gone, and
+  // that no answer comes, or "" where one will. Events: "open" (its detail is what Python says of T), "lost", "waiting", "heard"
+  // after that, "busy", "ready", and pushes by name.
+  constructor(carrier) {
     super();
-    for (const state of ["lost", "busy", "ready"]) {
-      this.addEventListener(state, () => { document.body.dataset.state = state; });
-    }
     this.kinds = new Map(); // of questions under way: those that were sent, and the newest after them
     this.questions = 0;
-    this.tries = 0;
-    this.connect();
+    this.carrier = carrier;
+    carrier.listen({
+      message: (data) => this.receive(decode(data)),
+      lost: (words) => this.lose(words),
+      waiting: (words) => this.tell("waiting", words),
+    });
   }
 
-  connect() {
-    const url = new URL("socket", location.href);
-    url.protocol = url.protocol.replace("http", "ws");
-    this.socket = new WebSocket(url);
-    this.socket.binaryType = "arraybuffer";
-    this.socket.onmessage = ({ data }) => this.receive(decode(data));
-    this.socket.onclose = ({ reason }) => {
-      for (const { sent, next } of this.kinds.values()) [...sent, next].forEach((each) => each?.answer(null));
-      this.kinds.clear();
-      this.tell("lost", reason);
-      setTimeout(() => this.connect(), Math.min(LONGEST_WAIT, 250 * 2 ** this.tries++));
-    };
+  lose(words) {
+    for (const { sent, next } of this.kinds.values()) [...sent, next].forEach((each) => each?.answer(null));
+    this.kinds.clear();
+    this.tell("lost", words);
   }
 
   tell(name, detail) {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 
+  // Let `element` say in its data what state the connection is in.
+  mark(element) {
+    for (const state of ["lost", "busy", "ready"]) {
+      this.addEventListener(state, () => { element.dataset.state = state; });
+    }
+  }
+
   // The answer, or null where a newer question of this kind took its place or the connection was lost.
   // Errors are thrown. Painting never queues: a question waits here while two are under way.
   ask(kind, fields = {}, arrays = {}) {
-    if (this.socket.readyState !== WebSocket.OPEN) return Promise.resolve(null);
+    if (!this.carrier.isOpen) return Promise.resolve(null);
     return new Promise((answer, fail) => {
       const queue = this.kinds.get(kind) ?? { sent: [], next: null };
       this.kinds.set(kind, queue);
@@ -54,17 +56,16 @@ export class Connection extends EventTarget {
   send(queue) {
     if (!queue.next || queue.sent.length >= (AT_ONCE[queue.next.kind] ?? 2)) return;
     const { id, kind, fields, arrays } = queue.next;
-    this.socket.send(encode({ id, do: kind, ...fields }, arrays));
+    this.carrier.send(encode({ id, do: kind, ...fields }, arrays));
     queue.sent.push(queue.next);
     queue.next = null;
   }
 
   receive(message) {
+    this.tell("heard");
     const queue = this.kinds.get(message.do), at = queue?.sent.findIndex(({ id }) => id === message.id) ?? -1;
-    if (message.do === "hello") {
-      this.tries = 0;
-      this.tell("open", message);
-    } else if (at < 0) this.tell(message.do, message);
+    if (message.do === "hello") this.tell("open", message);
+    else if (at < 0) this.tell(message.do, message);
     else {
       const [question, ...older] = queue.sent.splice(0, at + 1).reverse();
       older.forEach((each) => each.answer(null)); // the server took a newer one in their place

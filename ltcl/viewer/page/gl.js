@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Draws linear light on canvases. One WebGL context serves them all: it draws at the size of the picture, one
 // fragment a pixel, row 0 first, and the result is copied to the canvas, which CSS enlarges without smoothing.
+// A browser takes contexts away, as when many notebooks are open: the next drawing makes another one.
 
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
@@ -54,15 +55,24 @@ void main() {
   colour.a = 1.0;
 }`;
 
-const surface = document.createElement("canvas");
-const gl = surface.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-export const supported = Boolean(gl);
-
-surface.addEventListener("webglcontextlost", (event) => event.preventDefault());
-surface.addEventListener("webglcontextrestored", () => location.reload());
-gl?.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-
+let surface = null, gl = null;
 const programs = new Map();
+
+// Whether there is a context that can draw.
+export function ready() {
+  if (gl && !gl.isContextLost()) return true;
+  surface = document.createElement("canvas");
+  gl = surface.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+  gl?.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  programs.clear();
+  return Boolean(gl);
+}
+
+// Give the context back, until something is drawn again.
+export function release() {
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  gl = surface = null;
+}
 
 // Use the variant of the shader with these numbers for its names; returns the places of its uniforms.
 function use(defines) {
@@ -88,9 +98,16 @@ function use(defines) {
 // Pictures of one size as the layers of one texture.
 export class Layers {
   set(pictures) {
-    const { h, w, c } = pictures[0], shape = [c === 1 ? gl.R32F : gl.RGB32F, w, h, pictures.length];
-    if (String(shape) !== String(this.shape)) {
-      gl.deleteTexture(this.texture ?? null);
+    const { h, w, c } = pictures[0];
+    Object.assign(this, { pictures, h, w, grey: c === 1 });
+    if (ready()) this.upload();
+  }
+
+  // Bring the pictures to the context of now.
+  upload() {
+    const { pictures, h, w } = this, { c } = pictures[0], shape = [c === 1 ? gl.R32F : gl.RGB32F, w, h, pictures.length];
+    if (this.owner !== gl || String(shape) !== String(this.shape)) {
+      if (this.owner === gl) gl.deleteTexture(this.texture);
       this.texture = gl.createTexture();
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
       gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, ...shape);
@@ -102,11 +119,12 @@ export class Layers {
     pictures.forEach(({ data }, k) => {
       gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, w, h, 1, c === 1 ? gl.RED : gl.RGB, gl.FLOAT, data);
     });
-    Object.assign(this, { shape, pictures, h, w, grey: c === 1 });
+    Object.assign(this, { shape, owner: gl });
   }
 
   clear() {
-    gl.deleteTexture(this.texture);
+    if (this.owner === gl) gl?.deleteTexture(this.texture);
+    this.owner = null;
   }
 
   // The values of one pixel of the weighted sum.
@@ -119,6 +137,8 @@ export class Layers {
 // `look`: white (the value shown as white), logarithmic, mode (0 natural, 1 heat, 2 signed), weights; and
 // optionally others and wipe (0 to 1: left of it the sum by `others`), deviation (Layers) to overlay.
 export function draw(canvas, layers, look) {
+  if (!ready()) return;
+  for (const each of [layers, look.deviation]) if (each && each.owner !== gl) each.upload();
   const { h, w } = layers;
   if (surface.width < w || surface.height < h) {
     surface.width = Math.max(w, surface.width);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Bytes of a message, the same both ways: the length of the header as uint32 (little-endian), the header as
+// Bytes of a message, the same both ways and on any carrier: the length of the header as uint32 (little-endian), the header as
 // JSON padded with spaces so that arrays begin at a multiple of 4, then the arrays, each padded to 4 bytes.
 
 const TYPES = { f4: Float32Array, u1: Uint8Array }; // light, codes
@@ -44,18 +44,18 @@ export function encode(header, arrays = {}) {
   const names = Object.keys(arrays);
   if (!names.length) return JSON.stringify(header);
   const list = names.map((name) => {
-    const { h, w, c } = arrays[name];
-    return { name, shape: [h, w, c], dtype: "u1" };
+    const { h, w, c, length } = arrays[name]; // a picture, or the bytes of a file
+    return { name, shape: length === undefined ? [h, w, c] : [length], dtype: "u1" };
   });
   const json = new TextEncoder().encode(JSON.stringify({ ...header, arrays: list }));
   const start = padded(4 + json.length);
-  const size = names.reduce((sum, name) => sum + padded(arrays[name].data.byteLength), start);
+  const contents = names.map((name) => arrays[name].data ?? arrays[name]);
+  const size = contents.reduce((sum, { byteLength }) => sum + padded(byteLength), start);
   const bytes = new Uint8Array(size);
   new DataView(bytes.buffer).setUint32(0, start - 4, true);
   bytes.fill(32, 4, start).set(json, 4);
   let offset = start;
-  for (const name of names) {
-    const { buffer, byteOffset, byteLength } = arrays[name].data;
+  for (const { buffer, byteOffset, byteLength } of contents) {
     bytes.set(new Uint8Array(buffer, byteOffset, byteLength), offset);
     offset += padded(byteLength);
   }
@@ -70,7 +70,7 @@ export function decode(message) {
   let offset = 4 + length;
   for (const { name, shape, dtype } of header.arrays) {
     const data = new TYPES[dtype](message, offset, shape.reduce((a, b) => a * b));
-    arrays[name] = new Pixels(data, shape);
+    arrays[name] = shape.length === 1 ? data : new Pixels(data, shape);
     offset += padded(data.byteLength);
   }
   return { ...header, arrays };

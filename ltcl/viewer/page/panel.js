@@ -3,22 +3,25 @@
 
 import { Layers, draw } from "./gl.js";
 
-export const look = { stops: 0, logarithmic: false, mode: 0 }; // of all panels: the bar "Display"
-const panels = new Set();
-export const each = (change) => panels.forEach(change);
-
 const STEPS = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
 const HYSTERESIS = 6; // white follows a picture that is brighter, or darker by this factor: no flicker
 
+// The pixel in the middle of a projector's pattern, as [row, column].
+export function middle({ grid: [h, w], left }) {
+  return [h >> 1, left + (w >> 1)];
+}
+
 export class Panel {
-  // `element` is an empty <figure>. `grid` is [h, w]. `act(kind, row, col, event)` hears what pointer and
-  // keys do: "hover", "press", "drag", "release", "leave".
-  constructor(element, { title, grid, act = () => {} }) {
-    Object.assign(this, { element, grid, act, layers: new Layers(), white: 0, zoom: 1 });
-    this.cursor = grid.map((n) => n >> 1);
+  // `app` has the `panels` and the `look` of them all, the bar "Display". `element` is an empty <figure>.
+  // `grid` is [h, w]. `act(kind, row, col, event)` hears what pointer and keys do: "hover", "press", "drag",
+  // "release", "leave". `parts` are the projectors whose patterns stand side by side: [{ name, grid, left }].
+  constructor(app, element, { title, grid, act = () => {}, parts = [] }) {
+    Object.assign(this, { app, element, grid, act, parts, layers: new Layers(), white: 0, zoom: 1 });
+    const [first] = parts;
+    this.cursor = first ? middle(first) : grid.map((n) => n >> 1);
     element.classList.add("panel");
     element.parentElement.classList.toggle("wide", grid[1] > 2.3 * grid[0]); // pictures that are larger stacked
-    element.append(document.getElementById("panel").content.cloneNode(true));
+    element.append(app.$("panel").content.cloneNode(true));
     const find = (selector) => element.querySelector(selector);
     Object.assign(this, { canvas: find("canvas"), frame: find(".frame"), sheet: find(".sheet") });
     Object.assign(this, { mark: find(".cursor"), output: find(".values") });
@@ -31,10 +34,37 @@ export class Panel {
     const [out, into] = element.querySelectorAll(".zoom button");
     out.onclick = () => this.zoomBy(1 / 1.5);
     into.onclick = () => this.zoomBy(1.5);
+    this.names = document.createElement("div");
+    if (parts.length) this.divide();
     this.listen();
-    new ResizeObserver(() => this.fit()).observe(this.frame);
+    this.observer = new ResizeObserver(() => this.fit());
+    this.observer.observe(this.frame);
     this.frame.style.setProperty("--aspect", grid[1] / grid[0]);
-    panels.add(this);
+    app.panels.add(this);
+  }
+
+  // Names of the projectors in a row above the picture, and a border around the pattern of each.
+  divide() {
+    const [h, w] = this.grid;
+    this.element.classList.add("several");
+    this.names.className = "names";
+    this.frame.before(this.names);
+    for (const { name, grid: [height, width], left } of this.parts) {
+      const border = document.createElement("span"), label = document.createElement("b");
+      border.className = "part";
+      label.textContent = name;
+      label.style.width = `${(100 * width) / w}%`;
+      const box = { left: left / w, width: width / w, height: height / h };
+      for (const [side, share] of Object.entries(box)) border.style[side] = `${100 * share}%`;
+      this.sheet.append(border);
+      this.names.append(label);
+    }
+  }
+
+  dispose() {
+    this.observer.disconnect();
+    cancelAnimationFrame(this.soon);
+    this.layers.clear();
   }
 
   set note(text) {
@@ -52,7 +82,7 @@ export class Panel {
 
   redraw() {
     if (!this.layers.pictures || !this.element.offsetParent) return; // hidden ones are drawn later
-    const white = (this.white || 1) / 2 ** look.stops;
+    const { look } = this.app, white = (this.white || 1) / 2 ** look.stops;
     const { wipe, others, deviation, weights, mode = look.mode } = this;
     draw(this.canvas, this.layers, { ...look, white, mode, weights, others, wipe, deviation });
     this.canvas.dataset.white = white;
@@ -99,6 +129,7 @@ export class Panel {
     canvas.addEventListener("pointerleave", () => this.act("leave", ...this.cursor));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     this.frame.addEventListener("wheel", (event) => {
+      if (this.app.embedded && !event.ctrlKey && !event.metaKey) return; // it scrolls the notebook
       event.preventDefault();
       this.zoomBy(Math.exp(-event.deltaY / 400), event);
     }, { passive: false });
@@ -156,7 +187,9 @@ export class Panel {
     const names = ["R\u00a0", "G\u00a0", "B\u00a0"];
     const format = (v) => (Math.abs(v) < 1e-3 && v ? v.toExponential(2) : v.toFixed(4));
     const text = this.values(row, col).map((v, k, all) => (all.length === 3 ? names[k] : "") + format(v));
-    this.output.textContent = `row ${row}, column ${col}   ${text.join("   ")}`;
+    const part = this.parts.find(({ grid, left }) => row < grid[0] && col >= left && col < left + grid[1]);
+    const place = part ? `${part.name}: row ${row}, column ${col - part.left}` : `row ${row}, column ${col}`;
+    this.output.textContent = `${place}   ${text.join("   ")}`;
   }
 
   fit() {
@@ -166,6 +199,7 @@ export class Panel {
     this.frame.classList.toggle("zoomed", this.zoom > 1);
     this.sheet.style.width = `${scale * w}px`;
     this.sheet.style.height = `${scale * h}px`;
+    this.names.style.width = `${Math.min(scale * w, clientWidth)}px`;
     this.canvas.classList.toggle("smooth", scale * devicePixelRatio < 1);
   }
 

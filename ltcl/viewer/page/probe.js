@@ -3,16 +3,20 @@
 
 import { Panel } from "./panel.js";
 
-export function probe({ $, ask, press, hello }) {
+export function probe(app) {
+  const { $, ask, press, hello } = app;
   const sides = {
-    projector: { grid: hello.grid, title: "Projector", kind: "column", array: "picture", other: "camera" },
+    projector: {
+      grid: hello.grid, parts: hello.projectors, title: hello.projectors.length ? "Projectors" : "Projector",
+      kind: "column", array: "picture", other: "camera",
+    },
     camera: { grid: hello.camera_grid, title: "Camera", kind: "row", array: "pattern", other: "projector" },
   };
   let source = "projector", held = false;
 
   for (const [name, side] of Object.entries(sides)) {
     const act = (kind, row, col, event) => heard(name, kind, event);
-    side.panel = new Panel($(`probe-${name}`), { title: side.title, grid: side.grid, act });
+    side.panel = new Panel(app, $(`probe-${name}`), { ...side, act });
   }
 
   function heard(name, kind, event) {

@@ -2,9 +2,11 @@
 // The projector's window: one pixel of the pattern on a square of whole display pixels, without smoothing.
 
 import { Connection } from "./connection.js";
+import { SocketCarrier } from "./socket.js";
 
 const canvas = document.getElementById("show"), hint = document.getElementById("hint");
-const connection = new Connection();
+const connection = new Connection(new SocketCarrier());
+connection.mark(document.body);
 
 function fit() {
   const display = [innerWidth * devicePixelRatio, innerHeight * devicePixelRatio];

@@ -3,15 +3,17 @@
 
 import { draw, Layers } from "./gl.js";
 import { Pixels } from "./messages.js";
-import { Panel } from "./panel.js";
+import { Panel, middle } from "./panel.js";
 
 const UNDO = 30; // steps that can be undone
 
-export function relight({ $, ask, press, hello }) {
+export function relight(app) {
+  const { $, ask, press, hello } = app;
   const [h, w] = hello.grid;
   const canvas = () => pattern.canvas;
-  const pattern = new Panel($("relight-pattern"), { title: "Projector’s pattern", grid: [h, w], act });
-  const seen = new Panel($("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
+  const parts = hello.projectors, title = parts.length ? "Patterns of the projectors" : "Projector’s pattern";
+  const pattern = new Panel(app, $("relight-pattern"), { title, grid: [h, w], act, parts });
+  const seen = new Panel(app, $("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
   const paint = canvas().getContext("2d", { willReadFrequently: true });
   const past = [], video = document.createElement("video");
   let erasing = false, last = null, changed = false, sending = 0, motion = null, turn = 0;
@@ -90,7 +92,17 @@ export function relight({ $, ask, press, hello }) {
   }
 
   function spot(seconds) {
-    const x = w * (0.5 + 0.4 * Math.sin(1.1 * seconds)), y = h * (0.5 + 0.4 * Math.sin(1.7 * seconds));
+    glowAt(w * (0.5 + 0.4 * Math.sin(1.1 * seconds)), h * (0.5 + 0.4 * Math.sin(1.7 * seconds)));
+  }
+
+  // In the middle of one of several projectors: where they meet in the pattern they may light nothing.
+  function first() {
+    if (!parts.length) return spot(0.15);
+    const [row, col] = middle(parts[0]);
+    glowAt(col + 0.5, row + 0.5);
+  }
+
+  function glowAt(x, y) {
     const glow = paint.createRadialGradient(x, y, 0, x, y, Number(size.value));
     glow.addColorStop(0, $("relight-colour").value);
     glow.addColorStop(1, "#000");
@@ -149,7 +161,7 @@ export function relight({ $, ask, press, hello }) {
     const light = answer.arrays.pattern;
     shown(light);
     // All white is how it begins, and leaves nothing to paint.
-    if (!("picture" in fields) && light.data.every((stored) => stored === light.data[0])) spot(0.15);
+    if (!("picture" in fields) && light.data.every((stored) => stored === light.data[0])) first();
     pattern.read();
   }
 

@@ -5,7 +5,7 @@ const percent = (share) => `${(100 * share).toFixed(1)} %`;
 
 const PERIOD = 1000; // ms between two looks into the folder
 
-export function scan({ $, ask, press, hello }) {
+export function scan({ $, ask, press, hello, restart }) {
   const list = $("scan-photographs"), most = 24; // as many as the server keeps
   let seen = 0, timer = null;
 
@@ -53,10 +53,10 @@ export function scan({ $, ask, press, hello }) {
       answer.photographs.forEach((each, k) => add(each, answer.arrays[k]));
       const item = (textContent) => Object.assign(document.createElement("li"), { textContent });
       $("scan-warnings").replaceChildren(...answer.warnings.map(item));
-      if (answer.finished && !hello.grid) location.reload();
+      if (answer.finished && !hello.grid) restart();
     } else seen = 0; // the next viewer counts anew
     timer = setTimeout(start, PERIOD);
   }
 
-  return { start };
+  return { start, dispose: () => clearTimeout(timer) };
 }

@@ -18,7 +18,7 @@ from ltcl.acquisition.estimation.refinement import (
     make_estimator,
     stage_levels,
 )
-from ltcl.acquisition.estimation.windows import check_memory
+from ltcl.acquisition.estimation.windows import check_memory, hat_levels
 from ltcl.acquisition.scanning import sketch
 from ltcl.errors import MemoryLimitError
 from ltcl.transport.noise import Noise
@@ -194,3 +194,17 @@ def test_large_grids_are_refined_and_small_ones_are_not() -> None:
 def test_a_grid_beyond_the_memory_is_refused() -> None:
     with pytest.raises(MemoryLimitError, match="100000 x 100000"):
         check_memory((100000, 100000), 3)
+
+
+@pytest.mark.parametrize("of_many_pixels", [False, True])
+def test_light_is_unknown_at_fine_scales_beside_the_crease(
+    refined: RefinedEstimator, T: np.ndarray, of_many_pixels: bool
+) -> None:
+    estimator: Any = refined
+    if not of_many_pixels:
+        estimator = estimate(Estimator(GRID, 1, np.eye(1), None), make_pairs(T))
+    unknown = estimator.unknown_light()
+    assert unknown.shape == (len(hat_levels(GRID)), *GRID)
+    assert unknown.min() >= 0.0
+    fine = unknown[:2].sum(axis=(0, 1))
+    assert fine[22:26].mean() > 2.0 * fine[:8].mean()

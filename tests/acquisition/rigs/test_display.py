@@ -178,9 +178,7 @@ def test_pictures_are_scaled_as_asked(tmp_path: Path, how: str) -> None:
 
 
 def test_patterns_of_an_acquisition_are_not_scaled(scan: FolderRig) -> None:
-    with pytest.raises(
-        InputError, match=r"resize is 'crop', but .* the patterns of an acquisition"
-    ):
+    with pytest.raises(InputError, match="resize is 'crop'"):
         show(scan.folder, 0, 0.01, resize="crop")
     with pytest.raises(InputError, match="resize is 'fit'"):
         show(scan.folder, 0, 0.01, resize="fit")

@@ -211,6 +211,24 @@ def test_the_cameras_own_files_are_taken(tmp_path: Path) -> None:
     assert rig.photograph(HALF, 1.0)[0, 0] == 4
 
 
+def test_photographs_of_another_scan_are_left_out(tmp_path: Path) -> None:
+    """The card keeps them; one that is new is named."""
+    scan = tmp_path / "scan"
+    rig = FolderRig(scan, GRID)
+    rig.prepare([(HALF, 1.0)])
+    old = tmp_path / "IMG_1.png"
+    camera_files.write(old, GREY + 1)
+    new = tmp_path / "IMG_2.png"
+    camera_files.write(new, GREY + 2)
+    copies = [shutil.copyfile(old, tmp_path / "copy.png")]
+    with pytest.raises(InputError, match=r"0 new photographs, but 1 is missing, number 1;"):
+        rig.take([old], known=copies)
+    with pytest.raises(InputError, match=r"2 new photographs, IMG_1\.png to IMG_2\.png, but 1 is"):
+        rig.take([old, new])
+    rig.take([old, new], known=copies)
+    assert rig.photograph(HALF, 1.0)[0, 0] == 2
+
+
 NAMES = ["projector_grid", "channels", "camera_bits", "pattern_bits", "projector", "exposures"]
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition import acquire, camera_map
+from ltcl.acquisition.scanning import pictures
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
 from tests.store.stores import contents
@@ -115,6 +116,16 @@ def test_refused_and_put_right(
     change: Callable[[np.ndarray, int, int], np.ndarray],
     exposures: tuple[float, ...],
 ) -> None:
+    assert_refused_and_put_right(tmp_path, folder, strategy, change, exposures)
+
+
+def assert_refused_and_put_right(
+    tmp_path: Path,
+    folder: Path,
+    strategy: str,
+    change: Callable[[np.ndarray, int, int], np.ndarray],
+    exposures: tuple[float, ...],
+) -> None:
     """The second batch is wrong; the first one stays, and then the scan ends as the clean one.
 
     A change is of the order of a scan's photographs, n of each pattern, from `start` on.
@@ -145,6 +156,14 @@ def test_refused_and_put_right(
         assert change.__name__ in str(error.value)
     acquire(set_up(strategy)[0], **settings)
     assert contents(path) == clean.files
+
+
+@pytest.mark.slow
+def test_pictures_of_many_pixels_are_compared_at_some_of_them(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures, "MAX_COMPARED_PIXELS", 60)
+    assert_refused_and_put_right(tmp_path, folder, "sketch", exchanged, (0.5,))
 
 
 def oblique_rig(shift: float) -> Unplugged:

@@ -186,7 +186,7 @@ def test_a_picture_that_all_others_contradict_is_refused(scanned: Any, tmp_path:
     wrong = clean.count - 12
     rig = Unplugged(near + smooth_light(GRID, 0.2), GRID)
     rig.fault = lambda codes, image: dimmer(image) if rig.count == wrong else image
-    with pytest.raises(ScanRefused, match="contradicts those of all others"):
+    with pytest.raises(ScanRefused, match="contradicts"):
         acquire(rig, geometry="aligned", strategy="direct", store=tmp_path / "T.zarr")
 
 

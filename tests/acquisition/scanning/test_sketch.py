@@ -17,6 +17,7 @@ from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.estimation import refinement, windows
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.plan import choose, plans
+from ltcl.acquisition.settings import STRATEGIES
 from ltcl.errors import InputError, MemoryLimitError, ScanRefused
 
 from ..stopping import Unplugged
@@ -312,6 +313,41 @@ def test_a_sketch_is_finished_with_the_rounds_that_were_photographed(
         acquire(rig, geometry="aligned", strategy="sketch", store=path, photographs=allowed)
     finalize(path)
     assert Report.of(path).patterns == sketch.count_patterns(SMALL) + 16
+
+
+@pytest.mark.slow
+def test_patterns_of_a_round_are_kept_with_the_scan(
+    tmp_path: Path, first_count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a round that was begun are not made again: rounding may make others."""
+    path = tmp_path / "T.zarr"
+    settings: dict[str, Any] = {
+        "geometry": "aligned", "strategy": "sketch", "photographs": first_count + ROUND
+    }  # fmt: skip
+    whole = acquire(Unplugged(corner(), SMALL), **settings)
+    stopped = Unplugged(corner(), SMALL, left=first_count + 3)
+    with pytest.raises(RuntimeError):
+        acquire(stopped, store=path, **settings)
+
+    def others(*_: Any) -> list[np.ndarray]:
+        return sketch.more_patterns(SMALL, 0)
+
+    monkeypatch.setattr(sketch, "refined_patterns", others)
+    resumed = acquire(Unplugged(corner(), SMALL), store=path, **settings)
+    np.testing.assert_array_equal(dense(resumed), dense(whole))
+
+
+@pytest.mark.parametrize("goal", [{"rtol": 0.01}, {"photographs": 90}], ids=str)
+@pytest.mark.parametrize("strategy", ["auto", *sorted({*STRATEGIES} - {"sketch"})])
+def test_a_goal_that_no_other_strategy_keeps_is_refused(
+    strategy: str, goal: dict[str, Any]
+) -> None:
+    """They would take as many photographs as ever; "auto" makes no sketch of so few pixels."""
+    rig = Unplugged(corner(), SMALL)
+    [(name, value)] = goal.items()
+    with pytest.raises(InputError, match=f"{name} is {value}, but strategy is '{strategy}'"):
+        acquire(rig, geometry="aligned", strategy=strategy, **goal)
+    assert rig.count == 0
 
 
 def test_too_few_photographs_are_refused_before_the_first(first_count: int) -> None:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import pickle
 from typing import Any
 
 import numpy as np
@@ -101,6 +103,29 @@ def test_light_of_compensate(kind, brightest):
     facts = compensator.judge()
     assert facts.error == pytest.approx(error, abs=1e-5)
     assert facts.clipped == pytest.approx(expected.clipped, abs=0.1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "weighted", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "weighted"]
+)
+def test_a_frame_and_compensate_take_the_same_steps(kind, weighted):
+    """From the same light, both end at the same pattern, to rounding."""
+    T = transport(kind)
+    desired = picture(T, 2.0)
+    settings: dict[str, Any] = {"gain": 0.9, "background": 0.05, "bounds": (0.0, 0.8), "rtol": 1e-3}
+    if kind in SQUARE:
+        settings["inverse"] = ltcl.invert(T, 1e-3)
+    if weighted:
+        settings["weights"] = picture(T, 2.0, seed=7)
+    compensator = light(T, **settings)
+    pattern = compensator(desired)
+    expected = ltcl.compensate(T, desired, **settings)
+    assert expected.clipped > 0.1
+    np.testing.assert_allclose(pattern, expected.pattern, rtol=0, atol=1e-5)
+    facts = compensator.judge()
+    assert facts.error == pytest.approx(expected.error, abs=1e-6)
+    assert facts.clipped == pytest.approx(expected.clipped, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", SQUARE)
@@ -243,13 +268,15 @@ def test_kernels_meet_their_twins(shaped, kind, monkeypatch):
     monkeypatch.setattr(prepared, "STRIP_PIXELS", 5)
     known = transport(kind)
     T = ltcl.Transport(known.matrices, GRID, device=shaped, mixing=known.mixing)
-    compensator = ltcl.Compensator(T, gain="follow", background=0.1, bounds=(0.1, 0.8))
+    compensator = ltcl.Compensator(
+        T, gain="follow", background=0.1, bounds=(0.1, 0.8), bounces_every=2
+    )
     colours = T.channels
     frames = compensator._frames_of(colours, np.dtype(np.uint8))
     assert frames.bounded is not None
     codes = rng.integers(0, 256, (N, colours), dtype=np.uint8)
     slot = frames.slots[0]
-    slot.frame.set(codes)
+    slot.frame.array.set(codes)
     slot.decode.set(gain=0.7 / frames.unit)
     slot.decode()
     table = from_srgb(np.arange(256) / 255)
@@ -257,13 +284,31 @@ def test_kernels_meet_their_twins(shaped, kind, monkeypatch):
     found = frames.seen.to_channels(frames.target.get())
     np.testing.assert_allclose(frames.unit * found, expected, rtol=0, atol=1e-6)
 
+    kept = frames._kept_bounces
+    assert kept is not None
+    assert kept.background is not None
+    bounces = rng.uniform(-0.4, 0.0, frames.shown.shape).astype(np.float32)
+    kept.light.set(bounces)
+    assert slot.decode_between is not None
+    slot.decode_between.set(gain=0.7 / frames.unit, share=0.9)
+    slot.decode_between()
+    background_bounces = frames.shown.to_channels(kept.background.get())
+    between = reference.frames_between(
+        expected / frames.unit, frames.shown.to_channels(bounces), 0.9
+    )
+    found = frames.shown.to_channels(frames.direct.get())
+    np.testing.assert_allclose(found, between - background_bounces, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        frames.unit * frames.seen.to_channels(frames.target.get()), expected, rtol=0, atol=1e-6
+    )
+
     direct = rng.uniform(-0.3, 1.3, frames.shown.shape).astype(np.float32)
     frames.direct.set(direct)
     mixing = np.eye(colours) if T.mixing is None else np.linalg.inv(T.mixing)
     factors = frames.shown.to_channels(frames._direct_factors.get())
     light = reference.frames_light(factors, frames.shown.to_channels(direct), mixing)
     np.testing.assert_allclose(
-        frames.shown.to_channels(frames.light_of_direct()), light, rtol=0, atol=1e-6
+        frames.shown.to_channels(frames.light_of_direct(frames.direct)), light, rtol=0, atol=1e-6
     )
     frames._exceeded.set(np.zeros(1, np.int32))
     frames._clip()
@@ -279,13 +324,14 @@ def test_kernels_meet_their_twins(shaped, kind, monkeypatch):
     slot.encode()
     row = frames._table.thresholds[0, :-1]
     expected = reference.frames_encode(light, 0.1, 0.8, row)
-    difference = slot.codes.get().astype(int) - expected
+    difference = slot.codes.array.get().astype(int) - expected
     is_lit = scales > 0
     assert np.abs(difference[is_lit]).max() <= 1
     assert np.mean(difference[is_lit] != 0) < 0.02
-    assert not slot.codes.get()[~is_lit].any()
+    assert not slot.codes.array.get()[~is_lit].any()
 
     assert frames._find_peaks is not None
+    frames._find_peaks.set(peaks=slot.peaks.array)
     frames._find_peaks()
     target = frames.seen.to_channels(np.full(frames.seen.shape, 0.1 / frames.unit))
     columns = [t[:, None] for t in target.T]
@@ -294,7 +340,7 @@ def test_kernels_meet_their_twins(shaped, kind, monkeypatch):
         undone.append(np.linalg.solve(S.to_dense(), columns[channel])[:, 0])
     shift = reference.frames_light(factors, np.stack(undone, axis=-1), mixing)
     expected = reference.frames_peaks(light, 0.8, shift, 5)
-    np.testing.assert_allclose(frames._peaks.get(), expected, rtol=0, atol=3e-3)
+    np.testing.assert_allclose(slot.peaks.array.get(), expected, rtol=0, atol=3e-3)
 
 
 # Time.
@@ -310,6 +356,41 @@ def test_order_of_submitted_frames():
         for future, codes in zip(futures, expected, strict=True):
             np.testing.assert_array_equal(future.result(), codes)
         assert pipelined.statistics.frames == 12
+
+
+PINNED: dict[str, dict[str, Any]] = {
+    "clamped": {"clamp": True},
+    "within the bounds": {},
+    "gain that follows": {"gain": "follow", "clamp": True},
+    "cold": {"warm": False, "dtype": "uint8", "encode": "srgb"},
+}
+
+
+@pytest.mark.parametrize("case", PINNED)
+@pytest.mark.parametrize("frame_dtype", ["uint8", "float32"])
+def test_pinned_memory_gives_the_same_codes(monkeypatch, case, frame_dtype):
+    """One by one, in a pipeline, and from the device, in turn."""
+    T = transport("colour")
+    frames = []
+    for seed in range(8):
+        frame = picture(T, 0.1 * (1 + seed % 5), seed=seed)
+        frames.append((255 * frame).astype(np.uint8) if frame_dtype == "uint8" else frame)
+
+    def codes(transfers: str) -> list[np.ndarray]:
+        monkeypatch.setenv("LTCL_TRANSFERS", transfers)
+        with light(T, depth=2, **PINNED[case]) as compensator:
+            results = [compensator(frame) for frame in frames[:3]]
+            # One by one where the gain follows what was collected before.
+            if case == "gain that follows":
+                results += [compensator.submit(frame).result() for frame in frames]
+            else:
+                futures = [compensator.submit(frame) for frame in frames]
+                results += [future.result() for future in futures]
+            on_device = T.device.upload(frames[3], frames[3].dtype)
+            return [*results, compensator(on_device)]
+
+    for expected, found in zip(codes("direct"), codes("pinned"), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_late_frames_are_dropped():
@@ -386,6 +467,154 @@ def test_launches_of_a_frame():
         products = compensator.statistics.products
         allowed = 14 if inverse is not None else 14 + 2 * products
         assert launches <= allowed
+
+
+# Bounces of an earlier frame.
+
+
+def undone(T: ltcl.Transport, light: np.ndarray) -> np.ndarray:
+    """S^-1 of light (N, channels), in float64."""
+    columns = []
+    for S, column in zip(T.systems, light.T, strict=True):
+        columns.append(np.linalg.solve(S.to_dense().astype(np.float64), column))
+    return np.stack(columns, axis=-1)
+
+
+# Kinds of T, and the tolerance of an inverse, or none.
+BOUNCING = [*((kind, None) for kind in SQUARE), ("colour", 1e-3), ("compressed", 2e-3)]
+
+
+@pytest.mark.parametrize(("kind", "inverse_rtol"), BOUNCING)
+def test_bounces_of_every_second_frame(kind, inverse_rtol):
+    """Codes as without the option, and in between those of the bounces of the frame before."""
+    T = transport(kind)
+    dark = 0.05
+    settings: dict[str, Any] = {"background": dark, "rtol": 1e-4, "clamp": True}
+    tolerance = 1e-3
+    if inverse_rtol is not None:
+        settings |= {"inverse": ltcl.invert(T, inverse_rtol), "rtol": inverse_rtol}
+        tolerance += 2 * inverse_rtol
+    whole = light(T, **settings)
+    half = light(T, bounces_every=2, **settings)
+    F = np.atleast_2d(T.first_bounce).T
+    is_lit = (F > 0.0) & ~T.masked[:, None]
+    factors = np.divide(1.0, F, out=np.zeros_like(F), where=is_lit)
+    mixing = np.eye(T.channels) if T.mixing is None else np.linalg.inv(T.mixing)
+    lights = []
+    for number, gain in enumerate([1.0, 0.8, 1.1, 1.0]):
+        desired = picture(T, 0.5, seed=number)
+        half.gain = whole.gain = gain
+        pattern = half(desired)
+        lights.append(desired.reshape(-1, T.channels).astype(np.float64))
+        if number % 2 == 0:
+            np.testing.assert_array_equal(pattern, whole(desired))
+            continue
+        background = np.full_like(lights[-1], dark)
+        target = gain * lights[-1] - background
+        kept = gain * lights[-2] - background
+        direct = reference.frames_between(target, undone(T, kept) - kept, 1.0)
+        expected = reference.frames_light(factors, direct, mixing)
+        found = pattern.reshape(expected.shape)
+        np.testing.assert_allclose(found, np.clip(expected, 0.0, 1.0), atol=tolerance)
+        # The frame before is another one, whose bounces are others.
+        assert np.abs(found - whole(desired).reshape(expected.shape)).max() > 2e-3
+
+
+def test_error_is_that_of_the_bounces_of_the_change():
+    """S (b + e') - b is R (b - b'), which `judge` tells."""
+    T = transport("grey")
+    compensator = light(T, bounces_every=3, rtol=1e-5)
+    first = picture(T, 0.3)
+    second = picture(T, 0.4, seed=2)
+    compensator(first)
+    pattern = compensator(second)
+    S = T.systems[0].to_dense().astype(np.float64)
+    change = (second - first).ravel().astype(np.float64)
+    expected = np.linalg.norm(S @ change - change) / np.linalg.norm(second)
+    assert expected > 1e-2
+    assert compensator.judge().error == pytest.approx(expected, rel=1e-3)
+    appearance = T @ pattern
+    found = np.linalg.norm(appearance - second) / np.linalg.norm(second)
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("settings", [{"clamp": True}, {}, {"gain": "follow"}])
+@pytest.mark.parametrize("kind", ["colour", "compressed"])
+def test_still_film_has_the_bounces_of_each_frame(kind, settings):
+    """Codes of frames in between are the same, one by one, in a pipeline, and from the device."""
+    T = transport(kind)
+    frame = np.full((*T.camera_grid, 3), 100, np.uint8)
+    frame[1:] = 90
+    expected = ltcl.Compensator(T, **settings)(frame)
+    with ltcl.Compensator(T, bounces_every=3, depth=2, **settings) as compensator:
+        found = [compensator(frame) for _ in range(2)]
+        found += [future.result() for future in [compensator.submit(frame) for _ in range(5)]]
+        found.append(compensator(T.device.upload(frame, np.uint8)))
+    for codes in found:
+        np.testing.assert_array_equal(codes, expected)
+
+
+def test_bounces_in_a_pipeline():
+    """The order of frames decides, not when their codes are asked for."""
+    T = transport("colour")
+    frames = [picture(T, 0.1 * (1 + n % 5), seed=n) for n in range(9)]
+    compensator = light(T, clamp=True, bounces_every=3)
+    expected = [compensator(frame) for frame in frames]
+    with light(T, clamp=True, bounces_every=3, depth=2) as pipelined:
+        futures = [pipelined.submit(frame) for frame in frames]
+        for future, codes in zip(futures, expected, strict=True):
+            np.testing.assert_array_equal(future.result(), codes)
+
+
+def test_kept_bounces_outlast_other_bounds():
+    T = transport("colour")
+    frame = picture(T, 0.8)
+    compensator = light(T, bounces_every=3, clamp=True, gain="follow")
+    expected = light(T, bounds=(0.1, 0.6), clamp=True)
+    compensator(frame)
+    compensator.bounds = (0.1, 0.6)
+    found = compensator(frame)
+    expected.gain = compensator.statistics.gain
+    np.testing.assert_allclose(found, expected(frame), rtol=0, atol=1e-6)
+
+
+def test_kept_bounces_are_not_older_than_frames_of_other_colours():
+    T = transport("grey")
+    compensator = light(T, bounces_every=2, clamp=True)
+    expected = light(T, clamp=True)
+    second = picture(T, 0.4, seed=2)
+    compensator(picture(T, 0.1))
+    for _ in range(3):
+        compensator(np.repeat(second[..., None], 3, axis=-1))
+    np.testing.assert_array_equal(compensator(second), expected(second))
+
+
+def test_light_beyond_the_bounds_takes_steps_in_each_frame():
+    """No frame in between is worse than `compensate` of it."""
+    T = transport("colour")
+    compensator = light(T, bounces_every=2, rtol=1e-3)
+    for seed in range(4):
+        desired = picture(T, 2.0, seed=seed)
+        compensator(desired)
+        expected = ltcl.compensate(T, desired, rtol=1e-3)
+        assert compensator.judge().error <= expected.error + 2.5e-3
+
+
+def test_frames_in_between_take_no_product():
+    scene = ltcl.scenes.dihedral(8, albedo=(0.6, 0.5, 0.3))
+    T = ltcl.compress(scene.transport(), rtol=1e-2, basis="db2")
+    compensator = ltcl.Compensator(T, clamp=True, rtol=2e-2, bounces_every=2)
+    frame = np.full((*T.camera_grid, 3), 100, np.uint8)
+    compensator(frame)
+    before = T.device.launches.copy()
+    compensator(frame)
+    assert (T.device.launches - before).total() == 2
+
+
+@pytest.mark.parametrize("kind", ["blocks", "other camera"])
+def test_bounces_need_an_S(kind):
+    with pytest.raises(InputError, match="bounces_every is 2, but this T has no S"):
+        ltcl.Compensator(transport(kind), bounces_every=2)
 
 
 # Gain.
@@ -533,6 +762,13 @@ def test_a_cancelled_frame_spoils_nothing():
         compensator(frame)
 
 
+def test_another_process_makes_its_own():
+    compensator = light(transport("grey"))
+    for send in (pickle.dumps, copy.deepcopy):
+        with pytest.raises(InputTypeError, match=r"Compensator .*pickle its T"):
+            send(compensator)
+
+
 @pytest.mark.parametrize(
     "out",
     [np.zeros(GRID, np.uint8), np.zeros((6, 4), np.float32), [[0.0]], np.zeros((2, *GRID), "f4")],
@@ -546,6 +782,106 @@ def test_places_that_do_not_fit(out):
     assert compensator.statistics.frames == 0
 
 
+@pytest.mark.parametrize("kind", ["grey", "masked", "mixed colours", "other camera"])
+@pytest.mark.parametrize("bounds", [(0.0, 0.5), (0.1, 0.8), (-0.2, 300.0)])
+def test_bounds_that_are_set(kind, bounds):
+    """The next frame is as of a compensator with these bounds, whatever came before."""
+    T = transport(kind)
+    desired = picture(T, 2.0)
+    settings: dict[str, Any] = {"rtol": 1e-3, "dtype": "uint16", "background": 0.05}
+    compensator = ltcl.Compensator(T, **settings)
+    futures = [compensator.submit(desired) for _ in range(3)]
+    compensator.bounds = bounds
+    assert compensator.bounds == bounds
+    assert all(future.done() for future in futures)
+    with pytest.raises(InputError, match="no frame was given yet"):
+        compensator.judge()
+    fresh = ltcl.Compensator(T, bounds=bounds, **settings)
+    for frame in (desired, (200.0 * desired).astype(np.uint8)):
+        codes = compensator(frame)
+        np.testing.assert_allclose(codes, fresh(frame), rtol=0, atol=1)
+        assert compensator.judge().error == pytest.approx(fresh.judge().error, abs=1e-5)
+        assert compensator.judge().clipped == pytest.approx(fresh.judge().clipped, abs=1e-5)
+
+
+@pytest.mark.parametrize("settings", [{"clamp": True}, {"gain": "follow"}], ids=["clamp", "follow"])
+def test_bounds_that_are_set_count_everywhere(settings):
+    T = transport("colour")
+    compensator = light(T, rtol=1e-3, **settings)
+    compensator(picture(T, 0.8))
+    compensator.bounds = (0.0, 0.25)
+    fresh = light(T, rtol=1e-3, bounds=(0.0, 0.25), **settings)
+    fresh.gain = compensator.gain
+    for seed in (2, 3):
+        desired = picture(T, 0.8, seed=seed)
+        if seed == 3:
+            # A new one begins at the gain of its first frame.
+            compensator.gain = fresh.gain
+        codes = compensator(desired)
+        expected = fresh(desired)
+    np.testing.assert_allclose(codes, expected, rtol=0, atol=1e-6)
+    assert codes.max() <= 0.25
+    assert compensator.judge().clipped == pytest.approx(fresh.judge().clipped, abs=1e-6)
+
+
+def test_bad_bounds_change_nothing():
+    T = transport("colour")
+    compensator = light(T)
+    before = compensator(picture(T, 2.0))
+    with pytest.raises(InputError, match="bounds is"):
+        compensator.bounds = (0.5, 0.1)
+    assert compensator.bounds == (0.0, 1.0)
+    np.testing.assert_allclose(compensator(picture(T, 2.0)), before, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("settings", [{"clamp": True}, {"gain": "follow"}], ids=["clamp", "follow"])
+def test_bounds_that_cannot_be_prepared_change_nothing(settings):
+    """Several projectors take no bounds above 0 with these."""
+    T = ltcl.combine([ltcl.Transport(dense(seed), GRID) for seed in range(2)])
+    compensator = light(T, **settings)
+    frame = picture(T, 0.4)
+    before = compensator(frame)
+    with pytest.raises(InputError, match="bounds begin above 0"):
+        compensator.bounds = (0.1, 1.0)
+    assert compensator.bounds == (0.0, 1.0)
+    assert compensator.judge().error < 0.1
+    assert compensator.statistics.frames == 1
+    compensator.gain = compensator.statistics.gain
+    np.testing.assert_allclose(compensator(frame), before, rtol=0, atol=1e-6)
+
+
+def test_arrays_of_the_caller_may_change():
+    """Frames of another kind, which are prepared later, go by what was given."""
+    T = transport("grey")
+    bounds: Any = np.array([0.0, 0.5])
+    background = np.full(GRID, 0.05)
+    weights = np.ones(GRID)
+    compensator = light(T, background=background, weights=weights)
+    compensator.bounds = bounds
+    for values in (bounds, background, weights):
+        values[1] = 0.01
+    fresh = light(T, bounds=(0.0, 0.5), background=0.05, weights=np.ones(GRID))
+    desired = np.repeat(picture(T, 0.6)[..., None], 3, axis=-1)
+    assert compensator.bounds == (0.0, 0.5)
+    np.testing.assert_allclose(compensator(desired), fresh(desired), rtol=0, atol=1e-6)
+
+
+def test_light_far_beyond_the_bounds_is_refused():
+    """Where squares would leave float32, also in whole numbers, and after other bounds."""
+    T = transport("grey")
+    compensator = light(T)
+    compensator.bounds = (0.0, 1e-20)
+    for frame in (picture(T, 0.4), np.full(GRID, 90, np.uint8)):
+        with pytest.raises(
+            InputError, match=r"with bounds of \(0.0, 1e-20\) light must be at most"
+        ):
+            compensator(frame)
+    compensator(picture(T, 1e-19))
+    assert 0.5 < compensator.judge().error < 1.0
+    with pytest.raises(InputError, match="as bounds allow it"):
+        compensator.bounds = (0.0, 1e-35)
+
+
 @pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, 1e30, "a", None])
 def test_a_gain_that_is_set(gain):
     compensator = light(transport("grey"))
@@ -557,6 +893,7 @@ def test_a_gain_that_is_set(gain):
 FILMS: dict[str, tuple[Any, str]] = {
     "none": ([], "film has no frames"),
     "number": (3, "film is 3"),
+    "file": ("film.mp4", r"film is 'film\.mp4'; it must be frames"),
     "one picture": (np.zeros(GRID), "film, frame 1: frame has shape"),
     "sizes": ([np.ones(GRID), np.ones((2, 2))], "film, frame 2"),
     "NaN": ([np.full(GRID, np.nan)], "film, frame 1"),
@@ -608,6 +945,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "film": ({"film": [np.zeros(GRID)]}, "film is given"),
     "deadline": ({"deadline_ms": 0.0}, "deadline_ms"),
     "depth": ({"depth": 0}, "depth"),
+    "bounces": ({"bounces_every": 0}, "bounces_every is 0; it must be a whole number"),
+    "bounces of halves": ({"bounces_every": 1.5}, r"bounces_every is 1\.5"),
     "late": ({"late": "never"}, "late is 'never'"),
     "change": ({"gain_change": 0.5}, "gain_change"),
     "fps": ({"fps": 0.0}, "fps"),
@@ -664,6 +1003,8 @@ def test_clamp_needs_light_that_is_undone():
         light(strong, clamp=True)
     with pytest.raises(InputError, match="gain is 'follow'"):
         light(strong, gain="follow")
+    with pytest.raises(InputError, match="bounces_every is 2, but 60 steps"):
+        light(strong, bounces_every=2)
     desired = strong @ np.full(grid, 0.5)
     compensator = light(strong, rtol=1e-3)
     compensator(desired)

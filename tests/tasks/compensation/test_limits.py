@@ -291,3 +291,25 @@ def test_a_singular_T_has_a_best_pattern_within_the_bounds(device, damage, chann
     assert largest.error <= 0.95 * (1 + 1e-4)
     with pytest.raises(ConvergenceError):
         ltcl.compensate(T, desired, clamp=True)
+
+
+def test_light_that_rounding_leaves_beside_a_bound_is_clipped(device):
+    """All values are at a bound, beyond which the error would fall."""
+    random = np.random.default_rng(0)
+    T = 0.04 * random.random((3, 12, 12)) + np.diag(random.uniform(0.3, 0.9, 12))
+    mixing = np.array([[1.0, 0.1, 0.05], [0.1, 1.0, 0.1], [0.02, 0.1, 1.0]])
+    transport = ltcl.Transport(T, grid=(3, 4), mixing=mixing, device=device)
+    desired = random.uniform(0.2, 0.9, (3, 4, 3))
+    desired[..., 0] *= 1e4
+    c = ltcl.compensate(transport, desired, bounds=(-0.5, 1.0), rtol=1e-6)
+    missing = desired.reshape(12, 3) - c.appearance.reshape(12, 3)
+    gradient = np.einsum("cmn,mc->nc", T, missing) @ mixing
+    assert gradient.min() > 0.0
+    assert np.all(c.pattern == 1.0)
+    assert c.clipped == 1.0
+
+
+def test_a_black_target_and_bounds_below_0_say_nothing_of_units(device, caplog):
+    T = ltcl.Transport(np.eye(4) + 0.1, grid=(2, 2), device=device)
+    ltcl.compensate(T, np.zeros((2, 2)), bounds=(-1.0, -0.2))
+    assert "desired reaches" not in caplog.text

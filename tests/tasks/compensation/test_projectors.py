@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -141,14 +143,25 @@ def test_prepared_frames(T, clamp):
         assert (pattern.ravel() <= share.ceiling + 1e-5).all()
 
 
+def test_bounds_of_prepared_frames_that_are_set(T):
+    frame = DESIRED.astype(np.float32)
+    settings: dict[str, Any] = {"encode": "linear", "dtype": "float32", "clamp": True}
+    compensator = ltcl.Compensator(T, **settings)
+    compensator(frame)
+    compensator.bounds = (0.0, 0.5)
+    fresh = ltcl.Compensator(T, bounds=(0.0, 0.5), **settings)
+    np.testing.assert_allclose(compensator(frame), fresh(frame), rtol=0, atol=1e-6)
+
+
 def test_prepared_mixed_colours(device, S):
     T = coloured(device, S, MIXINGS)
     desired = np.repeat(0.5 * DESIRED[..., None], 3, axis=-1).astype(np.float32)
     with ltcl.Compensator(T, encode="linear", dtype="float32") as compensator:
         light = compensator(desired)
     assert np.linalg.norm(T @ light - desired) < 0.02 * np.linalg.norm(desired)
-    with pytest.raises(InputError, match="clamp"):
-        ltcl.Compensator(T, clamp=True)
+    with ltcl.Compensator(T, encode="linear", dtype="float32", clamp=True) as compensator:
+        light = compensator(desired)
+    assert np.linalg.norm(T @ light - desired) < 0.1 * np.linalg.norm(desired)
 
 
 def test_uniform_black(device, members):
@@ -188,3 +201,86 @@ def test_analysis_of_the_scene(T):
     assert a.grid == CAMERA
     assert 0.0 < a.channels[0].spectral_radius < 1.0
     assert a.verdict.text
+
+
+@pytest.mark.parametrize("mixings", [None, (MIXINGS[0],) * 2, MIXINGS])
+@pytest.mark.parametrize("clamp", [False, True])
+def test_an_inverse_of_the_scene(device, S, T, mixings, clamp):
+    """Light is undone by one product, for pictures, bounces and frames, as by solves."""
+    desired = DESIRED
+    if mixings is not None:
+        T = coloured(device, S, mixings)
+        desired = np.repeat(0.5 * DESIRED[..., None], 3, axis=-1)
+    inverse = ltcl.invert(T, rtol=1e-3, basis="pixels")
+    assert inverse.grid == CAMERA
+    with_it = ltcl.compensate(T, desired, inverse=inverse, clamp=clamp, rtol=1e-3)
+    without = ltcl.compensate(T, desired, clamp=clamp, rtol=1e-3)
+    assert with_it.error == pytest.approx(without.error, abs=2e-3)
+    bounces = ltcl.separate(T, with_it.appearance, bounces=1, inverse=inverse)
+    expected = ltcl.separate(T, with_it.appearance, bounces=1, rtol=1e-4)
+    np.testing.assert_allclose(bounces.direct, expected.direct, atol=5e-3 * desired.max())
+    options = {"encode": "linear", "dtype": "float32", "clamp": clamp}
+    with (
+        ltcl.Compensator(T, inverse=inverse, **options) as prepared,
+        ltcl.Compensator(T, **options) as solved,
+    ):
+        frame = desired.astype(np.float32)
+        light = prepared(frame)
+        np.testing.assert_allclose(T @ light, T @ solved(frame), atol=0.02 * desired.max())
+        assert prepared.statistics.products == 1
+
+
+def test_an_inverse_of_another_scene_is_refused(device, T):
+    other = ltcl.Transport(np.eye(PIXELS) * 0.5, CAMERA, device=device)
+    with pytest.raises(InputError, match="inverse"):
+        ltcl.compensate(T, DESIRED, inverse=ltcl.invert(other, basis="pixels"))
+
+
+@pytest.mark.parametrize("clamp", [False, True])
+def test_a_gain_that_follows(T, clamp):
+    """The brightest light comes to the upper bound, from darker and from brighter frames."""
+    brightness: list[float] = []
+    with ltcl.Compensator(
+        T, gain="follow", gain_change=1e6, fps=1.0, encode="linear", dtype="float32", clamp=clamp
+    ) as compensator:
+        for level in (0.2, 0.6, 0.05):
+            frame = (level * DESIRED).astype(np.float32)
+            compensator(frame)
+            light = compensator(frame)
+            assert light.max() == pytest.approx(1.0, abs=0.01)
+            brightness.append(compensator.gain * level)
+    np.testing.assert_allclose(brightness, brightness[0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("mixings", [None, (MIXINGS[0],) * 2, MIXINGS])
+def test_a_gain_that_follows_colours(device, S, mixings):
+    T = coloured(device, S, mixings if mixings is not None else (None, None))
+    frame = np.repeat(0.3 * DESIRED[..., None], 3, axis=-1).astype(np.float32)
+    with ltcl.Compensator(
+        T, gain="follow", gain_change=1e6, encode="linear", dtype="float32", clamp=True
+    ) as compensator:
+        compensator(frame)
+        light = compensator(frame)
+        gain = compensator.statistics.gain
+    assert light.max() == pytest.approx(1.0, abs=0.03)
+    seen = T @ light
+    assert np.linalg.norm(seen - gain * frame) < 0.1 * np.linalg.norm(gain * frame)
+
+
+@pytest.mark.parametrize("name", ["gain", "clamp", "inverse"])
+def test_a_darkest_light_takes_the_bounds_alone(T, name):
+    """One line that says why; compensate itself takes an inverse."""
+    inverse = ltcl.invert(T, rtol=1e-2, basis="pixels")
+    options = {
+        "gain": {"gain": "follow"},
+        "clamp": {"clamp": True},
+        "inverse": {"inverse": inverse},
+    }
+    with pytest.raises(InputError, match=f"{name} is .* bounds"):
+        ltcl.Compensator(T, bounds=(0.1, 1.0), **options[name])
+    assert ltcl.compensate(T, DESIRED, bounds=(0.01, 1.0), inverse=inverse).error < 0.02
+
+
+def test_bounces_of_several_projectors_are_those_of_each_frame(T):
+    with pytest.raises(InputError, match="bounces_every is 3, but T has several projectors"):
+        ltcl.Compensator(T, bounces_every=3)

@@ -121,7 +121,7 @@ def test_the_command_line_does_the_same_and_shows_them(program, tmp_path: Path) 
     best = ltcl.compensate(ltcl.Transport(case.true, GRID), DESIRED["grey"], gain="auto").gain
     assert picture["gain"] == pytest.approx(best, rel=0.02)
     assert "13 camera pixels" in program(*common).out
-    program(*common, "--on-dark", "raise").refused("T.npz", "13 of 1024 pixels")
+    program(*common, "--on-dark", "raise").assert_refused("T.npz", "13 of 1024 pixels")
     for command in ("info", "analyze"):
         (facts,) = program(command, path, "--show-dark", tmp_path / "dark.png", "--json").json
         assert facts["dark_pixels" if command == "info" else "masked"] == 13

@@ -383,6 +383,53 @@ def test_acquired_transports_have_the_noise_of_their_scan(
         assert least < np.sqrt(np.mean(np.square(values))) < 1.7
 
 
+def lit_alone(n: int, lit: list[int]) -> np.ndarray:
+    factors = np.zeros(n)
+    factors[lit] = np.linspace(1.0, 2.0, len(lit))
+    return factors
+
+
+@pytest.mark.parametrize("source", ["acquired", "measured twice"])
+@pytest.mark.parametrize("shape", [(6, 6), (5, 8)])
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [([0, 2, 3], [0, 1, 2, 3, 4]), ([0, 1, 2, 3, 4], [3]), ([1], [0, 2, 5]), ([2], [4]), ([], [])],
+    ids=["dark rows", "one column", "one row", "one entry", "none"],
+)
+def test_rows_and_columns_may_have_no_noise(
+    rows: list[int], columns: list[int], shape: tuple[int, int], source: str
+) -> None:
+    """Some with factor 0, or one alone with all the noise: the fit is exact for even light."""
+    light = np.full(shape, 0.5)
+    variance = 1e-4 * np.outer(lit_alone(shape[0], rows), lit_alone(shape[1], columns))
+    i, j = np.indices(shape)
+    samples = [entry.ravel() for entry in (i, j, light, variance)]
+    noise = Noise.fit(shape, [[samples]], source)
+    fitted = noise.variance(light)
+    if source == "acquired":
+        np.testing.assert_allclose(fitted, variance, rtol=1e-6)
+    else:
+        # Of few squares of errors the first bounce is not known by itself.
+        is_fitted = i != j
+        np.testing.assert_allclose(fitted[is_fitted], variance[is_fitted], rtol=0.01)
+    assert np.all(fitted[variance == 0.0] == 0.0)
+
+
+def test_a_row_without_noise_may_have_a_measured_white() -> None:
+    T = truth("corner", 4)
+    floor = 1e-3
+    pixels = len(T.to_numpy())
+    noise = Noise.uniform(T.shape, floor, source="acquired")
+    rows = noise.rows.copy()
+    rows[0, 3] = 0.0
+    noise = replace(noise, rows=rows, white=np.full_like(rows, pixels * floor**2 / 4))
+    measured = ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
+    std = ltcl.compensate(measured, T @ np.full(T.grid, 0.5)).std.appearance.ravel()
+    assert std[3] == 0.0
+    expected = 0.5 * np.sqrt(pixels / 4) * floor
+    np.testing.assert_allclose(np.delete(std, 3), expected, rtol=0.05)
+
+
 def test_the_first_bounce_may_have_a_noise_of_its_own() -> None:
     """A path tracer has no randomness in light that comes straight from the projector."""
     T = truth("box")
