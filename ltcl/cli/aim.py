@@ -58,28 +58,27 @@ def aim(
     scene = AimScene(folder.name)
     report = AimReport(folder=folder)
     count = 0
-    with Viewer(scene, **address(context)) as viewer:
+    with Viewer(scene, **address(context)) as viewer, contextlib.suppress(KeyboardInterrupt):
         print_line(f"{viewer.url} shows what the camera sees; Ctrl-C ends it")
-        with contextlib.suppress(KeyboardInterrupt):
-            for name, reading in _readings(project, place, scene):
-                count += 1
-                scene.add_reading(name, reading)
-                details = ", ".join(reading.facts)
-                context.progress("looks", count, looks, detail=f": {details}")
-                report = AimReport(
-                    folder=folder,
-                    looks=count,
-                    seconds=reading.seconds,
-                    brightness=reading.brightness,
-                    saturated=reading.saturated,
-                    lit=reading.lit,
-                    focus=reading.focus,
-                    sharpness=reading.sharpness,
-                    advice=reading.advice,
-                )
-                if count == looks:
-                    lines = [", ".join(reading.facts), *reading.advice]
-                    return Answer(report, lines)
+        for name, reading in _readings(project, place, scene):
+            count += 1
+            scene.add_reading(name, reading)
+            details = ", ".join(reading.facts)
+            context.progress("looks", count, looks, detail=f": {details}")
+            report = AimReport(
+                folder=folder,
+                looks=count,
+                seconds=reading.seconds,
+                brightness=reading.brightness,
+                saturated=reading.saturated,
+                lit=reading.lit,
+                focus=reading.focus,
+                sharpness=reading.sharpness,
+                advice=reading.advice,
+            )
+            if count == looks:
+                lines = [", ".join(reading.facts), *reading.advice]
+                return Answer(report, lines)
     return Answer(report, [*report.advice])
 
 

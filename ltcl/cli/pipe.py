@@ -97,12 +97,12 @@ def run(context: Context, scene: Any, gain: Any, resize: str, settings: dict[str
         dtype=source.dtype.name,
         **settings,
     )
-    note(f"stdout is {pipes.projected_video(projection, source).options}")
     with (
         open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as stdin,
         open(sys.stdout.fileno(), "wb", buffering=0, closefd=False) as stdout,
         contextlib.suppress(KeyboardInterrupt),
     ):
+        note(f"stdout is {pipes.projected_video(projection, source).options}")
         late = context.options["late"]
         result = pipes.pipe(projection, source, stdin, stdout, late=late, progress=context.progress)
         note(describe_pipe(result, projection.statistics.latency_p99))

@@ -96,20 +96,22 @@ def _play_in_window(
     source = open_frames(film)
     scene, settings = _load_scene(context, transport)
     report = PlayReport(film=film)
-    with Window(film.name, **address(context)) as window:
+    with (
+        Window(film.name, **address(context)) as window,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
         print_line(f"{window.url} plays {film}; Ctrl-C ends it")
-        with contextlib.suppress(KeyboardInterrupt):
-            pace = run_film(
-                scene,
-                source,
-                window,
-                compensation.resolve_gain(gain, scene.setup),
-                context.progress,
-                resize,
-                control=control,
-                **settings,
-            )
-            report = PlayReport(film=film, **dataclasses.asdict(pace))
+        pace = run_film(
+            scene,
+            source,
+            window,
+            compensation.resolve_gain(gain, scene.setup),
+            context.progress,
+            resize,
+            control=control,
+            **settings,
+        )
+        report = PlayReport(film=film, **dataclasses.asdict(pace))
     if report.shown is None:
         return Answer(report, [])
     line = (
@@ -203,10 +205,7 @@ def _show_in_browser(folder: Path, advance: Any, counter: _ShotCounter, resize: 
     from ltcl.acquisition import rigs
     from ltcl.show.window import Window
 
-    with Window(str(folder)) as window:
+    with Window(str(folder)) as window, contextlib.suppress(KeyboardInterrupt):
         print_line(f"{window.url} shows {folder}; Ctrl-C ends it")
-        with contextlib.suppress(KeyboardInterrupt):
-            return rigs.show(
-                folder, display=window, advance=advance, progress=counter, resize=resize
-            )
+        return rigs.show(folder, display=window, advance=advance, progress=counter, resize=resize)
     return counter.count

@@ -81,11 +81,10 @@ def view(
 
     paths = [] if picture is None else picture
     scene = _make_scene(context, transport, paths)
-    with Viewer(scene, **address(context)) as viewer:
+    with Viewer(scene, **address(context)) as viewer, contextlib.suppress(KeyboardInterrupt):
         print_line(f"{viewer.url} shows {transport}; Ctrl-C ends it")
         context.progress(f"showing {transport}")
-        with contextlib.suppress(KeyboardInterrupt):
-            viewer.wait()
+        viewer.wait()
     return Answer(ViewReport(url=viewer.url), [])
 
 

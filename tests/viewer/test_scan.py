@@ -26,6 +26,7 @@ from ltcl import errors, images
 from ltcl.acquisition import FolderRig, Project, rigs
 from ltcl.acquisition.agreement import CameraModel
 from ltcl.acquisition.radiometry import Radiance, Response
+from ltcl.cli.main import main
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.show.player import play
@@ -453,6 +454,35 @@ def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
     assert len(shown) == 1
+
+
+@pytest.mark.parametrize("command", ["acquire aim", "play", "show", "view"])
+def test_ctrl_c_is_no_error_from_the_line_that_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """What is interrupted is the line itself, the earliest moment at which a user knows."""
+    transport = tmp_path / "T.npz"
+    ltcl.save(transport, ltcl.Transport(np.eye(24) / 2, (4, 6)))
+    (tmp_path / "by_hand").mkdir()
+    project(tmp_path / "by_hand", BY_HAND)
+    frames = film(tmp_path / "film")
+    module, words = {
+        "acquire aim": ("aim", (tmp_path / "by_hand", "--no-browser")),
+        "play": ("show", (frames, transport, "--no-browser")),
+        "show": ("show", (frames, "--browser")),
+        "view": ("view", (transport, "--no-browser")),
+    }[command]
+    lines = []
+
+    def interrupted_line(text: str) -> None:
+        lines.append(text)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"ltcl.cli.{module}.print_line", interrupted_line)
+    monkeypatch.setattr("webbrowser.open", lambda url: True)
+    assert main([*command.split(), *map(str, words)]) == 0
+    (line,) = lines
+    assert line.endswith("Ctrl-C ends it")
 
 
 def test_a_folder_that_holds_nothing_is_called_so(tmp_path: Path) -> None:
