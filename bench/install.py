@@ -257,7 +257,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="ltcl-install-") as folder:
         wheel = build_wheel(Path(folder))
         for installer in installers:
-            home = Path(folder) / installer
+            home = Path(folder) / installer.replace(" ", "")
             home.mkdir()
             results[installer] = measure(Newcomer(installer, home), wheel, size)
     for installer, figures in results.items():
