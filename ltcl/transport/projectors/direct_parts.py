@@ -130,9 +130,7 @@ def _find_radius(total: np.ndarray, grid: tuple[int, int], peaks: Peaks) -> int:
     return min(radius, MAX_RADIUS)
 
 
-def _find_spread(
-    total: np.ndarray, grid: tuple[int, int], peaks: Peaks, radius: int
-) -> np.ndarray:
+def _find_spread(total: np.ndarray, grid: tuple[int, int], peaks: Peaks, radius: int) -> np.ndarray:
     """Direct light beside the peak, relative to it, which few bright rows exceed, (window,)."""
     window = _window(peaks.pixels, radius, grid)
     ring = _ring(peaks.pixels, radius + 1, grid)
