@@ -338,6 +338,9 @@ def _resampling_from_arrays(arrays: dict[str, np.ndarray]) -> Resampling:
 class Setup:
     """A calibration on the pixels of T, which are `blocks` of projector pixels.
 
+    Those of one of several projectors are squares of camera pixels: `CombinedSetup.of_scan` has
+    codes on the pixels of the projector itself.
+
     Examples
     --------
     >>> import tempfile, ltcl
@@ -397,12 +400,13 @@ class Setup:
 
         The light is clipped to [0, 1].
         """
-        light = np.clip(self._in_channels("pattern", pattern), 0.0, 1.0)
+        light = np.clip(self._in_channels("pattern", pattern, self.grid), 0.0, 1.0)
         return self.blocks.enlarged(self.calibration.projector.codes(light))
 
     def light(self, codes: Any) -> np.ndarray:
-        """Light of codes (h, w[, 3]) in [0, 1], relative to white."""
-        return self.calibration.projector.linear(self._in_channels("codes", codes))
+        """Light of codes (h, w[, 3]) in [0, 1] on the projector's pixels, relative to white."""
+        own = self._in_channels("codes", codes, self.pixels)
+        return self._block_means(self.calibration.projector.linear(own))
 
     def relative_error(self, rig: Any, T: Transport) -> tuple[float, ...]:
         """Relative error of T for each channel, by random patterns p of 0 and 1.
@@ -438,10 +442,10 @@ class Setup:
             return picture
         return self.calibration.resampling.apply(picture)
 
-    def _in_channels(self, name: str, picture: Any) -> np.ndarray:
-        """A checked picture of as many channels as the projector has."""
+    def _in_channels(self, name: str, picture: Any, grid: tuple[int, int]) -> np.ndarray:
+        """A checked picture on a grid, of as many channels as the projector has."""
         values = checks.finite(name, checks.real(name, picture)).astype(np.float32)
-        checks.shape(name, values, self.grid, (*self.grid, 3))
+        checks.shape(name, values, grid, (*grid, 3))
         if values.ndim == 2 and self.calibration.projector.channels == 3:
             return np.repeat(values[..., None], 3, axis=-1)
         return values
