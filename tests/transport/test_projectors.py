@@ -259,3 +259,6 @@ def test_refusals(device, members, T):
         T.join([np.ones(one.grid)] * 2)
     with pytest.raises(InputError, match="frames and colours"):
         T.join([np.ones(LEFT.grid), np.ones((*RIGHT.grid, 3))])
+    for call in (ltcl.align, ltcl.compress):
+        with pytest.raises(InputError, match=r"T is of several projectors, .*separate"):
+            call(T)
