@@ -43,8 +43,10 @@ CPU_BLOCK = 64
 MAX_DISTANCE = 1 << 14
 # Bits of a real that narrow entries do not have.
 LOWER_BITS = np.uint32(0xFFFF)
-# A place that holds an entry, above the bits of its numbers.
+# Where bits begin that say that there is an entry, above those of three halves.
 PRESENCE = 48
+ALL_HALVES = (1 << PRESENCE) - 1
+ALL_BITS = (1 << 32) - 1
 # Values of the define MIXED: colours of the operand are mixed, or those of the result.
 MIXED_OPERAND = 1
 MIXED_RESULT = 2
@@ -64,70 +66,77 @@ class JointEntries:
     pixels : int
         The first rows and columns are those of pixels; their diagonal is not among the entries.
     indptr, indices : (nodes + 1,), (entries,)
-    bits : (entries, 3)
-        Of reals: uint32, or their upper halves, uint16, where the lower are 0.
+    numbers : (entries,) uint64 or (entries, 3) uint32
+        The upper halves of the bits of three reals, from the lowest bits on, where the lower halves
+        are 0; or all bits.
     """
 
     pixels: int
     indptr: np.ndarray
     indices: np.ndarray
-    bits: np.ndarray
+    numbers: np.ndarray
 
     @classmethod
-    def of(cls, cores: Sequence[Any], pixels: int) -> tuple[JointEntries, np.ndarray]:
-        """The entries of K (nodes, nodes) of each colour, and their diagonals, (3, pixels)."""
-        own = []
-        stripped = []
-        has_few_bits = True
-        for K in cores:
-            diagonal = K.diagonal()[:pixels]
-            own.append(diagonal.astype(np.float64))
-            rows = np.repeat(np.arange(pixels, dtype=np.int32), np.diff(K.indptr[: pixels + 1]))
-            bits = K.data.astype(np.float32).view(np.uint32)
-            bits[: len(rows)][K.indices[: len(rows)] == rows] = 0
-            has_few_bits = has_few_bits and not np.any(bits & LOWER_BITS)
-            stripped.append(bits)
-        if has_few_bits:
-            joint = _join_halves(cores, stripped)
+    def of(cls, cores: Sequence[Any], pixels: int) -> JointEntries:
+        """The entries of K (nodes, nodes) of each colour, float32."""
+        bits = [K.data.view(np.uint32) for K in cores]
+        if all(map(_has_few_bits, cores, bits, [pixels] * COLOURS)):
+            indptr, indices, numbers = _join_halves(cores, bits)
         else:
-            joint = _join_reals(cores, stripped)
-        indptr, indices, bits = joint
-        # Diagonals are zeros by now.
-        rows = np.repeat(np.arange(pixels, dtype=np.int32), np.diff(indptr[: pixels + 1]))
+            indptr, indices, numbers = _join_reals(cores, bits)
         is_kept = np.ones(len(indices), bool)
-        is_kept[: len(rows)] = indices[: len(rows)] != rows
+        is_kept[: indptr[pixels]] = ~_are_own(indptr, indices, pixels)
         kept_before = np.concatenate([[0], np.cumsum(is_kept)])
-        entries = cls(
+        return cls(
             pixels=pixels,
             indptr=kept_before[indptr],
             indices=indices[is_kept],
-            bits=bits[is_kept],
+            numbers=numbers[is_kept],
         )
-        return entries, np.stack(own)
+
+    @property
+    def are_halves(self) -> bool:
+        """True if the upper halves of all bits suffice."""
+        return self.numbers.ndim == 1
 
     def transposed(self) -> JointEntries:
         """The entries of the K^T."""
         nodes = len(self.indptr) - 1
-        places = np.arange(len(self.indices))
+        places = np.arange(len(self.indices), dtype=np.int32)
         matrix = scipy.sparse.csr_array((places, self.indices, self.indptr), shape=(nodes, nodes))
         by_column: Any = matrix.tocsc()
         return replace(
             self,
             indptr=by_column.indptr,
             indices=by_column.indices,
-            bits=self.bits[by_column.data],
+            numbers=self.numbers[by_column.data],
         )
+
+
+def _are_own(indptr: np.ndarray, indices: np.ndarray, pixels: int) -> np.ndarray:
+    """True for the diagonal among the entries of the rows of pixels."""
+    rows = np.repeat(np.arange(pixels, dtype=indices.dtype), np.diff(indptr[: pixels + 1]))
+    return indices[: len(rows)] == rows
+
+
+def _has_few_bits(K: Any, bits: np.ndarray, pixels: int) -> bool:
+    """True if all but the diagonal at pixels have 8 significant bits."""
+    has_more = (bits & LOWER_BITS) != 0
+    is_own = _are_own(K.indptr, K.indices, pixels)
+    has_more[: len(is_own)] &= ~is_own
+    return not has_more.any()
 
 
 def _join_halves(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
     """Pointers, columns and upper halves of the bits of three matrices in all their places."""
     total: Any = 0
     for colour, (K, of_colour) in enumerate(zip(cores, bits, strict=True)):
-        upper = (of_colour >> np.uint32(16)).astype(np.int64)
-        numbers = (upper << (16 * colour)) | (1 << (PRESENCE + colour))
+        numbers = (of_colour >> np.uint32(16)).astype(np.int64)
+        numbers <<= 16 * colour
+        # Zeros would not count as entries.
+        numbers |= 1 << (PRESENCE + colour)
         total = total + scipy.sparse.csr_array((numbers, K.indices, K.indptr), shape=K.shape)
-    halves = total.data.view(np.uint16).reshape(-1, 4)
-    return total.indptr, total.indices, np.ascontiguousarray(halves[:, :COLOURS])
+    return total.indptr, total.indices, (total.data & ALL_HALVES).view(np.uint64)
 
 
 def _join_reals(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -140,7 +149,7 @@ def _join_reals(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.nd
     for colour, (K, of_colour) in enumerate(zip(cores, bits, strict=True)):
         numbers = of_colour.astype(np.int64)
         total = places + scipy.sparse.csr_array((numbers, K.indices, K.indptr), shape=K.shape)
-        joint[:, colour] = total.data & 0xFFFFFFFF
+        joint[:, colour] = total.data & ALL_BITS
     return places.indptr, places.indices, joint
 
 
@@ -178,40 +187,41 @@ class DeviceRows:
 
 def _wide_entries(entries: JointEntries, chosen: slice) -> np.ndarray:
     """Wide entries, (count, 4) uint32."""
-    bits = entries.bits[chosen]
-    wide = np.empty((len(bits), 4), np.uint32)
-    wide[:, :COLOURS] = bits
-    if bits.dtype == np.uint16:
+    numbers = entries.numbers[chosen]
+    wide = np.empty((len(numbers), COLOURS + 1), np.uint32)
+    if entries.are_halves:
+        halves = numbers.view(np.uint16).reshape(-1, COLOURS + 1)
+        wide[:, :COLOURS] = halves[:, :COLOURS]
         wide[:, :COLOURS] <<= np.uint32(16)
+    else:
+        wide[:, :COLOURS] = numbers
     wide[:, COLOURS] = entries.indices[chosen]
     return wide
 
 
 def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | None:
     """The base of each pixel's row, and narrow entries, (count, 4) uint16; None if too wide."""
-    if entries.bits.dtype != np.uint16:
+    if not entries.are_halves:
         return None
     pixels = entries.pixels
     indptr = entries.indptr[: pixels + 1]
     count = indptr[-1]
-    columns = entries.indices[:count]
-    counts = np.diff(indptr)
-    row = np.repeat(np.arange(pixels, dtype=np.int32), counts)
+    columns = entries.indices[:count].astype(np.int32, copy=False)
     is_far = columns >= pixels
-    # Columns ascend: the first of a row that is far has the number of all before that are not.
+    # Columns ascend: those that are far are the last of a row.
     far_before = np.concatenate([[0], np.cumsum(is_far)])
     far_count = np.diff(far_before[indptr])
     has_far = far_count > 0
     bases = np.zeros(pixels, np.int32)
-    first_far = indptr[1:] - far_count
-    bases[has_far] = columns[first_far[has_far]]
-    distance = columns - np.where(is_far, bases[row], row)
+    bases[has_far] = columns[(indptr[1:] - far_count)[has_far]]
+    counts = np.diff(indptr)
+    own = np.repeat(np.arange(pixels, dtype=np.int32), counts)
+    distance = columns - np.where(is_far, np.repeat(bases, counts), own)
     if np.any(distance < -MAX_DISTANCE) or np.any(distance >= MAX_DISTANCE):
         return None
-    narrow = np.empty((count, 4), np.uint16)
-    narrow[:, :COLOURS] = entries.bits[:count]
-    narrow[:, COLOURS] = (2 * distance + is_far).astype(np.int16).view(np.uint16)
-    return bases, narrow
+    narrow = entries.numbers[:count].copy()
+    narrow |= ((2 * distance + is_far) & 0xFFFF).astype(np.uint64) << np.uint64(PRESENCE)
+    return bases, narrow.view(np.uint16).reshape(-1, COLOURS + 1)
 
 
 class ColourRows:
@@ -226,7 +236,9 @@ class ColourRows:
 
     def __init__(self, W: Hats, cores: Sequence[Any]) -> None:
         self.W = W
-        self._entries, self.own = JointEntries.of(cores, W.shape[1])
+        pixels = W.shape[1]
+        self.own = np.stack([K.diagonal()[:pixels].astype(np.float64) for K in cores])
+        self._entries = JointEntries.of(cores, pixels)
         self.forward = DeviceRows(W.device, self._entries)
         self._transposed: DeviceRows | None = None
 
