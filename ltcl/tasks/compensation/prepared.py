@@ -302,8 +302,12 @@ class WithinBounds:
         self.x = self.descent.x
         self.start = self.x.like()
         self._last = self.x.like()
+        # A x of the last x, where it is known, and what it leaves of another target.
+        self._last_picture = self.target.like()
+        self._last_residual = self.target.like()
         self._is_warm = is_warm
         self._has_last = False
+        self._has_last_picture = False
         self._rtol = rtol
         self.errors: np.ndarray | None = None
         self.steps = 0
@@ -319,36 +323,50 @@ class WithinBounds:
         self.x.copy_from(self.start)
         self.errors = None
         self.steps = 0
-        self._keep()
+        self._keep(has_picture=False)
 
     def solve(self, deadline: float) -> None:
         """Lower the error from the better of two starts, until the tolerance or the deadline."""
         descent = self.descent
         self.x.copy_from(self.start)
-        descent.begin()
-        clamped_errors, _ = descent.read()
+        descent.forget()
+        clamped_errors = descent.measure()
         if self._has_last:
-            self.x.copy_from(self._last)
-            descent.refresh()
-            errors, _ = descent.read()
+            errors = self._measure_last()
             if np.linalg.norm(errors) < np.linalg.norm(clamped_errors):
                 self.start.copy_from(self._last)
-            else:
-                self.x.copy_from(self.start)
-                descent.refresh()
+                self.x.copy_from(self._last)
+                descent.r.copy_from(self._last_residual)
+        descent.take_residual()
         search = Search(descent, self._rtol, deadline=deadline)
         search.run()
         self.steps = len(search.history) - 1
         self.errors = search.errors
-        if search.is_worse.any():
+        is_worse = bool(search.is_worse.any())
+        if is_worse:
             self.x.copy_from(self.start)
             self.errors = search.initial
-        self._keep()
+        self._keep(has_picture=descent.has_true_residual and not is_worse)
 
-    def _keep(self) -> None:
-        if self._is_warm:
-            self._last.copy_from(self.x)
-            self._has_last = True
+    def _measure_last(self) -> np.ndarray:
+        """||w (b - A x)|| of this target and the last x, by a product at most; waits."""
+        descent = self.descent
+        if self._has_last_picture:
+            vectors.axpby(1.0, self.target, -1.0, self._last_picture, self._last_residual)
+        else:
+            descent.A.apply(self._last, self._last_residual, scale=-1.0, add=self.target)
+            descent.products += 1
+        return descent.norm_of(self._last_residual)
+
+    def _keep(self, has_picture: bool) -> None:
+        """Keep x for the next frame, and A x, if r is that of x itself."""
+        if not self._is_warm:
+            return
+        self._last.copy_from(self.x)
+        self._has_last = True
+        self._has_last_picture = has_picture
+        if has_picture:
+            vectors.axpby(1.0, self.target, -1.0, self.descent.r, self._last_picture)
 
     def saturated(self) -> int:
         """The number of values at a bound, beyond which a step would go."""

@@ -190,9 +190,9 @@ class CompensationProblem:
     ) -> dict[int, tuple[np.ndarray, Bounded]]:
         """The light (N, k) within the limits that comes nearest to the target, from these starts.
 
-        Of each system that has a start, by its index. Small systems are solved at the same time, so
-        that a launch serves all colours. A solve counts the products of all solves of its system
-        before, too.
+        It is found for each system that has a start, by the system's index. Small systems are
+        solved at the same time, so that a launch serves all colours. A solve counts the products of
+        all solves of its system before, too.
         """
         targets = self.light_to_add(gain)
         problems = []
