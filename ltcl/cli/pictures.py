@@ -47,8 +47,8 @@ def read(
     """Read a linear picture on a `grid`, float32 (h, w[, 3]), by --encoding and --resize.
 
     Integers are codes for the pixels of the projector of `setup`, if there is one and no other
-    encoding is requested. Photographs, not `upright`, keep the camera's pixels. InputError, which names the
-    `owner` of the grid, if the size is another.
+    encoding is requested. Photographs, not `upright`, keep the camera's pixels. InputError, which
+    names the `owner` of the grid, if the size is another.
     """
     from ltcl import images
 
