@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From an empty environment to the demo's picture, and what each import and package costs.
 
+The picture is the sheet of the compensation, which the demo announces by a line with its name: the
+clock is read at that line, and the file must be a whole picture then. All other pictures follow.
+
 The wheel of this checkout goes into a new virtual environment with pip, and with uv if PATH has
 it; all other packages come from the index that they are configured for, with no cache of their own.
+pip goes twice: it compiles the modules of all packages, unless it is told to leave that to Python.
 Then the demo runs for the first time, with no kernel compiled. Folders of caches are new ones, so
 that nothing of the user's is touched. Times of imports are those of `python -X importtime`: a
 package counts without the packages that it imports.
@@ -21,9 +25,11 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
 from rich.table import Table
 
 from _harness import Options, parse_options, publish
@@ -34,6 +40,8 @@ MAX_SECONDS = 20.0
 MAX_HELP_SECONDS = 0.3
 HELP_RUNS = 5
 LARGEST = 8
+PICTURE = "compensation.png"
+PICTURE_WIDTH = 1600
 # Variables that would lead out of the new environment, or keep modules uncompiled.
 HIDDEN = (
     "PYTHONPATH",
@@ -54,10 +62,19 @@ print(json.dumps(sizes))
 """
 
 
+@dataclass(frozen=True, kw_only=True)
+class DemoTimes:
+    """Seconds from the start of a demo to the line with its first picture, and to its end."""
+
+    picture: float
+    end: float
+
+
 class Newcomer:
     """Somebody with an empty virtual environment below a folder, and one way to install."""
 
     def __init__(self, installer: str, folder: Path) -> None:
+        # Its name, and options.
         self.installer = installer
         self.folder = folder
         self.environment = {name: text for name, text in os.environ.items() if name not in HIDDEN}
@@ -104,17 +121,38 @@ class Newcomer:
             target = ("--python", self.python)
             return self.seconds("uv", "pip", "install", "--no-cache", *target, str(wheel))
         pip = (self.python, "-m", "pip", "--disable-pip-version-check", "--no-cache-dir")
-        return self.seconds(*pip, "install", str(wheel))
+        options = self.installer.split()[1:]
+        return self.seconds(*pip, "install", *options, str(wheel))
 
-    def demo(self, name: str, size: int | None) -> float:
-        """Seconds of a demo, which ends with its picture."""
+    def demo(self, name: str, size: int | None) -> DemoTimes:
+        """Run a demo, whose picture must be whole when the line with its name comes."""
         words = [self.ltcl, "demo", "--out", name]
         if size is not None:
             words += ["--size", str(size)]
-        spent = self.seconds(*words)
+        picture_seconds = None
+        output = []
+        start = time.perf_counter()
+        with subprocess.Popen(  # noqa: S603
+            words,
+            cwd=self.folder,
+            env=self.environment,
+            text=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        ) as process:
+            for line in process.stdout or ():
+                output.append(line)
+                if picture_seconds is None and PICTURE in line:
+                    picture_seconds = time.perf_counter() - start
+                    check_picture(self.folder / name / PICTURE)
+        end = time.perf_counter() - start
+        if process.returncode or picture_seconds is None:
+            text = "".join(output)
+            raise SystemExit(f"{' '.join(words)}: exit status {process.returncode}\n{text}")
         if not (self.folder / name / "contact_sheet.png").is_file():
             raise SystemExit("the demo wrote no contact_sheet.png")
-        return spent
+        return DemoTimes(picture=picture_seconds, end=end)
 
     def help_seconds(self) -> float:
         """Median seconds of `ltcl --help`, once its modules are compiled."""
@@ -142,6 +180,15 @@ class Newcomer:
         return package
 
 
+def check_picture(path: Path) -> None:
+    """End the bench unless the file is a whole picture."""
+    with Image.open(path) as picture:
+        # It reads all pixels, and fails where some are missing.
+        picture.load()
+        if picture.width != PICTURE_WIDTH:
+            raise SystemExit(f"{path.name} is {picture.width} pixels wide, not {PICTURE_WIDTH}")
+
+
 def build_wheel(folder: Path) -> Path:
     """Build the wheel of this checkout."""
     words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps"]
@@ -163,11 +210,15 @@ def measure(newcomer: Newcomer, wheel: Path, size: int | None) -> dict[str, Any]
     first_demo = newcomer.demo("first", size)
     packages = newcomer.package_megabytes()
     imports = newcomer.import_milliseconds()
+    second_demo = newcomer.demo("second", size)
     return {
         "install, s": install,
-        "first demo, s": first_demo,
-        "demo with compiled kernels, s": newcomer.demo("second", size),
-        "until the picture, s": install + first_demo,
+        "first demo until its picture, s": first_demo.picture,
+        "first demo until its end, s": first_demo.end,
+        "demo with compiled kernels until its picture, s": second_demo.picture,
+        "demo with compiled kernels until its end, s": second_demo.end,
+        "until the picture, s": install + first_demo.picture,
+        "until all pictures, s": install + first_demo.end,
         "help, s": newcomer.help_seconds(),
         "packages, MB": round(sum(packages.values()), 1),
         "largest packages, MB": largest(packages),
@@ -193,7 +244,7 @@ def tabulate(results: Mapping[str, Mapping[str, Any]]) -> Table:
 def main() -> None:
     """Run the bench."""
     options: Options = parse_options(__doc__)
-    installers = ["pip", "uv"]
+    installers = ["pip", "pip --no-compile", "uv"]
     size = None
     if options.smoke:
         installers = ["pip"]
@@ -202,11 +253,14 @@ def main() -> None:
         print("left out, since PATH has no uv: installing with it")
         installers.remove("uv")
     results = {}
-    facts = {"processor cores": os.cpu_count()}
+    facts: dict[str, Any] = {"processor cores": os.cpu_count()}
+    if hasattr(os, "getloadavg"):
+        # Above 0 others work on this machine, too, and all takes longer.
+        facts["load before the bench, of the last minute"] = round(os.getloadavg()[0], 1)
     with tempfile.TemporaryDirectory(prefix="ltcl-install-") as folder:
         wheel = build_wheel(Path(folder))
         for installer in installers:
-            home = Path(folder) / installer
+            home = Path(folder) / installer.replace(" ", "")
             home.mkdir()
             results[installer] = measure(Newcomer(installer, home), wheel, size)
     for installer, figures in results.items():

@@ -46,6 +46,8 @@ COLOUR_SIGMAS = 5.0
 # Relative deviation of few pixels and the others from white, from which on the projector's light
 # depends on the picture. Clean ones deviate by less than 1 %.
 MAX_CONTRAST_CHANGE = 0.03
+# Standard deviations that the light of a pixel must be above to show whose it is.
+CLEAR_SIGMAS = 6.0
 # Standard deviations of noise that white must be above.
 MIN_SIGMAS = 3.0
 # Relative deviation of a projector's curve from pixel to pixel that is allowed.
@@ -175,7 +177,9 @@ def check_superposition(
     other_light = session.merge_sampled([others]) - black
     total = few_light.value + other_light.value
     variance = few_light.variance + other_light.variance
-    is_valid = light.valid & few_light.valid & other_light.valid & (light.value > 0)
+    is_valid = light.valid & few_light.valid & other_light.valid
+    # Where the projector gives no light, noise would decide which pixels are the few.
+    is_valid &= light.value > CLEAR_SIGMAS * np.sqrt(variance)
     is_few = few_light.value > 0.5 * light.value
     shares = []
     deviations = []

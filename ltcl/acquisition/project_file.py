@@ -81,18 +81,20 @@ def projector_tables(path: Path, content: Mapping[str, Any]) -> dict[str, dict[s
             "[rig] alone"
         )
     tables: dict[str, dict[str, Any]] = {}
+    # Some file systems take names that differ in case alone for one.
+    taken: set[str] = set()
     for number, entry in enumerate(entries, start=1):
         name = entry.get("name", "") if isinstance(entry, dict) else ""
         is_name = isinstance(name, str) and PROJECTOR_NAME.fullmatch(name) is not None
-        if is_name and name in TAKEN_NAMES:
+        if is_name and name.lower() in TAKEN_NAMES:
             raise InputError(
                 f"{path}: [[projector]] {number} has the name {name!r}, which is that of other "
                 f"files here; it must be none of {', '.join(TAKEN_NAMES)}"
             )
-        if is_name and name in tables:
+        if is_name and name.lower() in taken:
             raise InputError(
-                f"{path}: [[projector]] {number} has the name {name!r}, as one before it; each "
-                "must have one of its own"
+                f"{path}: [[projector]] {number} has the name {name!r}, as one before it, but for "
+                "case at most; each must have one of its own"
             )
         if not is_name:
             raise InputError(
@@ -101,6 +103,7 @@ def projector_tables(path: Path, content: Mapping[str, Any]) -> dict[str, dict[s
             )
         own = {key: value for key, value in entry.items() if key != "name"}
         tables[name] = {**shared, **own}
+        taken.add(name.lower())
     return tables
 
 

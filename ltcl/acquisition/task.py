@@ -116,7 +116,7 @@ def acquire(
         all.
     rtol : float, optional
         Relative error of T p, for pictures that judge it, down to which a sketch goes on with
-        rounds of 16 more patterns, as long as they help. Of a sketch alone, as `photographs` is.
+        rounds of 16 more patterns, as long as they help. Only a sketch takes it, as `photographs`.
     photographs : int, optional
         Photographs that a sketch takes at most, those of the set-up included; without `rtol` it
         takes them all.

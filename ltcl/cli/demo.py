@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ltcl.cli import options
-from ltcl.cli.command import Answer, Context, command
+from ltcl.cli.command import Answer, Context, command, note
 from ltcl.cli.options import option
 from ltcl.cli.reports.program import DemoReport
 from ltcl.cli.tables import percent, table
@@ -30,9 +30,10 @@ def demo(
 ) -> Answer:
     """Compensate a picture in a coloured room corner: no hardware, no download, half a minute.
 
-    Fills DIR with the desired picture, the look of the walls without compensation, the pattern, the
-    compensated result, the bounces of light, a report and a contact sheet; with the extra plots
-    also a plot of convergence.
+    Fills DIR, first with compensation.png, the look of the walls without compensation, the pattern,
+    and the compensated result; a line tells when it is there. Then come the desired picture, the
+    bounces of light, all of these as files of their own, a report and a contact sheet; with the
+    extra plots also a plot of convergence.
     """
     opened = open_device(device)
     # It imports OpenCV.
@@ -41,7 +42,10 @@ def demo(
     def show_step(step: str) -> None:
         context.progress(step, demo.STEPS.index(step), len(demo.STEPS))
 
-    done = demo.run(out, size, device=opened, progress=show_step)
+    def announce(picture: Path) -> None:
+        note(f"{picture} shows the compensated corner; its bounces follow")
+
+    done = demo.run(out, size, device=opened, progress=show_step, announce=announce)
     report = DemoReport(folder=done.folder, files=list(done.files), **done.report)
     rows = []
     for view, error in done.report["errors"].items():

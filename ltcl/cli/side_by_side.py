@@ -14,6 +14,8 @@ OVERLAP = 1.0 / 3.0
 MARGIN = 0.04
 # Standard deviation of the blur of a projector pixel, in pixels.
 BLUR = 0.45
+# Height and width of a projector, at least: fewer pixels are too few for a scan.
+MIN_PIXELS = 8
 # Brightness of projectors, repeated.
 BRIGHTNESS = (0.8, 1.0, 0.9)
 MIN_WEIGHT = 1e-3
@@ -50,14 +52,16 @@ def _weights(patches: int, span: tuple[float, float], pixels: int) -> np.ndarray
 
 
 def side_by_side(count: int, scene_grid: tuple[int, int]) -> list[VirtualProjector]:
-    """Projectors from left to right, whose pixels are about as large as patches.
+    """Projectors from left to right, whose pixels are about as large as patches, or smaller.
 
     >>> [p.grid for p in side_by_side(2, (16, 32))]
     [(17, 21), (17, 21)]
     """
     height, width = scene_grid
     size = (1.0 + 2.0 * MARGIN) / (count - (count - 1) * OVERLAP)
-    grid = (round((1.0 + 2.0 * MARGIN) * height), round(size * width))
+    rows = round((1.0 + 2.0 * MARGIN) * height)
+    columns = round(size * width)
+    grid = (max(rows, MIN_PIXELS), max(columns, MIN_PIXELS))
     projectors = []
     for number in range(count):
         left = number * size * (1.0 - OVERLAP) - MARGIN

@@ -209,6 +209,11 @@ def _write_several(folder: Path, scene: str, asked: dict[str, Any]) -> None:
             )
     light = _named_scene(scene, asked)
     scene_grid = checks.grid("grid", light.grid or (1, 1))
+    if scene_grid[0] < asked["projectors"]:
+        raise InputError(
+            f"--size is {asked['size']}, but --projectors is {asked['projectors']}; so many take a "
+            f"--size of {asked['projectors']} or more"
+        )
     camera_grid = (CAMERA_PIXELS * scene_grid[0], CAMERA_PIXELS * scene_grid[1])
     _write_camera(folder / "camera.npz", camera_grid, scene_grid)
     ambient = asked["ambient"]

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The main result without hardware: a picture in a coloured corner, before and after compensation.
 
-`experiment` computes, `output` fills the folder.
+`experiment` computes, `output` fills the folder: first one picture, the sheet of the compensation,
+and then all others.
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ from ltcl.tasks import report
 
 __all__ = ["STEPS", "Demo", "run"]
 
-STEPS = (*experiment.STEPS, "pictures")
+FIRST_PICTURE = "first picture"
+PICTURES = "pictures"
+STEPS = (
+    *experiment.COMPENSATION_STEPS,
+    FIRST_PICTURE,
+    *experiment.STEPS_AFTER_IT,
+    PICTURES,
+)
 
 
 @dataclass(frozen=True)
@@ -41,13 +49,15 @@ def run(
     *,
     device: Any = None,
     progress: Callable[[str], object] | None = None,
+    announce: Callable[[Path], object] | None = None,
 ) -> Demo:
     """Compute everything and fill the folder `out` with pictures, plots and a report.
 
     Parameters
     ----------
     out : path
-        Folder; files of an earlier run are replaced only when everything has succeeded.
+        Folder. compensation.png, the walls before and after compensation, is written first; all
+        other files come, and those of an earlier run are replaced, when everything has succeeded.
     size : int
         Patches along a wall, at least 4, of 8 x 8 pixels each: the projector has 192 * size^2
         pixels.
@@ -55,6 +65,8 @@ def run(
         A device as `open_device` takes it.
     progress : callable(step), optional
         Called with each of `STEPS` as it begins.
+    announce : callable(path), optional
+        Called with the path of compensation.png once it is there.
 
     Examples
     --------
@@ -64,8 +76,10 @@ def run(
     True
     """
     checks.count("size", size, least=4)
-    if progress is not None and not callable(progress):
-        raise errors.InputTypeError(f"progress is {progress!r}; it must be callable(step), or None")
+    for name, value, form in (("progress", progress, "step"), ("announce", announce, "path")):
+        if value is not None and not callable(value):
+            message = f"{name} is {value!r}; it must be callable({form}), or None"
+            raise errors.InputTypeError(message)
     begun: dict[str, float] = {}
 
     def begin(step: str) -> None:
@@ -74,13 +88,21 @@ def run(
             progress(step)
 
     with fill_folder(out) as folder:
-        results = experiment.compute(size, device, begin)
-        begin("pictures")
-        output.write_pictures(results, folder)
+        corner = experiment.compensate_corner(size, device, begin)
+        begin(FIRST_PICTURE)
+        views = output.write_compensation(corner, folder)
+    if announce is not None:
+        announce(Path(out) / output.COMPENSATION_SHEET)
+
+    with fill_folder(out) as folder:
+        results = experiment.take_apart(corner, begin)
+        begin(PICTURES)
+        output.write_pictures(results, views, folder)
         text = output.report_of(results, _seconds(begun))
         report.write(folder / "report.json", text)
         files = [file.relative_to(folder) for file in folder.rglob("*") if file.is_file()]
-        names = sorted(file.as_posix() for file in files)
+        names = [file.as_posix() for file in files]
+    names = sorted([*names, output.COMPENSATION_SHEET])
     return Demo(Path(out), text, tuple(names))
 
 

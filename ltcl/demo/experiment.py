@@ -36,8 +36,12 @@ ALBEDO = ((0.97, 0.25, 0.15), (0.96, 0.80, 0.30), (0.97, 0.45, 0.80))
 COLOURS = ("red", "green", "blue")
 # Pixels along a patch.
 DETAIL = 8
-STEPS = ("the room", "its light transport", "the target", "compensation", "bounces", "convergence")
+COMPENSATION_STEPS = ("the room", "its light transport", "the target", "compensation")
+STEPS_AFTER_IT = ("analysis", "bounces", "convergence")
 RTOL = 1e-3
+# It needs no measured speeds of the device and few kernels, all of which have to be compiled before
+# the first picture.
+FIRST_METHOD = "gmres"
 BOUNCES = 4
 # Each bounce inherits the errors of those before it.
 BOUNCE_RTOL = 1e-4
@@ -69,19 +73,26 @@ class Look:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Experiment:
-    """All results: pictures are linear, (h, w, 3) on the walls' grid.
-
-    `worst` is the channel of `race`.
-    """
+class CompensatedCorner:
+    """The corner before and after compensation: pictures are linear, (h, w, 3), on its walls."""
 
     scene: RefinedScene
     T: Transport
-    analysis: Analysis
     target: np.ndarray
     mist: float
     compensation: Compensation
     looks: dict[str, Look]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """All results: the compensated `corner`, and its light taken apart.
+
+    `worst` is the channel of `race`.
+    """
+
+    corner: CompensatedCorner
+    analysis: Analysis
     bounces: list[np.ndarray]
     bounce_errors: list[float]
     worst: int
@@ -96,31 +107,47 @@ class Target(NamedTuple):
     brightest: float
 
 
-def compute(size: int, device: Any, begin: Callable[[str], object]) -> Experiment:
-    """Run everything; `begin` is called with each of `STEPS`."""
-    room, transport, target_step, compensation_step, bounces, convergence = STEPS
+def compensate_corner(size: int, device: Any, begin: Callable[[str], object]) -> CompensatedCorner:
+    """Compensate a picture; `begin` is called with each of `COMPENSATION_STEPS`."""
+    room, transport, target_step, compensation_step = COMPENSATION_STEPS
     begin(room)
     scene = scenes.refine(scenes.box(size, sides=3, albedo=ALBEDO), DETAIL)
     begin(transport)
     T = scene.transport(device)
-    analysis = analyze(T, rtol=RTOL)
 
     begin(target_step)
     target = reachable_target(scene, T)
 
     begin(compensation_step)
-    compensation = compensate(T, target.picture, gain=1.0 / target.brightest, rtol=RTOL)
+    gain = 1.0 / target.brightest
+    compensation = compensate(T, target.picture, gain=gain, method=FIRST_METHOD, rtol=RTOL)
     columns = target.picture.reshape(-1, 3).T
     # Where the walls' colours are undone but no bounces, T F^-1 target = S target is seen.
     undone = [np.asarray(S @ column) for S, column in zip(T.systems, columns, strict=True)]
-    uncompensated = T @ target.picture
     pictures = {
-        "uncompensated": uncompensated,
+        "uncompensated": T @ target.picture,
         "colours_only": np.stack(undone, axis=-1).reshape(target.picture.shape),
         "compensated": compensation.appearance,
     }
+    return CompensatedCorner(
+        scene=scene,
+        T=T,
+        target=target.picture,
+        mist=target.mist,
+        compensation=compensation,
+        looks={name: look_at(seen, target.picture) for name, seen in pictures.items()},
+    )
 
-    begin(bounces)
+
+def take_apart(corner: CompensatedCorner, begin: Callable[[str], object]) -> Experiment:
+    """Explain the corner's light; `begin` is called with each of `STEPS_AFTER_IT`."""
+    analysis_step, bounces_step, convergence = STEPS_AFTER_IT
+    T = corner.T
+    begin(analysis_step)
+    analysis = analyze(T, rtol=RTOL)
+
+    begin(bounces_step)
+    uncompensated = corner.looks["uncompensated"].seen
     separation = separate(T, uncompensated, BOUNCES, rtol=BOUNCE_RTOL)
 
     begin(convergence)
@@ -130,22 +157,17 @@ def compute(size: int, device: Any, begin: Callable[[str], object]) -> Experimen
     for name in RACE_METHODS:  # a method that fails is shown, too
         race[name] = solve(
             T.systems[worst],
-            columns[worst],
+            corner.target[..., worst].ravel(),
             name,
             rtol=RACE_RTOL,
             maxiter=RACE_LENGTH,
             throw=False,
         )
     return Experiment(
-        scene=scene,
-        T=T,
+        corner=corner,
         analysis=analysis,
-        target=target.picture,
-        mist=target.mist,
-        compensation=compensation,
-        looks={name: look_at(seen, target.picture) for name, seen in pictures.items()},
         bounces=[separation.direct, *separation.bounces],
-        bounce_errors=bounce_errors(scene, target.picture, separation),
+        bounce_errors=bounce_errors(corner.scene, corner.target, separation),
         worst=worst,
         race=race,
     )
@@ -179,8 +201,10 @@ def reachable_target(scene: RefinedScene, T: Transport) -> Target:
     parts = np.stack([sunset, mist], axis=-1).reshape(-1, 3, 2)
     columns = parts.transpose(1, 0, 2).astype(np.float64)  # (3, N, 2)
     light = []
-    for S, column in zip(T.systems, columns, strict=True):
-        light.append(solve(S, column, rtol=RTOL).x.astype(np.float64))
+    for S, pictures in zip(T.systems, columns, strict=True):
+        # One by one: kernels for two at once would be compiled for this alone.
+        solutions = [solve(S, picture, FIRST_METHOD, rtol=RTOL).x for picture in pictures.T]
+        light.append(np.stack(solutions, axis=-1).astype(np.float64))
 
     too_little = 0.0
     enough = 1.0

@@ -64,7 +64,7 @@ class Kind(abc.ABC):
         return False
 
     def unreadable_advice(self, value: Any) -> str:
-        """What to do with an array that `read` cannot read."""
+        """Advise on an array that `read` cannot read."""
         return "give it as a NumPy array"
 
     def untracked(self, value: Any) -> Any:

@@ -48,7 +48,7 @@ class TensorKind(Kind):
         return forward_ad.unpack_dual(value).tangent is not None
 
     def unreadable_advice(self, value: Any) -> str:
-        """What to do with a tensor without numbers, or one that is not dense."""
+        """Advise on a tensor without numbers, or one that is not dense."""
         if value.device.type == "meta":
             return "it has no numbers: give it on another device"
         if value.layout is not torch.strided:

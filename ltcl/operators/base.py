@@ -355,10 +355,16 @@ class Operator(scipy.sparse.linalg.LinearOperator, metaclass=abc.ABCMeta):
 
     def _dense(self) -> np.ndarray:
         rows, columns = self.shape
-        return self.between(np.arange(rows), np.arange(columns))
+        return self._between_by_products(np.arange(rows), np.arange(columns))
 
     def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """The entries (rows, columns), two lists of indices, in float64, by a product a column."""
+        """The entries (rows, columns), two lists of indices, in float64.
+
+        By a product a column, where the operator knows no shorter way.
+        """
+        return self._between_by_products(rows, columns)
+
+    def _between_by_products(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         entries = np.empty((len(rows), len(columns)))
         for start in range(0, len(columns), ENTRY_COLUMNS):
             stop = start + ENTRY_COLUMNS

@@ -78,6 +78,10 @@ class Basis(Operator):
         """Arrays that a file can hold, from which `ltcl.operators.stored` makes the basis again."""
         return {"name": np.array(self.name), "grid": np.array(self.grid)}
 
+    def columns_of(self, pixels: np.ndarray) -> scipy.sparse.csr_array | None:
+        """The columns of W that belong to some pixels, (M, n); None if the host has no W."""
+        return None
+
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()
 
@@ -298,6 +302,13 @@ class ScaledBasis(Basis):
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The arrays of W, and the scale."""
         return {**self.of.to_arrays(), "scale": self.scale}
+
+    def columns_of(self, pixels: np.ndarray) -> scipy.sparse.csr_array | None:
+        """Scaled columns of W."""
+        columns = self.of.columns_of(pixels)
+        if columns is None:
+            return None
+        return scipy.sparse.csr_array(columns * self.scale[pixels])
 
     def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
         if transpose:

@@ -11,6 +11,7 @@ from ltcl.device.kernels import Queued, in_order
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis
+from ltcl.operators.dense import Dense
 from ltcl.operators.epilogue import PLAIN, Epilogue
 from ltcl.operators.knowledge import NormBound
 
@@ -99,6 +100,19 @@ class Compressed(Operator):
             )
         self.known_diagonal = np.diagonal(self.to_dense()).copy()
         return self.known_diagonal
+
+    def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """The entries (rows, columns), by the core alone if the host has both bases."""
+        if self.out is None or self.into is None or not isinstance(self.core, Dense):
+            return super().between(rows, columns)
+        left = self.out.columns_of(rows)
+        right = self.into.columns_of(columns)
+        if left is None or right is None:
+            return super().between(rows, columns)
+        core = self.core.matrix().astype(np.float64)
+        if len(columns) <= len(rows):
+            return left.T @ (core @ right)
+        return (left.T @ core) @ right
 
     def norm_bound(self) -> NormBound:
         """Between isometric bases the bound of the core."""

@@ -73,6 +73,11 @@ class IdentityPlus(Operator):
         bound = self.R.norm_bound()
         return NormBound(1.0 + bound.value, bound.is_bound)
 
+    def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """The entries (rows, columns): those of R, and 1 on the diagonal."""
+        is_diagonal = np.equal.outer(rows, columns)
+        return self.sign * self.R.between(rows, columns) + is_diagonal
+
     @property
     def has_entries(self) -> bool:
         """True if the entries of R lie on one device, in rows."""

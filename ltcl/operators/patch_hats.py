@@ -74,7 +74,7 @@ class PatchHats(Basis):
         self.walls = walls
         self.detail = detail
         self.patches, self.shares = _corners((h, w), walls, detail)
-        self.matrix = _matrix(self.patches, self.shares, detail)
+        self.matrix = _matrix(self.patches, self.shares, h * w // detail**2)
         self._sums = CSR(device, self.matrix)
         super().__init__(device, (h, w), PATCH_HATS, self._sums.shape[0], self._sums)
         self.orthonormal = False
@@ -87,6 +87,10 @@ class PatchHats(Basis):
             "walls": np.array(self.walls),
             "detail": np.array(self.detail),
         }
+
+    def columns_of(self, pixels: np.ndarray) -> scipy.sparse.csr_array:
+        """The hats at some pixels, (P, n)."""
+        return _matrix(self.patches[pixels], self.shares[pixels], self.shape[0])
 
     def diagonal_of(self, core: np.ndarray) -> np.ndarray:
         """The diagonal of W^T C W, (N,) float64, for C (P, P) on the host."""
@@ -108,14 +112,14 @@ def hats_matrix(grid: tuple[int, int], walls: int, detail: int) -> scipy.sparse.
     4.0
     """
     patches, shares = _corners(grid, walls, detail)
-    return _matrix(patches, shares, detail)
+    return _matrix(patches, shares, len(patches) // detail**2)
 
 
-def _matrix(patches: np.ndarray, shares: np.ndarray, detail: int) -> scipy.sparse.csr_array:
-    """Hats (P, N), of those at each pixel."""
+def _matrix(patches: np.ndarray, shares: np.ndarray, count: int) -> scipy.sparse.csr_array:
+    """So many hats, (count, n), of those at each of n pixels."""
     pixels = np.repeat(np.arange(len(patches)), CORNERS)
     entries = (shares.ravel(), (patches.ravel(), pixels))
-    shape = (len(patches) // detail**2, len(patches))
+    shape = (count, len(patches))
     matrix = scipy.sparse.csr_array(scipy.sparse.coo_array(entries, shape=shape))
     matrix.eliminate_zeros()
     return matrix

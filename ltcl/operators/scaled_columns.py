@@ -52,6 +52,13 @@ class ScaledColumns(Operator):
         diagonal = self.A.diagonal()
         return diagonal * self.d[: len(diagonal)] - self.shift
 
+    def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """The entries (rows, columns): those of A, scaled and shifted."""
+        entries = self.A.between(rows, columns) * self.d[columns]
+        shift = np.broadcast_to(self.shift, self.shape[:1])
+        is_diagonal = np.equal.outer(rows, columns)
+        return entries - is_diagonal * shift[rows][:, None]
+
     def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
         form = self.A._float64_form(reads_blocks=reads_blocks)
         if form is None:

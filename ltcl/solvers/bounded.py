@@ -571,11 +571,15 @@ class Descent:
 
     def begin(self) -> None:
         """Start anew from b and x as they are on the device; waits."""
+        self.forget()
+        self.refresh()
+
+    def forget(self) -> None:
+        """Forget all steps, and take b as it is on the device; waits."""
         for launch in self._zeros:
             launch()
         self._numbers.set(self._first_numbers)
         self.norms = self.norm_of(self.b)
-        self.refresh()
 
     def norm_of(self, picture: Array) -> np.ndarray:
         """||w picture|| of a picture (M, k) on the device, (k,); waits."""
@@ -595,10 +599,15 @@ class Descent:
     def refresh(self) -> None:
         """Compute r and g from x itself, instead of by recursion."""
         self.A.apply(self.x, self.r, scale=-1.0, add=self.b)
+        self.products += 1
+        self.take_residual()
+
+    def take_residual(self) -> None:
+        """Take r = b - A x as it is on the device, of x itself, and compute g."""
         self._weigh_r()
         self.A.apply_transpose(self._u, self._q)
         self._look_anew()
-        self.products += 2
+        self.products += 1
         self.has_true_residual = True
 
     def shift(self, change: float, direction: Target) -> None:

@@ -79,8 +79,9 @@ class BlockStore:
     ----------
     layout : StoreLayout
     provenance, attributes : dict
-        Plain JSON: where the transport comes from; what `update` keeps. Those of the last time
-        that this object read or wrote the store; `update` adds to what others have written since.
+        Plain JSON: where the transport comes from; what `update` keeps. They are
+        from the last time that this object read or wrote the store; `update` adds to what others
+        have written since.
     final : bool
 
     Examples

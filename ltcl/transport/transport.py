@@ -33,6 +33,7 @@ from ltcl.operators import (
     as_operator,
     interreflections,
 )
+from ltcl.operators.colour_hats import mixed_colours
 from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
 from ltcl.transport import coverage, diagnostics, stored
@@ -564,7 +565,7 @@ class Transport:
             return (Coupled(rows),)
         operators = tuple(self._operator(channel) for channel in range(self.channels))
         if self.mixing is not None:
-            return (Coupled.mixed(operators, self.mixing),)
+            return (mixed_colours(operators, self.mixing),)
         return operators
 
     def _operator(self, channel: int) -> Operator:

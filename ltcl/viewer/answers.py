@@ -403,7 +403,7 @@ class ViewerScene:
 
 
 def _setup_of_several(T: Any) -> Any:
-    """What the projectors of a combination of scans are fed; None for any other T."""
+    """The codes of the projectors of a combination of scans; None for any other T."""
     if not isinstance(T, CombinedTransport) or not T.displays:
         return None
     # The import takes a second.

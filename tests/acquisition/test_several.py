@@ -272,6 +272,8 @@ def test_projectors_have_keys_of_their_own(tmp_path: Path) -> None:
         ({"acquire": 'strategy = "block"'}, "strategy is 'block'"),
         ({"a": 'grid = "4"'}, r"\[projector a\] has 'grid'"),
         ({"a": '[[projector]]\nname = "b"'}, "has the name 'b', as one before it"),
+        ({"a": '[[projector]]\nname = "B"'}, "has the name 'b', as one before it"),
+        ({"a": '[[projector]]\nname = "Transport"'}, "has the name 'Transport', which is that"),
         ({"a": '[[projector]]\nname = "a b"'}, "has the name 'a b'; it must be 1 to 32 letters"),
         ({"a": '[[projector]]\nname = "a/b"'}, "has the name 'a/b'"),
         ({"a": '[[projector]]\nname = "end"'}, "has the name 'end', .* none of transport"),

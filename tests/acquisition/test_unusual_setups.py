@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Shots, VirtualRig, acquire, camera_map
+from ltcl.acquisition import Shots, VirtualRig, acquire, anchor, camera_map
 from ltcl.acquisition.calibrate import measure
 from ltcl.acquisition.metering import check_full_scale
 from ltcl.errors import AcquisitionError, InputError
@@ -182,6 +182,16 @@ DEPENDING = {
 def test_light_that_depends_on_the_picture_is_refused(gain: Any, response: str) -> None:
     with pytest.raises(AcquisitionError, match=r"photograph \d+ .*deviates.*contrast"):
         measure(Shots(Dimmed(gain, response=response)), geometry="aligned")
+
+
+def test_few_pixels_that_no_camera_sees_are_no_fault() -> None:
+    """As of one of many projectors; noise must not choose the pixels that are compared."""
+    grid = (24, 48)
+    brightness = np.full(grid, 0.004, np.float32)
+    brightness[4:8] = 1.0
+    brightness[anchor.sparse_pattern(grid) > 0] = 0.0
+    T = np.diag(brightness.ravel())
+    measure(Shots(VirtualRig(T, grid, bits=12, ambient=0.01)), geometry="aligned")
 
 
 @pytest.mark.slow

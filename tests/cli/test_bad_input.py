@@ -66,6 +66,7 @@ OTHERS = [
     ("denoise {transport} --out {out}.npy", [".npy", ".npz"]),
     ("denoise {compressed} --out {out}.npz", ["T is made of", "compress"]),
     ("invert {transport} --out {out}.npy", [".npy", ".npz"]),
+    ("simulate dihedral --size 3 --projectors 4 --out {out}", ["--size is 3", "4 or more"]),
     ("simulate sphere --out {out}", ["SCENE is 'sphere'", "dihedral"]),
     ("simulate dihedral --grid 4x8 --out {out}", ["--grid", "(4, 8)"]),
     ("simulate mitsuba:dihedral --ambient 0.1 --out {out}", ["--ambient", "mitsuba"]),

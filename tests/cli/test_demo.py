@@ -26,7 +26,7 @@ VIEWS = [
     "compensated",
     *(f"bounce_{number}" for number in range(5)),
 ]
-SHEETS = {"contact_sheet.png", "convergence.png", "report.json"}
+SHEETS = {"compensation.png", "contact_sheet.png", "convergence.png", "report.json"}
 
 
 @pytest.fixture(scope="module")
@@ -75,12 +75,43 @@ def test_files_are_listed(done):
 
 def test_steps_are_told(done):
     _, report, outcome = done
-    steps = [line.removeprefix("ltcl: ") for line in outcome.err.splitlines()]
+    lines = [line.removeprefix("ltcl: ") for line in outcome.err.splitlines()]
+    steps = [line for line in lines if "compensation.png" not in line]
     assert steps == [*demo.STEPS]
     assert steps == [*report["seconds"]]
 
 
-@pytest.mark.parametrize("name", ["size", "progress"])
+def test_the_picture_is_announced_before_the_bounces(done):
+    out, _, outcome = done
+    lines = outcome.err.splitlines()
+    (place,) = (number for number, line in enumerate(lines) if "compensation.png" in line)
+    assert str(out / "compensation.png") in lines[place]
+    assert "bounces" in lines[place]
+    assert lines[place + 1] == "ltcl: analysis"
+
+
+class Stopped(Exception):
+    """Raised where a demo ends early."""
+
+
+def test_the_picture_is_whole_when_it_is_announced(tmp_path):
+    """It alone is there by then, and stays if the demo ends there."""
+    out = tmp_path / "demo"
+
+    def stop(picture: Path) -> None:
+        assert picture == out / "compensation.png"
+        assert [path.name for path in out.iterdir()] == [picture.name]
+        sheet = images.read(picture)
+        assert sheet.shape[1:] == (1600, 3)
+        assert sheet.std() > 0.1
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        demo.run(out, size=4, announce=stop)
+    assert [path.name for path in out.iterdir()] == ["compensation.png"]
+
+
+@pytest.mark.parametrize("name", ["size", "progress", "announce"])
 def test_bad_arguments_are_named(tmp_path, name):
     changed: dict[str, Any] = {name: 3}
     with pytest.raises((InputError, InputTypeError), match=f"{name} is 3"):

@@ -52,6 +52,18 @@ def test_transport_solves_equation_4(name: str, detail: int) -> None:
         np.testing.assert_allclose(matrices, exact, rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize(("rows", "columns"), [([0, 5, 7, 16], [5, 3]), ([16], [16, 0, 16])])
+@pytest.mark.parametrize("name", SCENES)
+def test_entries_of_some_pixels_are_those_of_products(name, rows, columns) -> None:
+    scene = refine(SCENES[name](), 3)
+    T = scene.transport()
+    matrices = T.to_numpy().reshape(scene.channels, *T.shape)
+    for matrix, operator in zip(matrices, T.matrices, strict=True):
+        entries = operator.between(np.array(rows), np.array(columns))
+        expected = matrix[np.ix_(rows, columns)]
+        np.testing.assert_allclose(entries, expected, rtol=0, atol=2e-6)
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_pixels_exchange_light_reciprocally_and_make_none(name: str) -> None:
     patches = SCENES[name]()

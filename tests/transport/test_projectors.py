@@ -12,6 +12,7 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import InputError, InputTypeError
+from ltcl.transport.projectors.direct_parts import direct_parts
 from ltcl.transport.projectors.montage import Montage
 from tests.transport import projectors
 from tests.transport.projectors import CAMERA, LEFT, RIGHT
@@ -74,6 +75,23 @@ def test_direct_light_is_found(T):
         rows = is_whole & is_plain
         error = share.direct[0].toarray()[rows] - true[rows]
         assert np.linalg.norm(error) < 0.03 * np.linalg.norm(true[rows])
+
+
+def test_direct_light_beside_a_crease_is_as_wide_as_elsewhere():
+    """Pixels of the projector are those of the camera, as scans of several projectors have them."""
+    grid = (12, 24)
+    scene = ltcl.scenes.dihedral(12, albedo=0.7)
+    S = scene.transport().to_numpy().astype(np.float64) / 0.7
+    blur = []
+    for pixels in grid:
+        blur.append(np.eye(pixels) + 0.06 * (np.eye(pixels, k=1) + np.eye(pixels, k=-1)))
+    F = np.kron(*blur)
+    (found,) = direct_parts([S @ F], grid)
+    lights = found.sum(axis=1).reshape(grid)
+    true = F.sum(axis=1).reshape(grid)
+    np.testing.assert_allclose(lights, true, rtol=0.11)
+    bounced = found.toarray() - F
+    assert np.linalg.norm(bounced) < 0.03 * np.linalg.norm(F)
 
 
 @pytest.mark.parametrize(("blend", "largest"), [("smooth", 0.05), ("linear", 0.15)])

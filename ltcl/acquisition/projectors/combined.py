@@ -186,7 +186,7 @@ class ScanFacts:
 
 
 def read_facts(store: Path) -> ScanFacts:
-    """What `write_facts` has kept; FileError if it is damaged."""
+    """Read the facts that `write_facts` has kept; FileError if they are damaged."""
     path = facts_path(store)
     try:
         facts = json.loads(input_file(path).read_text(encoding="utf-8"))

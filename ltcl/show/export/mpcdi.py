@@ -37,7 +37,7 @@ EXTENSION = "ltcl"
 
 @dataclass(frozen=True, kw_only=True)
 class Dialect:
-    """What differs between versions.
+    """The differences between versions.
 
     Attributes
     ----------

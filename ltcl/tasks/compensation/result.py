@@ -101,7 +101,7 @@ class Compensation:
 
     Pictures are linear, float32, with the frames and colours of `desired`. Those of the camera,
     `appearance`, `target` and `out_of_reach`, are made when they are asked for. All are arrays of
-    the kind of `desired`. Of a tensor with a gradient `pattern` has one, and so ``T @ pattern``.
+    the kind of `desired`. For a tensor with a gradient `pattern` has one, and so ``T @ pattern``.
 
     Attributes
     ----------

@@ -161,8 +161,9 @@ def _inverse_diagonal(S: SolvedSystem) -> np.ndarray:
     controls = np.stack(control_samples)
     scatter = samples - samples.mean(axis=1, keepdims=True)
     # Least squares by the equations of the one or two factors.
-    products = np.einsum("inp,jnp->ij", controls, controls)
+    regressors = controls.reshape(len(controls), -1)
+    products = regressors @ regressors.T
     inverse = np.linalg.pinv(products, rcond=MIN_CONTROL_SHARE, hermitian=True)
-    factors = inverse @ np.einsum("inp,np->i", controls, scatter)
+    factors = inverse @ (regressors @ scatter.ravel())
     means = controls.mean(axis=2)
     return samples.mean(axis=1) - factors @ means

@@ -3,7 +3,8 @@
 
 Direct light of a camera pixel comes from few projector pixels side by side, and indirect light from
 everywhere. The window around the brightest entry is direct, less the level of the ring around it; a
-row without a peak that stands out of its ring has no direct light of this projector.
+row without a peak that stands out of its ring has no direct light of this projector. Beside a
+crease the other wall is in the window, too: there direct light is as wide as it is elsewhere.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ MIN_CONTRAST = 0.5
 # Times the peak of bright rows: dimmer rows have no direct light.
 MIN_PEAK = 0.02
 BRIGHT_QUANTILE = 0.9
+# Times the spread of nine in ten rows, above which light beside the peak is indirect.
+MAX_SPREAD = 1.75
+SPREAD_QUANTILE = 0.9
 
 
 class Peaks(NamedTuple):
@@ -34,13 +38,20 @@ class Peaks(NamedTuple):
     pixels: np.ndarray
     values: np.ndarray
 
+    def at(self, rows: np.ndarray) -> Peaks:
+        """The entries of some rows."""
+        return Peaks(self.pixels[rows], self.values[rows])
+
 
 def direct_parts(
     matrices: Sequence[Any], grid: tuple[int, int]
 ) -> tuple[scipy.sparse.csr_array, ...]:
     """F_k of each channel: the direct part of matrices (M, N_k) on a projector's grid."""
     peaks = _find_peaks(matrices)
-    radius = _find_radius(matrices, grid, peaks)
+    sampled = _sampled_rows(peaks)
+    total = _total_light(matrices, sampled)
+    radius = _find_radius(total, grid, peaks.at(sampled))
+    largest = MAX_SPREAD * _find_spread(total, grid, peaks.at(sampled), radius)
     values: list[list[np.ndarray]] = [[] for _ in matrices]
     pixels = []
     for first, blocks in _row_blocks(matrices):
@@ -53,10 +64,12 @@ def direct_parts(
         is_direct = peak - level > MIN_CONTRAST * peak
         is_direct &= peak > MIN_PEAK * np.quantile(peaks.values, BRIGHT_QUANTILE)
         pixels.append(window)
+        light = _above_level(total, window, ring, radius)
+        allowed = largest * light.max(axis=1, keepdims=True)
+        share = np.minimum(allowed / np.maximum(light, np.finfo(float).tiny), 1.0)
+        share[~is_direct] = 0.0
         for channel, block in enumerate(blocks):
-            light = np.take_along_axis(block, np.maximum(window, 0), axis=1)
-            light = np.maximum(light - _levels(block, ring, radius), 0.0)
-            values[channel].append(np.where(is_direct[:, None] & (window >= 0), light, 0.0))
+            values[channel].append(share * _above_level(block, window, ring, radius))
     columns = np.concatenate(pixels)
     shape = (len(columns), grid[0] * grid[1])
     matrices_of_channels = []
@@ -90,22 +103,44 @@ def _find_peaks(matrices: Sequence[Any]) -> Peaks:
     return Peaks(np.concatenate(pixels), np.concatenate(values))
 
 
-def _find_radius(matrices: Sequence[Any], grid: tuple[int, int], peaks: Peaks) -> int:
-    """Half the side of the windows, by the area around the peaks of bright rows."""
+def _sampled_rows(peaks: Peaks) -> np.ndarray:
+    """Some of the bright rows."""
     bright = np.flatnonzero(peaks.values >= np.quantile(peaks.values, 0.5))
-    rows = bright[:: max(len(bright) // SAMPLED_ROWS, 1)]
+    return bright[:: max(len(bright) // SAMPLED_ROWS, 1)]
+
+
+def _total_light(matrices: Sequence[Any], rows: np.ndarray) -> np.ndarray:
+    """Sum of these rows over all channels, (rows, N)."""
     total: Any = 0.0
     for matrix in matrices:
         block = matrix[rows]
         if scipy.sparse.issparse(block):
             block = block.toarray()
         total = total + np.asarray(block, np.float64)
-    window = _window(peaks.pixels[rows], MAX_RADIUS, grid)
+    return total
+
+
+def _find_radius(total: np.ndarray, grid: tuple[int, int], peaks: Peaks) -> int:
+    """Half the side of the windows, by the area around the peaks of bright rows."""
+    window = _window(peaks.pixels, MAX_RADIUS, grid)
     light = np.take_along_axis(total, np.maximum(window, 0), axis=1)
     light = np.where(window >= 0, light, 0.0)
-    areas = np.count_nonzero(light > SPREAD_SHARE * peaks.values[rows, None], axis=1)
+    areas = np.count_nonzero(light > SPREAD_SHARE * peaks.values[:, None], axis=1)
     radius = int(np.ceil((np.sqrt(np.median(areas)) - 1.0) / 2.0)) + 1
     return min(radius, MAX_RADIUS)
+
+
+def _find_spread(total: np.ndarray, grid: tuple[int, int], peaks: Peaks, radius: int) -> np.ndarray:
+    """Direct light beside the peak, relative to it, which few bright rows exceed, (window,)."""
+    window = _window(peaks.pixels, radius, grid)
+    ring = _ring(peaks.pixels, radius + 1, grid)
+    light = _above_level(total, window, ring, radius)
+    relative = light / np.maximum(light.max(axis=1, keepdims=True), np.finfo(float).tiny)
+    is_outside = window < 0
+    relative[is_outside] = np.nan
+    # Neighbours that no row has here are not limited.
+    relative[:, is_outside.all(axis=0)] = 1.0
+    return np.nanquantile(relative, SPREAD_QUANTILE, axis=0)
 
 
 def _offsets(radius: int) -> np.ndarray:
@@ -133,6 +168,15 @@ def _ring(pixels: np.ndarray, radius: int, grid: tuple[int, int]) -> np.ndarray:
     offsets = _offsets(radius)
     is_border = np.abs(offsets).max(axis=1) == radius
     return _neighbours(pixels, offsets[is_border], grid)
+
+
+def _above_level(
+    block: np.ndarray, window: np.ndarray, ring: np.ndarray, radius: int
+) -> np.ndarray:
+    """Light in the window above the level of indirect light, (rows, window)."""
+    light = np.take_along_axis(block, np.maximum(window, 0), axis=1)
+    light = np.maximum(light - _levels(block, ring, radius), 0.0)
+    return np.where(window >= 0, light, 0.0)
 
 
 def _levels(block: np.ndarray, ring: np.ndarray, radius: int) -> np.ndarray:
