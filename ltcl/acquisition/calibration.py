@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Any
 
@@ -29,7 +29,8 @@ from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, on_projector
 from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
-from ltcl.acquisition.scratch import ImageFile, StoredImage
+from ltcl.acquisition.scratch import ImageFile, StoredImage, scratch_array
+from ltcl.acquisition.session import Photograph
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
 from ltcl.transport.transport import Transport
@@ -89,6 +90,9 @@ class Calibration:
     mapping : StoredMap, optional
         The map behind the resampling, for a store; `stored_map` reads it again. None with an
         aligned camera.
+    stripes : sequence of Photograph
+        Photographs of the bits of Gray code, which are patterns of a sketch as well, if they have
+        the exposure of the scan; not kept.
     """
 
     exposures: tuple[float, ...]
@@ -103,6 +107,7 @@ class Calibration:
     sharpness: Sharpness | None = None
     anchor: Anchor | None = None
     mapping: StoredMap | None = None
+    stripes: Sequence[Photograph] = ()
 
     @property
     def light(self) -> np.ndarray:
@@ -252,13 +257,13 @@ def _small_arrays(store: BlockStore, names: Iterable[str]) -> dict[str, np.ndarr
 
 
 def _joined(store: BlockStore, names: list[str]) -> np.ndarray:
-    """Join arrays of a store one below the other, without having all in memory."""
+    """Join arrays of a store one below the other; a large array is in a temporary file."""
     file = ImageFile()
     strips = []
     for name in names:
         strips.append(file.append(np.array(store.extra(name))))
     length = sum(strip.shape[0] for strip in strips)
-    joined = np.empty((length, *strips[0].shape[1:]), strips[0].dtype)
+    joined = scratch_array((length, *strips[0].shape[1:]), strips[0].dtype)
     top = 0
     for strip in strips:
         joined[top : top + strip.shape[0]] = strip.read()
