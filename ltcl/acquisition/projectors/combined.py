@@ -109,7 +109,7 @@ class CombinedSetup:
     def of_scan(cls, path: str | os.PathLike[str]) -> CombinedSetup | None:
         """The set-up of one of several projectors alone, by its store; None for other stores."""
         store = as_path(path)
-        if not facts_path(store).exists():
+        if not has_facts(store):
             return None
         setup = Setup.of(store)
         facts = read_facts(store)
@@ -178,6 +178,11 @@ def _check_places(name: str, places: np.ndarray, grid: tuple[int, int]) -> None:
 def facts_path(store: Path) -> Path:
     """File beside the store of a scan of one of several projectors."""
     return store.with_suffix(FACTS_SUFFIX)
+
+
+def has_facts(store: Path) -> bool:
+    """True if this is the store of a scan of one of several projectors, with its facts beside."""
+    return store.is_dir() and facts_path(store).exists()
 
 
 def write_facts(store: Path, *, view: Path, side: int) -> None:
@@ -267,7 +272,7 @@ def combine_scans(
     ambient = []
     for number, path in enumerate(as_path(store) for store in stores):
         store = BlockStore.open(path)
-        if not store.final or not facts_path(path).exists():
+        if not store.final or not has_facts(path):
             raise InputError(
                 f"{path}: is no finished scan of one of several projectors, as 'ltcl acquire run' "
                 "makes of an acquisition.toml with [[projector]]"
