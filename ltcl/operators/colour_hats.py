@@ -5,11 +5,12 @@ Each colour of a sketch is T = I + diag(w) W^T K W with the sums W under hats; i
 S = T F^-1 is one more diagonal away. The K of the three colours have their entries mostly in the
 same places, so a product of all takes each place once, with three numbers beside each other:
 
-    A = diag(outer) (W^T K W + diag(own)) diag(inner) M,    (3 N, 3 N), colour below colour
+    A = diag(outer) (W^T K W + diag(own)) diag(inner),    (3 N, 3 N), colour below colour,
 
-`own` holds the diagonals of K at pixels, which are direct light and keep all of their digits. M
-mixes the colours of a pixel. An entry in the row of a pixel takes 8 bytes where all numbers have 8
-significant bits, as those of a scan do, and nodes are near; else 16 (`kernels/colour_hats.cl`).
+or A M diag(columns), where M mixes the colours of a pixel. `own` holds the diagonals of K at
+pixels, which are direct light and keep all of their digits. An entry in the row of a pixel takes 8
+bytes where all numbers have 8 significant bits, as those of a scan do, and nodes are near; else 16
+(`kernels/colour_hats.cl`).
 """
 
 from __future__ import annotations
@@ -256,34 +257,85 @@ class ColourRows:
         return arrays
 
 
-class ColourHats(Operator):
-    """A = diag(outer) (W^T K W + diag(own)) diag(inner) M of three colours, (3 N, 3 N).
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Factors:
+    """The diagonals and the mixing of `ColourHats` on the device; None for ones, or zeros of `own`.
 
-    Parameters
-    ----------
-    rows : ColourRows
-    inner, outer, own : (3, N)
-    mixing : (3, 3) or None
-        M.
-    each : Operator
-        The same operator, colour by colour, which takes several right-hand sides.
+    `inner`, `outer` and `columns` are (3, N) or (3 N,), `own` is (N, 4), `mixing` is M and
+    `transposed_mixing` M^T, (3, 3).
     """
 
-    def __init__(
-        self,
-        rows: ColourRows,
+    inner: Array | None
+    outer: Array
+    own: Array | None
+    columns: Array | None = None
+    has_mixing: bool
+    mixing: Array
+    transposed_mixing: Array
+
+    @classmethod
+    def upload(
+        cls,
+        device: Device,
         inner: np.ndarray,
         outer: np.ndarray,
         own: np.ndarray,
         mixing: np.ndarray | None,
-        each: Operator,
-    ) -> None:
+    ) -> Factors:
+        """The factors (3, N) of a product, and M if colours are mixed."""
+        own_of_nodes = None
+        if own.any():
+            padded = np.zeros((own.shape[1], NODE_VALUES), np.float32)
+            padded[:, :COLOURS] = own.T
+            own_of_nodes = device.upload(padded)
+        M = np.eye(COLOURS) if mixing is None else mixing
+        return cls(
+            inner=None if np.all(inner == 1.0) else device.upload(inner),
+            outer=device.upload(outer),
+            own=own_of_nodes,
+            has_mixing=mixing is not None,
+            mixing=device.upload(M),
+            transposed_mixing=device.upload(M.T),
+        )
+
+    @property
+    def arrays(self) -> list[Array | None]:
+        """All arrays of many numbers."""
+        return [self.inner, self.outer, self.own, self.columns]
+
+    def mixing_defines(self, transpose: bool) -> dict[str, int]:
+        """Defines of the kernels that say how colours are mixed."""
+        if not self.has_mixing:
+            return {}
+        place = MIXED_RESULT if transpose else MIXED_OPERAND
+        return {"MIXED": place, "COLUMNS": int(self.columns is not None)}
+
+    def mixing_arguments(self, transpose: bool, unread: Array) -> dict[str, Array]:
+        """Arguments of the kernels for that."""
+        return {
+            "mixing": self.transposed_mixing if transpose else self.mixing,
+            "columns": unread if self.columns is None else self.columns,
+        }
+
+
+class ColourHats(Operator):
+    """diag(outer) (W^T K W + diag(own)) diag(inner) M diag(columns) of three colours, (3 N, 3 N).
+
+    Parameters
+    ----------
+    rows : ColourRows
+    factors : Factors
+    each : Operator
+        The same operator, colour by colour, which takes several right-hand sides.
+    """
+
+    def __init__(self, rows: ColourRows, factors: Factors, each: Operator) -> None:
         device = rows.W.device
         self.rows = rows
         self.each = each
         self._block = CPU_BLOCK if device.is_cpu else 1
         self._group = 1 if device.is_cpu else GROUP
-        self._factors = _Factors(device, inner, outer, own, mixing)
+        self._factors = factors
         super().__init__(device, each.shape, *self._factors.arrays, each)
         self.error = each.error
 
@@ -294,6 +346,13 @@ class ColourHats(Operator):
     def diagonal(self) -> np.ndarray:
         """The diagonals of the colours, one behind the other."""
         return self.each.diagonal()
+
+    def with_columns(self, d: np.ndarray) -> ColourHats | None:
+        """A diag(d), d (3 N,), which reads it along; None unless colours are mixed."""
+        if not self._factors.has_mixing or self._factors.columns is not None:
+            return None
+        factors = replace(self._factors, columns=self.device.upload(d))
+        return ColourHats(self.rows, factors, ScaledColumns(self.each, d))
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()
@@ -319,17 +378,17 @@ class ColourHats(Operator):
             "colour_hats",
             "colour_hats_scale",
             SCALED=int(inner is not None),
-            MIXED=factors.mixed(transpose),
             BLOCK=self._block,
+            **factors.mixing_defines(transpose),
         )
         return kernel.bind(
             -(-rows.pixels // self._block),
             self._group,
             pixels=rows.pixels,
-            mixing=factors.mixing(transpose),
             inner=x if inner is None else inner,
             x=x,
             nodes=nodes,
+            **factors.mixing_arguments(transpose, x),
         )
 
     def _bind_levels(self, rows: DeviceRows, nodes: Array, sums: Array) -> list[Queued]:
@@ -374,8 +433,8 @@ class ColourHats(Operator):
             NARROW=int(rows.is_narrow),
             SCALED=int(outer is not None),
             OWN=int(factors.own is not None),
-            MIXED=factors.mixed(transpose),
             BLOCK=self._block,
+            **factors.mixing_defines(transpose),
         )
         return kernel.bind(
             (-(-width // self._block), height),
@@ -390,53 +449,14 @@ class ColourHats(Operator):
             sums=sums,
             outer=x if outer is None else outer,
             own=x if factors.own is None else factors.own,
-            mixing=factors.mixing(transpose),
             a=epilogue.a,
             b=epilogue.b,
             c=epilogue.c,
             x=x,
             y=epilogue.operand(out),
             out=out,
+            **factors.mixing_arguments(transpose, x),
         )
-
-
-class _Factors:
-    """The diagonals and the mixing on the device; None for ones of `inner`, zeros of `own`."""
-
-    def __init__(
-        self,
-        device: Device,
-        inner: np.ndarray,
-        outer: np.ndarray,
-        own: np.ndarray,
-        mixing: np.ndarray | None,
-    ) -> None:
-        self.inner = None if np.all(inner == 1.0) else device.upload(inner)
-        self.outer = device.upload(outer)
-        self.own = None
-        if own.any():
-            padded = np.zeros((own.shape[1], NODE_VALUES), np.float32)
-            padded[:, :COLOURS] = own.T
-            self.own = device.upload(padded)
-        self._has_mixing = mixing is not None
-        M = np.eye(COLOURS) if mixing is None else mixing
-        self._mixing = device.upload(M)
-        self._transposed_mixing = device.upload(M.T)
-
-    @property
-    def arrays(self) -> list[Array | None]:
-        """All arrays of many numbers."""
-        return [self.inner, self.outer, self.own]
-
-    def mixing(self, transpose: bool) -> Array:
-        """M or M^T, (3, 3)."""
-        return self._transposed_mixing if transpose else self._mixing
-
-    def mixed(self, transpose: bool) -> int:
-        """The define MIXED of the kernels."""
-        if not self._has_mixing:
-            return 0
-        return MIXED_RESULT if transpose else MIXED_OPERAND
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -478,7 +498,8 @@ def join_colours(
     own = rows.own + (1.0 - np.divide(shift, inner, out=np.zeros_like(inner), where=is_lit)) / outer
     # Where F is direct light nothing is left of it but rounding.
     own[np.abs(own) * outer <= ROUNDING * np.abs(shift)] = 0.0
-    return ColourHats(rows, inner, outer, own, mixing, each)
+    factors = Factors.upload(rows.W.device, inner, outer, own, mixing)
+    return ColourHats(rows, factors, each)
 
 
 def _colour_of(block: Operator) -> _Colour | None:
@@ -547,3 +568,11 @@ def mixed_colours(operators: Sequence[Operator], mixing: np.ndarray) -> Operator
     coupled = Coupled.mixed(operators, mixing)
     joined = join_colours(operators, coupled, mixing)
     return coupled if joined is None else joined
+
+
+def scale_columns(A: Operator, d: np.ndarray) -> Operator:
+    """A diag(d), which colours of a sketch take along."""
+    scaled = None
+    if isinstance(A, ColourHats):
+        scaled = A.with_columns(d)
+    return ScaledColumns(A, d) if scaled is None else scaled

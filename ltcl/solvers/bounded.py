@@ -56,6 +56,9 @@ _DOTS = "vector_dots"
 _MOVE = "bounded_move"
 _LOOK = "bounded_look"
 
+# Rows of x that the host works on at once.
+ROWS_AT_ONCE = 1 << 14
+
 # lower, upper (N,)
 Box = tuple[np.ndarray, np.ndarray]
 
@@ -661,13 +664,23 @@ class Descent:
         """Numbers of columns as an array that broadcasts to x."""
         if self.planes == 1:
             return numbers
-        return np.repeat(numbers, self.x.shape[0] // self.planes)[:, None]
+        rows = self.x.shape[0] // self.planes
+        return np.repeat(numbers, rows)[:, None]
 
     def saturated(self, x: np.ndarray) -> np.ndarray:
         """Return the entries that a step along -g takes beyond a bound, touched or not."""
+        g = self.g.get()
+        alpha = np.broadcast_to(self.along_x(self._alpha), x.shape)
         lower, upper = _as_columns(self._box)
-        stepped = x - self.along_x(self._alpha) * self.g.get()
-        return (lower < upper) & ((stepped < lower) | (stepped > upper))
+        is_saturated = np.empty(x.shape, bool)
+        # What is between fits the caches.
+        for first in range(0, len(x), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            low = lower[rows]
+            high = upper[rows]
+            stepped = x[rows] - alpha[rows] * g[rows]
+            is_saturated[rows] = (low < high) & ((stepped < low) | (stepped > high))
+        return is_saturated
 
 
 def _as_columns(box: Box) -> Box:

@@ -18,7 +18,12 @@ from ltcl.operators import (
     block_diagonal,
     colour_hats,
 )
-from ltcl.operators.colour_hats import ColourHats, mixed_colours, share_entries
+from ltcl.operators.colour_hats import (
+    ColourHats,
+    mixed_colours,
+    scale_columns,
+    share_entries,
+)
 from tests import reference
 from tests.operators import helpers
 
@@ -101,6 +106,13 @@ def test_colours_of_a_pixel_are_mixed(shaped, grid):
     matrix = colours.matrix(mixing=MIXING)
     helpers.meets_twin(mixed, matrix)
     helpers.meets_twin(mixed, matrix, transpose=True)
+    d = np.random.default_rng(6).uniform(0.0, 2.0, len(matrix))
+    scaled = scale_columns(mixed, d)
+    assert isinstance(scaled, ColourHats)
+    helpers.meets_twin(scaled, matrix * d)
+    helpers.meets_twin(scaled, matrix * d, transpose=True)
+    twice = scale_columns(scaled, d)
+    helpers.meets_twin(twice, matrix * d**2)
 
 
 def test_nodes_that_are_too_far_take_wide_entries(device, monkeypatch):
