@@ -16,8 +16,10 @@ bytes where all numbers have 8 significant bits, as those of a scan do, and node
 from __future__ import annotations
 
 import operator
+import os
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -46,6 +48,8 @@ MAX_DISTANCE = 1 << 14
 LOWER_BITS = np.uint32(0xFFFF)
 # Where bits begin that say that there is an entry, above those of three halves.
 PRESENCE = 48
+# Rows that are joined at once.
+ROWS_AT_ONCE = 1 << 15
 ALL_HALVES = (1 << PRESENCE) - 1
 ALL_BITS = (1 << 32) - 1
 # Values of the define MIXED: colours of the operand are mixed, or those of the result.
@@ -79,20 +83,26 @@ class JointEntries:
 
     @classmethod
     def of(cls, cores: Sequence[Any], pixels: int) -> JointEntries:
-        """The entries of K (nodes, nodes) of each colour, float32."""
-        bits = [K.data.view(np.uint32) for K in cores]
-        if all(map(_has_few_bits, cores, bits, [pixels] * COLOURS)):
-            indptr, indices, numbers = _join_halves(cores, bits)
-        else:
-            indptr, indices, numbers = _join_reals(cores, bits)
-        is_kept = np.ones(len(indices), bool)
-        is_kept[: indptr[pixels]] = ~_are_own(indptr, indices, pixels)
-        kept_before = np.concatenate([[0], np.cumsum(is_kept)])
+        """The entries of K (nodes, nodes) of each colour, float32 in ascending columns."""
+        nodes = cores[0].shape[0]
+        join = _join_halves
+        if not all(map(_has_few_bits, cores, [pixels] * COLOURS)):
+            join = _join_reals
+
+        def join_rows(rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            indptr, indices, numbers = join([_rows_of_core(K, rows) for K in cores])
+            row = np.repeat(np.arange(rows.start, rows.stop), np.diff(indptr))
+            is_kept = (row >= pixels) | (indices != row)
+            before = np.concatenate([[0], np.cumsum(is_kept)])
+            return np.diff(before[indptr]), indices[is_kept], numbers[is_kept]
+
+        blocks = _in_threads(join_rows, nodes)
+        counts, indices, numbers = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         return cls(
             pixels=pixels,
-            indptr=kept_before[indptr],
-            indices=indices[is_kept],
-            numbers=numbers[is_kept],
+            indptr=np.concatenate([[0], np.cumsum(counts)]),
+            indices=indices,
+            numbers=numbers,
         )
 
     @property
@@ -114,25 +124,38 @@ class JointEntries:
         )
 
 
-def _are_own(indptr: np.ndarray, indices: np.ndarray, pixels: int) -> np.ndarray:
-    """True for the diagonal among the entries of the rows of pixels."""
-    rows = np.repeat(np.arange(pixels, dtype=indices.dtype), np.diff(indptr[: pixels + 1]))
-    return indices[: len(rows)] == rows
+def _in_threads(work: Callable[[slice], Any], rows: int) -> list[Any]:
+    """The results for blocks of rows, which fit the caches, in order."""
+    blocks = [slice(i, min(i + ROWS_AT_ONCE, rows)) for i in range(0, rows, ROWS_AT_ONCE)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, blocks))
 
 
-def _has_few_bits(K: Any, bits: np.ndarray, pixels: int) -> bool:
+def _rows_of_core(K: Any, rows: slice) -> Any:
+    """Some rows of a csr_array, whose numbers are not copied."""
+    indptr = K.indptr[rows.start : rows.stop + 1]
+    entries = slice(indptr[0], indptr[-1])
+    parts = (K.data[entries], K.indices[entries], indptr - indptr[0])
+    return scipy.sparse.csr_array(parts, shape=(rows.stop - rows.start, K.shape[1]))
+
+
+def _has_few_bits(K: Any, pixels: int) -> bool:
     """True if all but the diagonal at pixels have 8 significant bits."""
-    has_more = (bits & LOWER_BITS) != 0
-    is_own = _are_own(K.indptr, K.indices, pixels)
-    has_more[: len(is_own)] &= ~is_own
-    return not has_more.any()
+
+    def have(rows: slice) -> bool:
+        block = _rows_of_core(K, rows)
+        row = np.repeat(np.arange(rows.start, rows.stop), np.diff(block.indptr))
+        is_own = (row < pixels) & (block.indices == row)
+        return not np.any((block.data.view(np.uint32) & LOWER_BITS != 0) & ~is_own)
+
+    return all(_in_threads(have, K.shape[0]))
 
 
-def _join_halves(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def _join_halves(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
     """Pointers, columns and upper halves of the bits of three matrices in all their places."""
     total: Any = 0
-    for colour, (K, of_colour) in enumerate(zip(cores, bits, strict=True)):
-        numbers = (of_colour >> np.uint32(16)).astype(np.int64)
+    for colour, K in enumerate(cores):
+        numbers = (K.data.view(np.uint32) >> np.uint32(16)).astype(np.int64)
         numbers <<= 16 * colour
         # Zeros would not count as entries.
         numbers |= 1 << (PRESENCE + colour)
@@ -140,15 +163,15 @@ def _join_halves(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.n
     return total.indptr, total.indices, (total.data & ALL_HALVES).view(np.uint64)
 
 
-def _join_reals(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def _join_reals(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
     """Pointers, columns and bits of three matrices in all their places."""
     places: Any = 0
     for K in cores:
         ones = np.full(len(K.data), 1 << PRESENCE)
         places = places + scipy.sparse.csr_array((ones, K.indices, K.indptr), shape=K.shape)
     joint = np.empty((len(places.data), COLOURS), np.uint32)
-    for colour, (K, of_colour) in enumerate(zip(cores, bits, strict=True)):
-        numbers = of_colour.astype(np.int64)
+    for colour, K in enumerate(cores):
+        numbers = K.data.view(np.uint32).astype(np.int64)
         total = places + scipy.sparse.csr_array((numbers, K.indices, K.indptr), shape=K.shape)
         joint[:, colour] = total.data & ALL_BITS
     return places.indptr, places.indices, joint
@@ -205,23 +228,30 @@ def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | No
     if not entries.are_halves:
         return None
     pixels = entries.pixels
-    indptr = entries.indptr[: pixels + 1]
-    count = indptr[-1]
-    columns = entries.indices[:count].astype(np.int32, copy=False)
-    is_far = columns >= pixels
-    # Columns ascend: those that are far are the last of a row.
-    far_before = np.concatenate([[0], np.cumsum(is_far)])
-    far_count = np.diff(far_before[indptr])
-    has_far = far_count > 0
     bases = np.zeros(pixels, np.int32)
-    bases[has_far] = columns[(indptr[1:] - far_count)[has_far]]
-    counts = np.diff(indptr)
-    own = np.repeat(np.arange(pixels, dtype=np.int32), counts)
-    distance = columns - np.where(is_far, np.repeat(bases, counts), own)
-    if np.any(distance < -MAX_DISTANCE) or np.any(distance >= MAX_DISTANCE):
+    narrow = np.empty(entries.indptr[pixels], np.uint64)
+
+    def narrow_rows(rows: slice) -> bool:
+        """Write the bases and entries of some rows; returns whether all nodes are near."""
+        indptr = entries.indptr[rows.start : rows.stop + 1]
+        own = slice(indptr[0], indptr[-1])
+        indptr = indptr - indptr[0]
+        columns = entries.indices[own]
+        is_far = columns >= pixels
+        # Columns ascend: those that are far are the last of a row.
+        far_before = np.concatenate([[0], np.cumsum(is_far)])
+        far_count = np.diff(far_before[indptr])
+        has_far = far_count > 0
+        bases[rows][has_far] = columns[(indptr[1:] - far_count)[has_far]]
+        counts = np.diff(indptr)
+        near_bases = np.repeat(np.arange(rows.start, rows.stop), counts)
+        distance = columns - np.where(is_far, np.repeat(bases[rows], counts), near_bases)
+        code = (2 * distance + is_far) & 0xFFFF
+        narrow[own] = entries.numbers[own] | code.astype(np.uint64) << np.uint64(PRESENCE)
+        return not np.any((distance < -MAX_DISTANCE) | (distance >= MAX_DISTANCE))
+
+    if not all(_in_threads(narrow_rows, pixels)):
         return None
-    narrow = entries.numbers[:count].copy()
-    narrow |= ((2 * distance + is_far) & 0xFFFF).astype(np.uint64) << np.uint64(PRESENCE)
     return bases, narrow.view(np.uint16).reshape(-1, COLOURS + 1)
 
 
