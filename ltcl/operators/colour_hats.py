@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import operator
 import os
+import threading
 import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -269,15 +270,20 @@ class ColourRows:
         self.W = W
         pixels = W.shape[1]
         self.own = np.stack([K.diagonal()[:pixels].astype(np.float64) for K in cores])
-        self._entries = JointEntries.of(cores, pixels)
+        self._lock = threading.Lock()
+        # Until they are transposed.
+        self._entries: JointEntries | None = JointEntries.of(cores, pixels)
         self.forward = DeviceRows(W.device, self._entries)
         self._transposed: DeviceRows | None = None
 
     def transposed(self) -> DeviceRows:
         """The rows of the K^T."""
-        if self._transposed is None:
-            self._transposed = DeviceRows(self.W.device, self._entries.transposed())
-        return self._transposed
+        with self._lock:
+            if self._transposed is None:
+                assert self._entries is not None  # noqa: S101 - they are transposed once
+                self._transposed = DeviceRows(self.W.device, self._entries.transposed())
+                self._entries = None
+            return self._transposed
 
     def arrays(self) -> set[Array]:
         """All arrays on the device."""
