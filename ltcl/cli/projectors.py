@@ -112,10 +112,10 @@ def _is_same(scan: Path, other: Path) -> bool:
 def _combined(paths: Sequence[Path], settings: dict[str, Any], device: Any) -> Any:
     """The combination of stores of scans, with their set-ups, or of other files."""
     from ltcl.acquisition.projectors import combine_scans
-    from ltcl.acquisition.projectors.combined import facts_path
+    from ltcl.acquisition.projectors.combined import has_facts
     from ltcl.transport.projectors import combine as combine_transports
 
-    are_scans = [facts_path(path).exists() for path in paths]
+    are_scans = [has_facts(path) for path in paths]
     if all(are_scans):
         return combine_scans(paths, device=device, **settings)
     if any(are_scans):

@@ -32,7 +32,7 @@ def relight(
     names.
     """
     T = loading.load(context, transport, notes_dark=False)
-    setup = loading.load_setup(transport)
+    setup = loading.load_setup(transport) or loading.setup_of_several(T)
     patterns = pictures.read_all(context, pattern, T.grid, "the projector", setup)
     relit = {}
     for name, light in patterns.items():

@@ -313,6 +313,18 @@ def test_other_stores_are_refused(tmp_path: Path) -> None:
         combine_scans([tmp_path / "T.zarr", tmp_path / "T.zarr"])
 
 
+def test_other_files_in_the_folder_of_scans_are_no_scans(scanned: Path, tmp_path: Path) -> None:
+    """Files with the names of stores, such as what `ltcl convert` makes of them."""
+    files = []
+    for name in ("left", "right"):
+        (tmp_path / f"{name}.projector.json").symlink_to(scanned / f"{name}.projector.json")
+        files.append(tmp_path / f"{name}.npz")
+        ltcl.save(files[-1], ltcl.load(scanned / f"{name}.zarr", on_dark="mask"))
+    out = tmp_path / "both.npz"
+    assert main(["combine", *map(str, files), "--out", str(out), "--quiet"]) == 0
+    assert CombinedSetup.of(ltcl.load(out)) is None
+
+
 def test_damaged_facts_are_named(scanned: Path, tmp_path: Path) -> None:
     (tmp_path / "left.zarr").symlink_to(scanned / "left.zarr")
     (tmp_path / "left.projector.json").write_text('{"side": 6}')

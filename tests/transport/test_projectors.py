@@ -155,6 +155,27 @@ def test_narrow_overlaps_have_linear_weights(shared, power):
     np.testing.assert_allclose(np.diff(distance[alone + 2 : -1]), -1.0)
 
 
+@pytest.mark.parametrize("inner", [24, 12])
+def test_a_projector_inside_of_another_ends_softly(inner):
+    """The outer one, which never has to fade out, gives all of its light everywhere."""
+    camera = (4, 60)
+    size = camera[0] * camera[1]
+    first = (camera[1] - inner) // 2
+    identity = np.eye(size, dtype=np.float32).reshape(size, *camera)
+    inside = identity[:, :, first : first + inner].reshape(size, -1)
+    members = [
+        ltcl.Transport(identity.reshape(size, size), camera, camera_grid=camera),
+        ltcl.Transport(inside, (4, inner), camera_grid=camera),
+    ]
+    outer_share, inner_share = ltcl.combine(members).shares
+    np.testing.assert_array_equal(outer_share.own, 1.0)
+    np.testing.assert_array_equal(outer_share.ceiling, 1.0)
+    own = inner_share.own.reshape(4, inner)
+    assert own[1, 0] < 0.12
+    assert own[1, -1] < 0.12
+    assert own[1, inner // 2] > 0.9
+
+
 def test_own_weights(members):
     weights = [np.ones(T.grid) for T in members]
     T = ltcl.combine(members, blend=weights)
@@ -238,3 +259,6 @@ def test_refusals(device, members, T):
         T.join([np.ones(one.grid)] * 2)
     with pytest.raises(InputError, match="frames and colours"):
         T.join([np.ones(LEFT.grid), np.ones((*RIGHT.grid, 3))])
+    for call in (ltcl.align, ltcl.compress):
+        with pytest.raises(InputError, match=r"T is of several projectors, .*separate"):
+            call(T)

@@ -280,6 +280,12 @@ class CombinedTransport(Transport):
         """False: S is that of `scene`."""
         return False
 
+    def _require_first_bounce(self) -> np.ndarray:
+        raise InputError(
+            "T is of several projectors, whose S is that of T.scene, between the camera's pixels: "
+            "compensate, relight, separate, analyze and invert take T, others T.scene or one scan"
+        )
+
     @cached_property
     def unlit(self) -> np.ndarray:
         """Camera pixels (M,) without direct light of any projector."""

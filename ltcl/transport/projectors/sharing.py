@@ -82,15 +82,23 @@ class ProjectorShare:
         return np.asarray(self.direct[channel].sum(axis=1)).ravel()
 
 
-def border_distance(is_border: np.ndarray) -> np.ndarray:
-    """Distance (h, w) of each pixel to the outer side of the border pixels, (h, w) bool.
+def border_distances(borders: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Distance (N_k,) of each pixel to the outer side of the border pixels, (h, w) bool.
 
-    Without a border all pixels are alike.
+    A projector without a border never has to fade out: all of it is as far from a border as the
+    pixel of another projector that is farthest from its own.
     """
-    if not is_border.any():
-        return np.ones(is_border.shape)
-    distance = np.asarray(scipy.ndimage.distance_transform_edt(~is_border), np.float64)
-    return distance + 0.5
+    distances = []
+    for is_border in borders:
+        if is_border.any():
+            distance = np.asarray(scipy.ndimage.distance_transform_edt(~is_border), np.float64)
+            distances.append(distance.ravel() + 0.5)
+        else:
+            distances.append(np.zeros(is_border.size))
+    farthest = max(float(distance.max()) for distance in distances)
+    if farthest == 0.0:
+        farthest = 1.0
+    return [distance if distance.any() else distance + farthest for distance in distances]
 
 
 def find_borders(
@@ -174,7 +182,7 @@ def find_ramps(
     if isinstance(blend, str):
         name = checks.one_of("blend", blend, ("auto", *BLENDS))
         borders = find_borders(directs, grids, camera_grid)
-        distances = [border_distance(is_border).ravel() for is_border in borders]
+        distances = border_distances(borders)
         if name == "auto":
             width = overlap_width(directs, distances, camera_grid)
             name = "smooth" if width >= WIDE_OVERLAP else "linear"
