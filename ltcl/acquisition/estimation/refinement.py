@@ -207,11 +207,14 @@ class RefinedEstimator:
         """The same as `Estimator.scale_of_variance`."""
         scales = []
         for channel in range(self.channels):
-            squares = self._pictures(patterns, channel) ** 2
-            sums = self.hats.sums_from(0, squares, power=2)
-            shares = self._at_pixels(sums, [stage.variance[channel] for stage in self.stages])
+            variances = [stage.variance[channel] for stage in self.stages]
             light = self.light[:, channel] ** 2
-            expected = (light[:, None] * shares).sum()
+            expected = 0.0
+            # One by one: the sums of all would take a quarter of the memory of the rows.
+            for frame in range(len(patterns)):
+                squares = self._pictures(patterns[frame : frame + 1], channel) ** 2
+                sums = self.hats.sums_from(0, squares, power=2)
+                expected += float(light @ self._at_pixels(sums, variances)[:, 0])
             noise = len(patterns) * (self.stages[-1].noise * light).sum()
             measured = max(residual_squares[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
