@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Products of three colours with matrices between hat functions, all in one pass:
 //
-//   out = a A x + b y + c x,    A = N diag(outer) (W^T K W + diag(own)) diag(inner) M
+//   out = a A x + b y + c x,    A = diag(outer) (W^T K W + diag(own)) diag(inner)
 //
-// W are the sums under the hats of all levels (hats.cl), K the coefficients of nodes, a matrix a
-// colour, M and N mix the colours of a pixel. The three values of a node lie side by side in four
+// or A M diag(columns), or diag(columns) M A. W are the sums under the hats of all levels (hats.cl),
+// K the coefficients of nodes, a matrix a colour; M mixes the colours of a pixel. The three values of a node lie side by side in four
 // reals, the last of which is 0, so that an entry of K is one wide product for all colours.
 //
-//   colour_hats_scale   nodes of level 0: diag(inner) M x
+//   colour_hats_scale   nodes of level 0: diag(inner) x, with x mixed where that comes first
 //   colour_hats_rows    K times the nodes, for the rows of all coarser levels
 //   colour_hats_finish  K times the nodes, for the rows of pixels, with the light between the nodes
 //                       of level 1 and all else
@@ -15,10 +15,10 @@
 // hats.cl makes the levels between. A work-item takes a row of K, or some neighbouring pixels.
 //
 // Optional defines: NARROW, 1 where entries of rows of pixels are narrow; SCALED, 1 if `inner`
-// or `outer` counts, else it is not read; OWN, the same for `own`; MIXED, 1 for M, 2 for N, else 0;
-// BLOCK, pixels of an item, 1 by default.
+// or `outer` counts, else it is not read; OWN and COLUMNS, the same for these; MIXED, 1 where
+// colours of x are mixed, 2 where those of the result are; BLOCK, pixels of an item, 1 by default.
 //
-// Layout: x, y, out, inner and outer are planes, (3, pixels); nodes and light are (nodes, 4).
+// Layout: x, y, out, inner, outer, columns are planes, (3, pixels); nodes and light are (nodes, 4).
 //   pointers  [rows + 1], where the entries of each row begin
 //   entries   four numbers each: those of the colours and a column. Wide ones are the bits of three
 //             reals, and a node. Narrow ones are the upper halves of the bits of three reals, and
@@ -39,7 +39,9 @@
 #ifndef MIXED
 #define MIXED 0
 #endif
-
+#ifndef COLUMNS
+#define COLUMNS 0
+#endif
 #ifndef BLOCK
 #define BLOCK 1
 #endif
@@ -48,25 +50,35 @@
 // Without the fourth number of an entry, which is no light.
 #define COLOURS_OF(v) as_float4((v) & (uint4)(~0u, ~0u, ~0u, 0u))
 
+#if COLUMNS
+#define COLUMN(i) (columns[i])
+#else
+#define COLUMN(i) 1
+#endif
+
 // A plane of the light of some pixels, in private memory: loops over one thing each, so that a CPU
 // takes wide registers.
 #define EACH_PIXEL(p) for (int p = 0; p < count; ++p)
 
 kernel void colour_hats_scale(
-    int pixels,                // of a plane
-    constant real *mixing,     // M, (3, 3); not read without it
-    global const real *inner,  // factors
-    global const real *x,      // operand
-    global real4 *nodes)       // of which the first are those of pixels
+    int pixels,                  // of a plane
+    constant real *mixing,       // M, (3, 3); not read without it
+    global const real *columns,  // factors
+    global const real *inner,    // factors
+    global const real *x,        // operand
+    global real4 *nodes)         // of which the first are those of pixels
 {
     const int first = (int)get_global_id(0) * BLOCK, count = min(BLOCK, pixels - first);
     real light[COLOURS * BLOCK];
     for (int c = 0; c < COLOURS; ++c)
         EACH_PIXEL(p) {
 #if MIXED == 1
-            constant real *row = mixing + COLOURS * c;
-            global const real *at = x + first + p;
-            light[c * BLOCK + p] = row[0] * at[0] + row[1] * at[pixels] + row[2] * at[2 * pixels];
+            real sum = 0;
+            for (int d = 0; d < COLOURS; ++d) {
+                const int i = first + p + d * pixels;
+                sum += mixing[COLOURS * c + d] * (COLUMN(i) * x[i]);
+            }
+            light[c * BLOCK + p] = sum;
 #else
             light[c * BLOCK + p] = x[first + p + c * pixels];
 #endif
@@ -153,7 +165,8 @@ kernel void colour_hats_finish(
     global const real4 *sums,   // of hats_spread, in which level 1 stands behind a spare one
     global const real *outer,   // factors
     global const real4 *own,    // factors of nodes of level 0, (pixels, 4)
-    constant real *mixing,      // N, (3, 3); not read without it
+    constant real *mixing,      // M, (3, 3); not read without it
+    global const real *columns, // factors
     real a,                     // factor of A x
     real b,                     // factor of y
     real c,                     // factor of x
@@ -192,9 +205,10 @@ kernel void colour_hats_finish(
     for (int d = 0; d < COLOURS; ++d)
         EACH_PIXEL(p) {
 #if MIXED == 2
-            constant real *mixed = mixing + COLOURS * d;
-            const real value = mixed[0] * values[p] + mixed[1] * values[BLOCK + p]
-                               + mixed[2] * values[2 * BLOCK + p];
+            real sum = 0;
+            for (int e = 0; e < COLOURS; ++e)
+                sum += mixing[COLOURS * d + e] * values[e * BLOCK + p];
+            const real value = COLUMN(first + p + d * pixels) * sum;
 #else
             const real value = values[d * BLOCK + p];
 #endif

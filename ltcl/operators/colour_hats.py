@@ -5,18 +5,22 @@ Each colour of a sketch is T = I + diag(w) W^T K W with the sums W under hats; i
 S = T F^-1 is one more diagonal away. The K of the three colours have their entries mostly in the
 same places, so a product of all takes each place once, with three numbers beside each other:
 
-    A = diag(outer) (W^T K W + diag(own)) diag(inner) M,    (3 N, 3 N), colour below colour
+    A = diag(outer) (W^T K W + diag(own)) diag(inner),    (3 N, 3 N), colour below colour,
 
-`own` holds the diagonals of K at pixels, which are direct light and keep all of their digits. M
-mixes the colours of a pixel. An entry in the row of a pixel takes 8 bytes where all numbers have 8
-significant bits, as those of a scan do, and nodes are near; else 16 (`kernels/colour_hats.cl`).
+or A M diag(columns), where M mixes the colours of a pixel. `own` holds the diagonals of K at
+pixels, which are direct light and keep all of their digits. An entry in the row of a pixel takes 8
+bytes where all numbers have 8 significant bits, as those of a scan do, and nodes are near; else 16
+(`kernels/colour_hats.cl`).
 """
 
 from __future__ import annotations
 
 import operator
+import os
+import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +49,8 @@ MAX_DISTANCE = 1 << 14
 LOWER_BITS = np.uint32(0xFFFF)
 # Where bits begin that say that there is an entry, above those of three halves.
 PRESENCE = 48
+# Rows that are joined at once.
+ROWS_AT_ONCE = 1 << 15
 ALL_HALVES = (1 << PRESENCE) - 1
 ALL_BITS = (1 << 32) - 1
 # Values of the define MIXED: colours of the operand are mixed, or those of the result.
@@ -78,20 +84,26 @@ class JointEntries:
 
     @classmethod
     def of(cls, cores: Sequence[Any], pixels: int) -> JointEntries:
-        """The entries of K (nodes, nodes) of each colour, float32."""
-        bits = [K.data.view(np.uint32) for K in cores]
-        if all(map(_has_few_bits, cores, bits, [pixels] * COLOURS)):
-            indptr, indices, numbers = _join_halves(cores, bits)
-        else:
-            indptr, indices, numbers = _join_reals(cores, bits)
-        is_kept = np.ones(len(indices), bool)
-        is_kept[: indptr[pixels]] = ~_are_own(indptr, indices, pixels)
-        kept_before = np.concatenate([[0], np.cumsum(is_kept)])
+        """The entries of K (nodes, nodes) of each colour, float32 in ascending columns."""
+        nodes = cores[0].shape[0]
+        join = _join_halves
+        if not all(map(_has_few_bits, cores, [pixels] * COLOURS)):
+            join = _join_reals
+
+        def join_rows(rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            indptr, indices, numbers = join([_rows_of_core(K, rows) for K in cores])
+            row = np.repeat(np.arange(rows.start, rows.stop), np.diff(indptr))
+            is_kept = (row >= pixels) | (indices != row)
+            before = np.concatenate([[0], np.cumsum(is_kept)])
+            return np.diff(before[indptr]), indices[is_kept], numbers[is_kept]
+
+        blocks = _in_threads(join_rows, nodes)
+        counts, indices, numbers = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         return cls(
             pixels=pixels,
-            indptr=kept_before[indptr],
-            indices=indices[is_kept],
-            numbers=numbers[is_kept],
+            indptr=np.concatenate([[0], np.cumsum(counts)]),
+            indices=indices,
+            numbers=numbers,
         )
 
     @property
@@ -113,25 +125,38 @@ class JointEntries:
         )
 
 
-def _are_own(indptr: np.ndarray, indices: np.ndarray, pixels: int) -> np.ndarray:
-    """True for the diagonal among the entries of the rows of pixels."""
-    rows = np.repeat(np.arange(pixels, dtype=indices.dtype), np.diff(indptr[: pixels + 1]))
-    return indices[: len(rows)] == rows
+def _in_threads(work: Callable[[slice], Any], rows: int) -> list[Any]:
+    """The results for blocks of rows, which fit the caches, in order."""
+    blocks = [slice(i, min(i + ROWS_AT_ONCE, rows)) for i in range(0, rows, ROWS_AT_ONCE)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, blocks))
 
 
-def _has_few_bits(K: Any, bits: np.ndarray, pixels: int) -> bool:
+def _rows_of_core(K: Any, rows: slice) -> Any:
+    """Some rows of a csr_array, whose numbers are not copied."""
+    indptr = K.indptr[rows.start : rows.stop + 1]
+    entries = slice(indptr[0], indptr[-1])
+    parts = (K.data[entries], K.indices[entries], indptr - indptr[0])
+    return scipy.sparse.csr_array(parts, shape=(rows.stop - rows.start, K.shape[1]))
+
+
+def _has_few_bits(K: Any, pixels: int) -> bool:
     """True if all but the diagonal at pixels have 8 significant bits."""
-    has_more = (bits & LOWER_BITS) != 0
-    is_own = _are_own(K.indptr, K.indices, pixels)
-    has_more[: len(is_own)] &= ~is_own
-    return not has_more.any()
+
+    def have(rows: slice) -> bool:
+        block = _rows_of_core(K, rows)
+        row = np.repeat(np.arange(rows.start, rows.stop), np.diff(block.indptr))
+        is_own = (row < pixels) & (block.indices == row)
+        return not np.any((block.data.view(np.uint32) & LOWER_BITS != 0) & ~is_own)
+
+    return all(_in_threads(have, K.shape[0]))
 
 
-def _join_halves(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def _join_halves(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
     """Pointers, columns and upper halves of the bits of three matrices in all their places."""
     total: Any = 0
-    for colour, (K, of_colour) in enumerate(zip(cores, bits, strict=True)):
-        numbers = (of_colour >> np.uint32(16)).astype(np.int64)
+    for colour, K in enumerate(cores):
+        numbers = (K.data.view(np.uint32) >> np.uint32(16)).astype(np.int64)
         numbers <<= 16 * colour
         # Zeros would not count as entries.
         numbers |= 1 << (PRESENCE + colour)
@@ -139,15 +164,15 @@ def _join_halves(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.n
     return total.indptr, total.indices, (total.data & ALL_HALVES).view(np.uint64)
 
 
-def _join_reals(cores: Sequence[Any], bits: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def _join_reals(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
     """Pointers, columns and bits of three matrices in all their places."""
     places: Any = 0
     for K in cores:
         ones = np.full(len(K.data), 1 << PRESENCE)
         places = places + scipy.sparse.csr_array((ones, K.indices, K.indptr), shape=K.shape)
     joint = np.empty((len(places.data), COLOURS), np.uint32)
-    for colour, (K, of_colour) in enumerate(zip(cores, bits, strict=True)):
-        numbers = of_colour.astype(np.int64)
+    for colour, K in enumerate(cores):
+        numbers = K.data.view(np.uint32).astype(np.int64)
         total = places + scipy.sparse.csr_array((numbers, K.indices, K.indptr), shape=K.shape)
         joint[:, colour] = total.data & ALL_BITS
     return places.indptr, places.indices, joint
@@ -204,23 +229,30 @@ def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | No
     if not entries.are_halves:
         return None
     pixels = entries.pixels
-    indptr = entries.indptr[: pixels + 1]
-    count = indptr[-1]
-    columns = entries.indices[:count].astype(np.int32, copy=False)
-    is_far = columns >= pixels
-    # Columns ascend: those that are far are the last of a row.
-    far_before = np.concatenate([[0], np.cumsum(is_far)])
-    far_count = np.diff(far_before[indptr])
-    has_far = far_count > 0
     bases = np.zeros(pixels, np.int32)
-    bases[has_far] = columns[(indptr[1:] - far_count)[has_far]]
-    counts = np.diff(indptr)
-    own = np.repeat(np.arange(pixels, dtype=np.int32), counts)
-    distance = columns - np.where(is_far, np.repeat(bases, counts), own)
-    if np.any(distance < -MAX_DISTANCE) or np.any(distance >= MAX_DISTANCE):
+    narrow = np.empty(entries.indptr[pixels], np.uint64)
+
+    def narrow_rows(rows: slice) -> bool:
+        """Write the bases and entries of some rows; returns whether all nodes are near."""
+        indptr = entries.indptr[rows.start : rows.stop + 1]
+        own = slice(indptr[0], indptr[-1])
+        indptr = indptr - indptr[0]
+        columns = entries.indices[own]
+        is_far = columns >= pixels
+        # Columns ascend: those that are far are the last of a row.
+        far_before = np.concatenate([[0], np.cumsum(is_far)])
+        far_count = np.diff(far_before[indptr])
+        has_far = far_count > 0
+        bases[rows][has_far] = columns[(indptr[1:] - far_count)[has_far]]
+        counts = np.diff(indptr)
+        near_bases = np.repeat(np.arange(rows.start, rows.stop), counts)
+        distance = columns - np.where(is_far, np.repeat(bases[rows], counts), near_bases)
+        code = (2 * distance + is_far) & 0xFFFF
+        narrow[own] = entries.numbers[own] | code.astype(np.uint64) << np.uint64(PRESENCE)
+        return not np.any((distance < -MAX_DISTANCE) | (distance >= MAX_DISTANCE))
+
+    if not all(_in_threads(narrow_rows, pixels)):
         return None
-    narrow = entries.numbers[:count].copy()
-    narrow |= ((2 * distance + is_far) & 0xFFFF).astype(np.uint64) << np.uint64(PRESENCE)
     return bases, narrow.view(np.uint16).reshape(-1, COLOURS + 1)
 
 
@@ -238,15 +270,20 @@ class ColourRows:
         self.W = W
         pixels = W.shape[1]
         self.own = np.stack([K.diagonal()[:pixels].astype(np.float64) for K in cores])
-        self._entries = JointEntries.of(cores, pixels)
+        self._lock = threading.Lock()
+        # Until they are transposed.
+        self._entries: JointEntries | None = JointEntries.of(cores, pixels)
         self.forward = DeviceRows(W.device, self._entries)
         self._transposed: DeviceRows | None = None
 
     def transposed(self) -> DeviceRows:
         """The rows of the K^T."""
-        if self._transposed is None:
-            self._transposed = DeviceRows(self.W.device, self._entries.transposed())
-        return self._transposed
+        with self._lock:
+            if self._transposed is None:
+                assert self._entries is not None  # noqa: S101 - they are transposed once
+                self._transposed = DeviceRows(self.W.device, self._entries.transposed())
+                self._entries = None
+            return self._transposed
 
     def arrays(self) -> set[Array]:
         """All arrays on the device."""
@@ -256,34 +293,85 @@ class ColourRows:
         return arrays
 
 
-class ColourHats(Operator):
-    """A = diag(outer) (W^T K W + diag(own)) diag(inner) M of three colours, (3 N, 3 N).
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Factors:
+    """The diagonals and the mixing of `ColourHats` on the device; None for ones, or zeros of `own`.
 
-    Parameters
-    ----------
-    rows : ColourRows
-    inner, outer, own : (3, N)
-    mixing : (3, 3) or None
-        M.
-    each : Operator
-        The same operator, colour by colour, which takes several right-hand sides.
+    `inner`, `outer` and `columns` are (3, N) or (3 N,), `own` is (N, 4), `mixing` is M and
+    `transposed_mixing` M^T, (3, 3).
     """
 
-    def __init__(
-        self,
-        rows: ColourRows,
+    inner: Array | None
+    outer: Array
+    own: Array | None
+    columns: Array | None = None
+    has_mixing: bool
+    mixing: Array
+    transposed_mixing: Array
+
+    @classmethod
+    def upload(
+        cls,
+        device: Device,
         inner: np.ndarray,
         outer: np.ndarray,
         own: np.ndarray,
         mixing: np.ndarray | None,
-        each: Operator,
-    ) -> None:
+    ) -> Factors:
+        """The factors (3, N) of a product, and M if colours are mixed."""
+        own_of_nodes = None
+        if own.any():
+            padded = np.zeros((own.shape[1], NODE_VALUES), np.float32)
+            padded[:, :COLOURS] = own.T
+            own_of_nodes = device.upload(padded)
+        M = np.eye(COLOURS) if mixing is None else mixing
+        return cls(
+            inner=None if np.all(inner == 1.0) else device.upload(inner),
+            outer=device.upload(outer),
+            own=own_of_nodes,
+            has_mixing=mixing is not None,
+            mixing=device.upload(M),
+            transposed_mixing=device.upload(M.T),
+        )
+
+    @property
+    def arrays(self) -> list[Array | None]:
+        """All arrays of many numbers."""
+        return [self.inner, self.outer, self.own, self.columns]
+
+    def mixing_defines(self, transpose: bool) -> dict[str, int]:
+        """Defines of the kernels that say how colours are mixed."""
+        if not self.has_mixing:
+            return {}
+        place = MIXED_RESULT if transpose else MIXED_OPERAND
+        return {"MIXED": place, "COLUMNS": int(self.columns is not None)}
+
+    def mixing_arguments(self, transpose: bool, unread: Array) -> dict[str, Array]:
+        """Arguments of the kernels for that."""
+        return {
+            "mixing": self.transposed_mixing if transpose else self.mixing,
+            "columns": unread if self.columns is None else self.columns,
+        }
+
+
+class ColourHats(Operator):
+    """diag(outer) (W^T K W + diag(own)) diag(inner) M diag(columns) of three colours, (3 N, 3 N).
+
+    Parameters
+    ----------
+    rows : ColourRows
+    factors : Factors
+    each : Operator
+        The same operator, colour by colour, which takes several right-hand sides.
+    """
+
+    def __init__(self, rows: ColourRows, factors: Factors, each: Operator) -> None:
         device = rows.W.device
         self.rows = rows
         self.each = each
         self._block = CPU_BLOCK if device.is_cpu else 1
         self._group = 1 if device.is_cpu else GROUP
-        self._factors = _Factors(device, inner, outer, own, mixing)
+        self._factors = factors
         super().__init__(device, each.shape, *self._factors.arrays, each)
         self.error = each.error
 
@@ -294,6 +382,13 @@ class ColourHats(Operator):
     def diagonal(self) -> np.ndarray:
         """The diagonals of the colours, one behind the other."""
         return self.each.diagonal()
+
+    def with_columns(self, d: np.ndarray) -> ColourHats | None:
+        """A diag(d), d (3 N,), which reads it along; None unless colours are mixed."""
+        if not self._factors.has_mixing or self._factors.columns is not None:
+            return None
+        factors = replace(self._factors, columns=self.device.upload(d))
+        return ColourHats(self.rows, factors, ScaledColumns(self.each, d))
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()
@@ -319,17 +414,17 @@ class ColourHats(Operator):
             "colour_hats",
             "colour_hats_scale",
             SCALED=int(inner is not None),
-            MIXED=factors.mixed(transpose),
             BLOCK=self._block,
+            **factors.mixing_defines(transpose),
         )
         return kernel.bind(
             -(-rows.pixels // self._block),
             self._group,
             pixels=rows.pixels,
-            mixing=factors.mixing(transpose),
             inner=x if inner is None else inner,
             x=x,
             nodes=nodes,
+            **factors.mixing_arguments(transpose, x),
         )
 
     def _bind_levels(self, rows: DeviceRows, nodes: Array, sums: Array) -> list[Queued]:
@@ -374,8 +469,8 @@ class ColourHats(Operator):
             NARROW=int(rows.is_narrow),
             SCALED=int(outer is not None),
             OWN=int(factors.own is not None),
-            MIXED=factors.mixed(transpose),
             BLOCK=self._block,
+            **factors.mixing_defines(transpose),
         )
         return kernel.bind(
             (-(-width // self._block), height),
@@ -390,53 +485,14 @@ class ColourHats(Operator):
             sums=sums,
             outer=x if outer is None else outer,
             own=x if factors.own is None else factors.own,
-            mixing=factors.mixing(transpose),
             a=epilogue.a,
             b=epilogue.b,
             c=epilogue.c,
             x=x,
             y=epilogue.operand(out),
             out=out,
+            **factors.mixing_arguments(transpose, x),
         )
-
-
-class _Factors:
-    """The diagonals and the mixing on the device; None for ones of `inner`, zeros of `own`."""
-
-    def __init__(
-        self,
-        device: Device,
-        inner: np.ndarray,
-        outer: np.ndarray,
-        own: np.ndarray,
-        mixing: np.ndarray | None,
-    ) -> None:
-        self.inner = None if np.all(inner == 1.0) else device.upload(inner)
-        self.outer = device.upload(outer)
-        self.own = None
-        if own.any():
-            padded = np.zeros((own.shape[1], NODE_VALUES), np.float32)
-            padded[:, :COLOURS] = own.T
-            self.own = device.upload(padded)
-        self._has_mixing = mixing is not None
-        M = np.eye(COLOURS) if mixing is None else mixing
-        self._mixing = device.upload(M)
-        self._transposed_mixing = device.upload(M.T)
-
-    @property
-    def arrays(self) -> list[Array | None]:
-        """All arrays of many numbers."""
-        return [self.inner, self.outer, self.own]
-
-    def mixing(self, transpose: bool) -> Array:
-        """M or M^T, (3, 3)."""
-        return self._transposed_mixing if transpose else self._mixing
-
-    def mixed(self, transpose: bool) -> int:
-        """The define MIXED of the kernels."""
-        if not self._has_mixing:
-            return 0
-        return MIXED_RESULT if transpose else MIXED_OPERAND
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -478,7 +534,8 @@ def join_colours(
     own = rows.own + (1.0 - np.divide(shift, inner, out=np.zeros_like(inner), where=is_lit)) / outer
     # Where F is direct light nothing is left of it but rounding.
     own[np.abs(own) * outer <= ROUNDING * np.abs(shift)] = 0.0
-    return ColourHats(rows, inner, outer, own, mixing, each)
+    factors = Factors.upload(rows.W.device, inner, outer, own, mixing)
+    return ColourHats(rows, factors, each)
 
 
 def _colour_of(block: Operator) -> _Colour | None:
@@ -547,3 +604,11 @@ def mixed_colours(operators: Sequence[Operator], mixing: np.ndarray) -> Operator
     coupled = Coupled.mixed(operators, mixing)
     joined = join_colours(operators, coupled, mixing)
     return coupled if joined is None else joined
+
+
+def scale_columns(A: Operator, d: np.ndarray) -> Operator:
+    """A diag(d), which colours of a sketch take along."""
+    scaled = None
+    if isinstance(A, ColourHats):
+        scaled = A.with_columns(d)
+    return ScaledColumns(A, d) if scaled is None else scaled

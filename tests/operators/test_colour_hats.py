@@ -17,8 +17,14 @@ from ltcl.operators import (
     ScaledColumns,
     block_diagonal,
     colour_hats,
+    stored,
 )
-from ltcl.operators.colour_hats import ColourHats, mixed_colours, share_entries
+from ltcl.operators.colour_hats import (
+    ColourHats,
+    mixed_colours,
+    scale_columns,
+    share_entries,
+)
 from tests import reference
 from tests.operators import helpers
 
@@ -101,6 +107,13 @@ def test_colours_of_a_pixel_are_mixed(shaped, grid):
     matrix = colours.matrix(mixing=MIXING)
     helpers.meets_twin(mixed, matrix)
     helpers.meets_twin(mixed, matrix, transpose=True)
+    d = np.random.default_rng(6).uniform(0.0, 2.0, len(matrix))
+    scaled = scale_columns(mixed, d)
+    assert isinstance(scaled, ColourHats)
+    helpers.meets_twin(scaled, matrix * d)
+    helpers.meets_twin(scaled, matrix * d, transpose=True)
+    twice = scale_columns(scaled, d)
+    helpers.meets_twin(twice, matrix * d**2)
 
 
 def test_nodes_that_are_too_far_take_wide_entries(device, monkeypatch):
@@ -137,6 +150,25 @@ def test_entries_are_shared(device):
     assert isinstance(S, IdentityPlus)
     assert isinstance(S.R, ColourHats)
     assert T.rows is S.R.rows
+
+
+def test_matrices_of_a_colour_are_uploaded_at_their_first_product(device):
+    """A T from arrays has the entries of all colours alone, until one is multiplied alone."""
+    colours = Colours(device, (13, 7))
+    blocks = colours.blocks()
+    systems = [block.A for block in blocks if isinstance(block.A, IdentityPlus)]
+    arrays = stored.to_arrays(systems)
+    read = stored.from_arrays(device, arrays)
+    cores = [S.R.core for S in read if isinstance(S.R, Compressed)]
+    of_colours = [ScaledColumns(S, d) for S, d in zip(read, colours.inner, strict=True)]
+    x = np.random.default_rng(7).random(3 * colours.pixels)
+    expected = colours.matrix() @ x
+    joined = block_diagonal(of_colours)
+    np.testing.assert_allclose(helpers.product(joined, x), expected, rtol=1e-5, atol=1e-5)
+    assert not any(core.arrays() for core in cores)
+    for A, part, seen in zip(of_colours, np.split(x, 3), np.split(expected, 3), strict=True):
+        np.testing.assert_allclose(helpers.product(A, part), seen, rtol=1e-5, atol=1e-5)
+    assert all(core.arrays() for core in cores)
 
 
 def test_others_stay_as_they_are(device):

@@ -19,7 +19,8 @@ import numpy as np
 
 from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
-from ltcl.operators import Operator, ScaledColumns
+from ltcl.operators import Operator
+from ltcl.operators.colour_hats import scale_columns
 from ltcl.operators.diagonal_blocks import are_quicker_joined, joined_once
 from ltcl.solvers import SolveSettings
 from ltcl.solvers.bounded import Bounded, BoxProblem, minimise_each
@@ -310,5 +311,5 @@ def channel_systems(T: Transport) -> tuple[ChannelSystem, ...]:
     else:
         norms = T.column_norms
     inverses = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)
-    operators = map(ScaledColumns, T.operators, inverses)
+    operators = map(scale_columns, T.operators, inverses)
     return tuple(map(ChannelSystem, operators, norms))
