@@ -86,11 +86,11 @@ def load_setup(transport: Path, calibration: Path | None = None) -> Any:
     if calibration is None and not is_measured(transport):
         return None
     # The import takes a second.
-    from ltcl.acquisition import Setup
+    from ltcl.acquisition import CombinedSetup, Setup
 
-    if calibration is None:
-        return Setup.of(transport)
-    return Setup.of(calibration)
+    scan = transport if calibration is None else calibration
+    setup = CombinedSetup.of_scan(scan)
+    return Setup.of(scan) if setup is None else setup
 
 
 def setup_of_several(T: Transport) -> Any:

@@ -133,6 +133,16 @@ class Warp:
         shown[self.places < 0] = 0
         return shown
 
+    def reduced(self, picture: np.ndarray) -> np.ndarray:
+        """Means of a picture (h, w[, 3]) of the projector over each pixel of T; 0 without any."""
+        is_shown = self.places >= 0
+        shape = (self.grid[0] * self.grid[1], *picture.shape[2:])
+        total = np.zeros(shape, np.float64)
+        np.add.at(total, self.places[is_shown], picture[is_shown])
+        counts = np.bincount(self.places[is_shown], minlength=shape[0])
+        means = total.T / np.maximum(counts, 1)
+        return means.T.reshape(*self.grid, *shape[1:]).astype(np.float32)
+
 
 def _largest_distance(mapping: Correspondence) -> float:
     """Distance in projector pixels from which on a place is not seen by a camera pixel."""

@@ -24,7 +24,7 @@ from ltcl.acquisition.calibration import stored_map
 from ltcl.acquisition.captures.map_file import read_map
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.projectors import camera_geometry
-from ltcl.acquisition.projectors.combined import facts_path, read_facts
+from ltcl.acquisition.projectors.combined import facts_path, has_facts, read_facts
 from ltcl.acquisition.projectors.warp import MIN_SIDE
 from ltcl.acquisition.radiance import planes
 from ltcl.acquisition.several import scanned_stores
@@ -116,7 +116,7 @@ def _check_once(places: Sequence[Path]) -> None:
 
 def _name(place: Path, number: int, taken: Sequence[str]) -> str:
     """The projector's name in its project, where it has one that is not taken."""
-    if not facts_path(place).exists():
+    if not has_facts(place):
         return f"projector_{number}"
     name = read_facts(place).name
     unused = name
@@ -145,7 +145,7 @@ def _read_scan(path: Path, name: str) -> ExportedScan:
     calibration = Calibration.of(opened)
     mapping = stored_map(opened)
     resampling = calibration.resampling
-    if facts_path(path).exists():
+    if has_facts(path):
         mapping = _own_map(path, mapping)
         resampling = Resampling.of(mapping).ascertained_by(planes(calibration.white, "value"))
     elif _has_squares(mapping, _slope(mapping)):

@@ -44,6 +44,7 @@ from ltcl.transport.projectors.sharing import (
     ProjectorShare,
     drive_divisors,
     find_ramps,
+    inner_pixels,
     share_out,
 )
 from ltcl.transport.transport import Transport, check_transport
@@ -280,6 +281,12 @@ class CombinedTransport(Transport):
         """False: S is that of `scene`."""
         return False
 
+    def _require_first_bounce(self) -> np.ndarray:
+        raise InputError(
+            "T is of several projectors, whose S is that of T.scene, between the camera's pixels: "
+            "compensate, relight, separate, analyze and invert take T, others T.scene or one scan"
+        )
+
     @cached_property
     def unlit(self) -> np.ndarray:
         """Camera pixels (M,) without direct light of any projector."""
@@ -368,8 +375,9 @@ class CombinedTransport(Transport):
     def gamut(self) -> Gamut:
         """The colours that all projectors have in common, and how far these differ."""
         whites = []
-        for share in self.shares:
-            white = [share.white(channel) for channel in range(self.channels)]
+        are_inside = inner_pixels(self.shares, self.camera_grid)
+        for share, is_inside in zip(self.shares, are_inside, strict=True):
+            white = [share.white(channel)[is_inside] for channel in range(self.channels)]
             whites.append(np.stack(white))
         return common_gamut(whites, self.mixings)
 
