@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,8 +79,8 @@ def combine(
         camera_grid=T.camera_grid,
         channels=T.channels,
         fed=[list(grid) for grid in _fed_grids(T)],
-        contrast=None if T.contrast is None else T.contrast.measured,
-        contrast_uniform=None if T.contrast is None else T.contrast.uniform,
+        contrast=_finite(T.contrast and T.contrast.measured),
+        contrast_uniform=_finite(T.contrast and T.contrast.uniform),
         differences=T.gamut.differences.tolist(),
     )
     return Answer(report, _combine_lines(out, T))
@@ -145,6 +146,13 @@ def _fed_grids(T: Any) -> list[tuple[int, int]]:
     if setup is None:
         return []
     return [projector.warp.pixels for projector in setup.projectors]
+
+
+def _finite(contrast: float | None) -> float | None:
+    """A contrast as JSON has it: None where it is unknown, or without any black."""
+    if contrast is None or not math.isfinite(contrast):
+        return None
+    return contrast
 
 
 def _combine_lines(out: Path, T: Any) -> list[str]:

@@ -224,6 +224,13 @@ def test_rims_are_not_the_light_of_a_projector(device, S):
     )
 
 
+def test_without_black_the_contrast_is_infinite(members):
+    contrast = ltcl.combine(members, blacks=[np.zeros(CAMERA)] * 2).contrast
+    assert contrast is not None
+    assert np.isinf(contrast.measured)
+    assert str(contrast).startswith("contrast inf")
+
+
 def test_scene_between_camera_pixels(T, S):
     plain = np.abs(np.arange(CAMERA[1]) - CAMERA[1] / 2 + 0.5) > 3
     direct = np.ones(np.prod(CAMERA))
