@@ -3,9 +3,10 @@
 //
 //   out = a A x + b y + c x,    A = diag(outer) (W^T K W + diag(own)) diag(inner)
 //
-// or A M diag(columns), or diag(columns) M A. W are the sums under the hats of all levels (hats.cl),
-// K the coefficients of nodes, a matrix a colour; M mixes the colours of a pixel. The three values of a node lie side by side in four
-// reals, the last of which is 0, so that an entry of K is one wide product for all colours.
+// or A M diag(columns), or diag(columns) M A. W are the sums under the hats of all levels
+// (hats.cl), K the coefficients of nodes, a matrix a colour; M mixes the colours of a pixel. The
+// three values of a node lie side by side in four reals, the last of which is 0, so that an entry
+// of K is one wide product for all colours.
 //
 //   colour_hats_scale   nodes of level 0: diag(inner) x, with x mixed where that comes first
 //   colour_hats_rows    K times the nodes, for the rows of all coarser levels
@@ -161,18 +162,18 @@ kernel void colour_hats_finish(
 #else
     global const uint4 *entries,  // wide
 #endif
-    global const real4 *nodes,  // sums under all hats
-    global const real4 *sums,   // of hats_spread, in which level 1 stands behind a spare one
-    global const real *outer,   // factors
-    global const real4 *own,    // factors of nodes of level 0, (pixels, 4)
-    constant real *mixing,      // M, (3, 3); not read without it
-    global const real *columns, // factors
-    real a,                     // factor of A x
-    real b,                     // factor of y
-    real c,                     // factor of x
-    global const real *x,       // operand
-    global const real *y,       // what is added; not read where b is 0
-    global real *out)           // may be y
+    global const real4 *nodes,   // sums under all hats
+    global const real4 *sums,    // of hats_spread, in which level 1 stands behind a spare one
+    global const real *outer,    // factors
+    global const real4 *own,     // factors of nodes of level 0, (pixels, 4)
+    constant real *mixing,       // M, (3, 3); not read without it
+    global const real *columns,  // factors
+    real a,                      // factor of A x
+    real b,                      // factor of y
+    real c,                      // factor of x
+    global const real *x,        // operand
+    global const real *y,        // what is added; not read where b is 0
+    global real *out)            // may be y
 {
     const int column = (int)get_global_id(0) * BLOCK, row = get_global_id(1);
     if (row >= height)
@@ -181,14 +182,14 @@ kernel void colour_hats_finish(
     const int pixels = height * width;
     real values[COLOURS * BLOCK];
     EACH_PIXEL(p) {
-        const int pixel = first + p;
+        const int pixel = first + p, begin = pointers[pixel], end = pointers[pixel + 1];
         real4 sum = 0;
         if (levels > 1)
             sum = light_between(row, column + p, width / 2 + 1, sums + pixels + 1);
 #if NARROW
-        sum += narrow_sum(entries, nodes, pixel, bases[pixel], pointers[pixel], pointers[pixel + 1]);
+        sum += narrow_sum(entries, nodes, pixel, bases[pixel], begin, end);
 #else
-        sum += wide_sum(entries, nodes, pointers[pixel], pointers[pixel + 1]);
+        sum += wide_sum(entries, nodes, begin, end);
 #endif
 #if OWN
         sum += own[pixel] * nodes[pixel];

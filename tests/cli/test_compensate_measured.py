@@ -163,3 +163,14 @@ def test_one_of_several_projectors_is_fed_on_its_own_pixels(
     pattern = images.read(tmp_path / "out" / "even_pattern.exr")
     expected = ltcl.load(transport, on_dark="mask") @ pattern
     np.testing.assert_allclose(relit, expected, atol=0.01 * expected.max())
+
+
+def test_a_store_without_the_files_beside_it_is_told(
+    program, room_of_two: Path, tmp_path: Path
+) -> None:
+    """Then its codes are on squares of camera pixels, which no projector has."""
+    (tmp_path / "left.zarr").symlink_to(room_of_two / "left.zarr")
+    picture = write(tmp_path / "even.exr", np.full((6, 12), 0.5, np.float32))
+    told = program("compensate", tmp_path / "left.zarr", picture, "--out", tmp_path / "out").err
+    assert "has squares of camera pixels" in told
+    assert "left.projector.json" in told

@@ -206,6 +206,31 @@ def test_common_gamut(device, S):
     assert "projector 2" in str(gamut)
 
 
+def test_rims_are_not_the_light_of_a_projector(device, S):
+    """Each lights the pixels at its rim in part, which are more than one in twenty."""
+    scene = ltcl.Transport(S.astype(np.float32), CAMERA, device=device)
+    gains = [1.0, 1.4, 0.8]
+    members = []
+    for gain, left, right in zip(gains, (-0.1, 0.28, 0.62), (0.43, 0.77, 1.1), strict=True):
+        projector = projectors.Projector(grid=(10, 9), left=left, right=right, gain=gain)
+        direct = scipy.sparse.csr_array(projector.direct().astype(np.float32))
+        members.append(ltcl.Transport(direct, (10, 9), camera_grid=CAMERA, device=device))
+    gamut = ltcl.combine(members, scene=scene).gamut
+    white = projectors.ALBEDO * np.array(gains)
+    np.testing.assert_allclose(gamut.projectors.ravel(), white, rtol=0.02)
+    np.testing.assert_allclose(gamut.white, white.min(), rtol=0.02)
+    np.testing.assert_allclose(
+        gamut.differences, np.abs(white - white.mean()) / white.mean(), atol=0.02
+    )
+
+
+def test_without_black_the_contrast_is_infinite(members):
+    contrast = ltcl.combine(members, blacks=[np.zeros(CAMERA)] * 2).contrast
+    assert contrast is not None
+    assert np.isinf(contrast.measured)
+    assert str(contrast).startswith("contrast inf")
+
+
 def test_scene_between_camera_pixels(T, S):
     plain = np.abs(np.arange(CAMERA[1]) - CAMERA[1] / 2 + 0.5) > 3
     direct = np.ones(np.prod(CAMERA))

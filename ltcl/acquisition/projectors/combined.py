@@ -177,6 +177,8 @@ def _check_places(name: str, places: np.ndarray, grid: tuple[int, int]) -> None:
 
 def facts_path(store: Path) -> Path:
     """File beside the store of a scan of one of several projectors."""
+    if store.name in ("", ".."):
+        store = store.resolve()
     return store.with_suffix(FACTS_SUFFIX)
 
 
@@ -226,7 +228,7 @@ def read_facts(store: Path) -> ScanFacts:
     path = facts_path(store)
     try:
         facts = json.loads(input_file(path).read_text(encoding="utf-8"))
-        view = store.parent / str(facts["map"])
+        view = path.parent / str(facts["map"])
         side = checks.count("side", facts["side"], least=MIN_SIDE)
     except (ValueError, KeyError, TypeError, InputError) as error:
         raise FileError(f"{path}: is damaged: {error}") from None

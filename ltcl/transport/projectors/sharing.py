@@ -112,7 +112,7 @@ def find_borders(
     other one lights the scene, and the border of the camera's picture, are none.
     """
     totals = [_total(direct) for direct in directs]
-    are_lit = _lit_pictures(totals, camera_grid)
+    are_lit = lit_pictures(totals, camera_grid)
     borders = []
     for number, (total, grid) in enumerate(zip(totals, grids, strict=True)):
         is_taken_over = _lit_by_others(are_lit, number) & ~are_lit[number]
@@ -127,7 +127,7 @@ def find_borders(
     return borders
 
 
-def _lit_pictures(
+def lit_pictures(
     totals: Sequence[scipy.sparse.csr_array], camera_grid: tuple[int, int]
 ) -> list[np.ndarray]:
     """Camera pixels (H, W) that each projector lights."""
@@ -160,7 +160,7 @@ def overlap_width(
     mean is half of its width.
     """
     totals = [_total(direct) for direct in directs]
-    are_lit = _lit_pictures(totals, camera_grid)
+    are_lit = lit_pictures(totals, camera_grid)
     widths = []
     for number, (total, distance) in enumerate(zip(totals, distances, strict=True)):
         light = _row_sums(scipy.sparse.csr_array(total.T))
@@ -200,6 +200,22 @@ def find_ramps(
             raise InputError(f"{name} reaches {weights.min():.3g}; weights must be at least 0")
         ramps.append(weights)
     return ramps
+
+
+def inner_pixels(
+    shares: Sequence[ProjectorShare], camera_grid: tuple[int, int]
+) -> list[np.ndarray]:
+    """Camera pixels (M,) that each projector lights as the strongest, away from its rim.
+
+    At its rim it lights pixels in part. One that is nowhere the strongest has all that it lights.
+    """
+    are_lit = lit_pictures([_total(share.direct) for share in shares], camera_grid)
+    are_inside = []
+    for share, is_lit in zip(shares, are_lit, strict=True):
+        is_inside = np.asarray(scipy.ndimage.binary_erosion(is_lit, EIGHT, border_value=1)).ravel()
+        is_inside &= share.relative == 1.0
+        are_inside.append(is_inside if is_inside.any() else is_lit.ravel())
+    return are_inside
 
 
 def _total(direct: Sequence[scipy.sparse.csr_array]) -> scipy.sparse.csr_array:
