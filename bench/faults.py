@@ -47,7 +47,7 @@ from _random_sketches import dense_matrix, random_camera, random_scene
 from ltcl import scenes
 from ltcl.acquisition import Report, acquire
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE
-from ltcl.acquisition.scanning.sketch import count_patterns, like_nature
+from ltcl.acquisition.scanning.sketch import count_patterns, count_stripes, like_nature
 from ltcl.errors import AcquisitionError, ScanRefused
 
 # Projector pixels along a wall.
@@ -246,8 +246,10 @@ def random_setup(number: int) -> Setup:
     name, T, grid = random_scene(number)
     is_aligned = number % 2 == 0
     place = "aligned" if is_aligned else "oblique"
-    # After each batch comes a photograph of blocks.
+    # After each batch comes a photograph of blocks; those of Gray code come before the scan.
     patterns = count_patterns(grid)
+    if not is_aligned:
+        patterns -= count_stripes(grid)
     return Setup(
         name=f"{number}: {name}, {place}",
         T=T,

@@ -253,7 +253,10 @@ def main() -> None:
         print("left out, since PATH has no uv: installing with it")
         installers.remove("uv")
     results = {}
-    facts = {"processor cores": os.cpu_count()}
+    facts: dict[str, Any] = {"processor cores": os.cpu_count()}
+    if hasattr(os, "getloadavg"):
+        # Above 0 others work on this machine, too, and all takes longer.
+        facts["load before the bench, of the last minute"] = round(os.getloadavg()[0], 1)
     with tempfile.TemporaryDirectory(prefix="ltcl-install-") as folder:
         wheel = build_wheel(Path(folder))
         for installer in installers:

@@ -121,6 +121,7 @@ class LargeSketch:
     photographs: int
     cost: EstimateCost
     nbytes: int
+    disk_bytes: int
     errors: dict[str, float]
     compensated: float
     compensate_seconds: float
@@ -168,6 +169,7 @@ def run(
             photographs=rig.count,
             cost=cost,
             nbytes=T.nbytes,
+            disk_bytes=sum(file.stat().st_size for file in store.rglob("*") if file.is_file()),
             errors=errors,
             compensated=compensated,
             compensate_seconds=compensate_seconds,
@@ -259,6 +261,7 @@ def main() -> None:
         "seconds until T is there": result.cost.seconds,
         "memory while T is estimated, MB": result.cost.bytes / 1e6,
         "T, MB": result.nbytes / 1e6,
+        "T on disk, MB": result.disk_bytes / 1e6,
         "compensate, s": result.compensate_seconds,
         "prepared frames a second": result.frames_a_second,
         "the same with bounces of every second frame": result.frames_a_second_of_half,

@@ -175,14 +175,27 @@ kernel void frames_encode(
     global const real *thresholds,  // (CHANNELS, count), ascending
     global CODE *codes)             // (pixels, CHANNELS)
 {
+    real unmixed[BLOCK * CHANNELS];
     real lights[BLOCK];
     int in_cells[BLOCK];
     CODE found[BLOCK * CHANNELS];
     EACH_BLOCK(block) {
+        // Once for all colours that are mixed of it.
+        for (int c = 0; c < CHANNELS; ++c)
+            EACH_PIXEL(pixel, block)
+                unmixed[c * BLOCK + pixel - block] = factors[AT(c)] * direct[AT(c)];
         for (int c = 0; c < CHANNELS; ++c) {
             EACH_PIXEL(pixel, block) {
-                const real free_light = LIGHT(c);
-                const real light = factors[AT(c)] != 0 ? within(free_light, low, high) : 0;
+                const int i = pixel - block;
+#if MIXED
+                real free_light = 0;
+                for (int d = 0; d < CHANNELS; ++d)
+                    free_light += mixing[CHANNELS * c + d] * unmixed[d * BLOCK + i];
+#else
+                const real free_light = unmixed[c * BLOCK + i];
+#endif
+                const real inside = within(free_light, low, high);
+                const real light = factors[AT(c)] != 0 ? inside : 0;
                 const real at = (light - first_light) * cells_per_light;
                 lights[pixel - block] = light;
                 in_cells[pixel - block] = (int)within(at, (real)0, (real)(cells - 1));

@@ -19,11 +19,20 @@ INLINE real share(int distance)
     return distance == 0 ? (real)1 : (real)0.5;
 }
 
+#define SUM_DOWN(p) \
+    (LOAD(p) + (real)0.5 * (LOAD((p) - other.w * k) + LOAD((p) + other.w * k)))
+
 INLINE lanes
 sum_under_hat(int row, int column, level_place other, global const real *sums, int k)
 {
     const int y = 2 * row, bottom = min(y + 1, other.h - 1);
     const int x = 2 * column, right = min(x + 1, other.w - 1);
+    if (y > 0 && x > 0 && y + 1 < other.h && x + 1 < other.w) {
+        // Within the picture along one side after the other.
+        global const real *middle = sums + (y * other.w + x) * k;
+        const lanes before = SUM_DOWN(middle - k), after = SUM_DOWN(middle + k);
+        return SUM_DOWN(middle) + (real)0.5 * (before + after);
+    }
     lanes sum = 0;
     for (int i = max(y - 1, 0); i <= bottom; ++i)
         for (int j = max(x - 1, 0); j <= right; ++j)

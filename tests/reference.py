@@ -583,6 +583,21 @@ def hats_gather(grid: tuple[int, int]) -> np.ndarray:
         height, width, scale = height // 2 + 1, width // 2 + 1, 2 * scale
 
 
+def colour_hats_scale(x: np.ndarray, inner: np.ndarray, mixing: np.ndarray) -> np.ndarray:
+    """diag(inner) M x of planes x (3, N)."""
+    return inner * (mixing @ x)
+
+
+def colour_hats_rows(cores: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """K of each colour, (3, nodes, nodes), times sums under hats (3, nodes)."""
+    return np.einsum("cij,cj->ci", cores, sums)
+
+
+def colour_hats_finish(W: np.ndarray, light: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """diag(outer) W^T of the light (3, nodes) of the nodes of all levels."""
+    return outer * (light @ W)
+
+
 def patch_hats(grid: tuple[int, int], walls: int, detail: int) -> np.ndarray:
     """W (patches, N) of `PatchHats`, from its formula."""
 

@@ -95,6 +95,11 @@ def align(T: Transport, **settings: Any) -> Alignment:
     (True, True)
     """
     check_transport(T, square=False)
+    if T.scene is not T:
+        raise InputError(
+            "T is of several projectors, whose bounces are found in the camera's pixels: "
+            "ltcl.separate takes it as it is"
+        )
     if T.camera_grid == T.grid:
         raise InputError(f"T has a camera_grid {T.camera_grid}, that of its projector already")
     matrices = _matrices_in_memory(T)

@@ -5,8 +5,8 @@
     response     of the camera, from ramps at a bracket of exposures
     geometry     which projector pixel a camera pixel sees, by Gray code
     black, white repeatedly: noise of the camera, its offset, ambient light, the row sums of T
-    projector    uniform codes: light of each channel, and how colours mix; few pixels and all
-                 others: does its light depend on the picture?
+    projector    uniform codes of all channels and each channel alone: their curves, and how colours
+                 mix; few pixels and all others: does its light depend on the picture?
     anchor       a pattern that is photographed again during the scan: did anything move?
 
 Known limit: the unit of light is what the response reaches at the last code, which has no absolute
@@ -75,6 +75,9 @@ MAX_RAMPS = 4
 MIN_REPEATS = 2
 # Most of them before a scan of few patterns.
 MAX_SPARING_REPEATS = 4
+# Pixels of a photograph among which those are that determine the response, and their number.
+MAX_RESPONSE_PIXELS = 1 << 15
+RESPONSE_SAMPLES = 1 << 14
 # Photographs that usually find the exposure of white.
 EXPECTED_PROBES = 2
 # Camera pixels for one of the projector's, in a plan before the first photograph.
@@ -99,18 +102,33 @@ class Effort:
         Whether they cost much: a person takes them, or the scan after them takes few.
     exposures : int
         Exposures for the response.
+    many_pixels : int
+        Camera pixels from which on `few_exposures` tell it, and `few_repeats` of black and white
+        the noise.
     ramp_pixels : int
         Camera pixels in the ramps of each.
     codes : tuple of float
         Uniform codes of the projector. Monotone cubics through the many codes, none the inverse of
         another, deviate from sRGB, a power of 2.2 and film by at most 0.02 % of white (root mean
         square), through the few by 0.3 %.
+    spares_witnesses : bool
+        Leaves out the inverses of coarse stripes of Gray code, and long exposures of black and of
+        white before a scan without any. A person takes them: they tell which photograph is wrong
+        where some are exchanged or missing.
     """
 
     is_sparing: bool
     exposures: int
     ramp_pixels: int
     codes: tuple[float, ...]
+    many_pixels: float = math.inf
+    few_exposures: int = 0
+    few_repeats: int = MAX_SPARING_REPEATS
+    spares_witnesses: bool = False
+
+    def response_exposures(self, camera_pixels: int) -> int:
+        """Exposures for the response of a camera of so many pixels."""
+        return self.few_exposures if camera_pixels >= self.many_pixels else self.exposures
 
     def ramps(
         self, grid: tuple[int, int], camera_pixels: int, lit: np.ndarray | None = None
@@ -136,47 +154,55 @@ class Effort:
             ramps.append(ramp)
         return ramps
 
-    def repeats(self, frames: int, camera_pixels: float) -> int:
+    def repeats(self, frames: int, camera_pixels: int, seeing: float) -> int:
         """Photographs of black and of white.
 
-        Few are shared by the camera pixels that see one projector pixel.
+        Few are shared by the camera pixels that see one projector pixel, `seeing` of them.
         """
         if not self.is_sparing:
             return max(MIN_REPEATS, frames)
-        return max(MIN_REPEATS, math.ceil(frames / max(camera_pixels, 1.0)))
+        if camera_pixels >= self.many_pixels:
+            frames = min(frames, self.few_repeats)
+        return max(MIN_REPEATS, math.ceil(frames / max(seeing, 1.0)))
 
     def requests(
         self, grid: tuple[int, int], channels: int, repeats: int, times: CaptureTimes
     ) -> list[list[Request]]:
-        """Blocks, black, white, uniform codes of each channel, few pixels, blocks, the others.
+        """Blocks, black, white, uniform codes, colours, few pixels, blocks, the others.
 
-        The second photograph of blocks shows that nothing moved in between.
+        With one channel there are no colours. The second photograph of blocks shows that nothing
+        moved in between.
         """
         white = np.ones(grid, np.float32)
         black = np.zeros(grid, np.float32)
+        white_seconds = times.black[0]
+        # Then long exposures are those of black alone, for the light of the room.
+        has_short_scan = self.spares_witnesses and len(times.scan) == 1
         scan_range = sorted({times.scan[0], times.scan[-1]})
         blocks = [(anchor.pattern(grid), seconds) for seconds in scan_range]
-        dark_requests = _repeated(black, times.black, repeats)
+        dark_requests = []
+        for seconds in times.black:
+            count = 1 if has_short_scan and seconds != white_seconds else repeats
+            dark_requests += _repeated(black, seconds, count)
         bright_requests = []
         for seconds in times.white:
-            is_single = self.is_sparing and seconds != times.black[0]
+            is_single = self.is_sparing and seconds != white_seconds
             count = 1 if is_single else repeats
-            bright_requests += _repeated(white, [seconds], count)
-        codes = self.codes
-        colours = [np.float32(1.0)]
-        shape = grid
-        if channels == 3:
-            codes = (*codes, 1.0)
-            colours = list(np.eye(3, dtype=np.float32))
-            shape = (*grid, 3)
-        groups = [blocks[:1], dark_requests, bright_requests]
-        for colour in colours:
+            bright_requests += _repeated(white, seconds, count)
+        uniform_requests = []
+        for code in self.codes:
             # Views: the codes of many pixels in all colours would fill the memory.
-            uniform = [np.broadcast_to(np.float32(code) * colour, shape) for code in codes]
-            groups.append([(pattern, times.black[0]) for pattern in uniform])
+            uniform = np.broadcast_to(np.float32(code), grid)
+            uniform_requests.append((uniform, white_seconds))
+        groups = [blocks[:1], dark_requests, bright_requests, uniform_requests]
+        if channels == 3:
+            colours = []
+            for colour in np.eye(3, dtype=np.float32):
+                colours.append((np.broadcast_to(colour, (*grid, 3)), white_seconds))
+            groups.append(colours)
         few = anchor.sparse_pattern(grid)
         others = 1.0 - few
-        return [*groups, [(few, times.black[0])], blocks, [(others, times.black[0])]]
+        return [*groups, [(few, white_seconds)], blocks, [(others, white_seconds)]]
 
 
 def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:
@@ -186,12 +212,9 @@ def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-def _repeated(codes: np.ndarray, times: Sequence[float], count: int) -> list[Request]:
-    """`count` requests of the same codes at each exposure."""
-    requests: list[Request] = []
-    for seconds in times:
-        requests += [(codes, seconds)] * count
-    return requests
+def _repeated(codes: np.ndarray, seconds: float, count: int) -> list[Request]:
+    """`count` requests of the same codes at one exposure."""
+    return [(codes, seconds)] * count
 
 
 THOROUGH = Effort(
@@ -208,13 +231,27 @@ BY_HAND = Effort(
 )
 
 
-# An automatic rig before a scan of few patterns: its camera may have few pixels.
-SPARING = replace(BY_HAND, exposures=THOROUGH.exposures, ramp_pixels=1 << 12)
+# An automatic rig before a scan of few patterns. The error of a response is 0.11 to 0.15 % by 8
+# exposures of 1024 pixels of the camera, 0.07 to 0.09 % of 4096 and 0.06 % by 6 of 16384; 5 have
+# 0.08 to 0.3 % (linear, film and sRGB cameras).
+SPARING = replace(
+    BY_HAND,
+    exposures=THOROUGH.exposures,
+    many_pixels=1 << 13,
+    few_exposures=6,
+    spares_witnesses=True,
+)
+# The same before a scan of direct light, which is off by more than that.
+DIRECT = replace(
+    SPARING, many_pixels=1 << 10, few_exposures=BY_HAND.exposures, few_repeats=MIN_REPEATS
+)
 
 
-def _effort(by_hand: bool, sparing: bool) -> Effort:
+def _effort(by_hand: bool, sparing: bool, direct: bool) -> Effort:
     if by_hand:
         return BY_HAND
+    if direct:
+        return DIRECT
     return SPARING if sparing else THOROUGH
 
 
@@ -225,28 +262,37 @@ def expected_photographs(
     aligned: bool = False,
     by_hand: bool = False,
     sparing: bool = False,
+    direct: bool = False,
 ) -> int:
     """Number of photographs that `measure` takes without a known response.
 
     Probes of the exposure may add some. `by_hand`: by a person, with at least three camera pixels
-    to a side of one of the projector's; `sparing`: before a scan of few patterns.
+    to a side of one of the projector's; `sparing`: before a scan of few patterns; `direct`: of
+    direct light.
 
     >>> expected_photographs((8, 16)), expected_photographs((8, 16), by_hand=True)
     (149, 39)
     """
-    effort = _effort(by_hand, sparing)
+    effort = _effort(by_hand, sparing, direct)
     if sparing:
         frames = min(frames, MAX_SPARING_REPEATS)
-    camera_pixels = 1 if aligned else EXPECTED_CAMERA_PIXELS
-    ramps = effort.ramps(grid, camera_pixels * grid[0] * grid[1])
+    seeing = 1 if aligned else EXPECTED_CAMERA_PIXELS
+    camera_pixels = seeing * grid[0] * grid[1]
+    ramps = effort.ramps(grid, camera_pixels)
+    of_response = effort.response_exposures(camera_pixels) * len(ramps)
     # Black and white of the Gray code are photographed anyway.
-    stripes = 0 if aligned else GrayCode(grid).count - 2
-    scan_times = (2.0,) if sparing else (2.0, 3.0)
-    times = CaptureTimes(black=(2.0, 3.0), white=(1.0, 2.0, 3.0), scan=scan_times)
-    repeats = effort.repeats(frames, camera_pixels)
+    stripes = 0 if aligned else GrayCode(grid, effort.spares_witnesses).count - 2
+    white_times = (1.0, 2.0, 3.0)
+    scan_times = (2.0, 3.0)
+    if sparing:
+        scan_times = (2.0,)
+        if effort.spares_witnesses:
+            white_times = (1.0, 2.0)
+    times = CaptureTimes(black=(2.0, 3.0), white=white_times, scan=scan_times)
+    repeats = effort.repeats(frames, camera_pixels, seeing)
     groups = effort.requests(grid, channels, repeats, times)
     captures = sum(map(len, groups))
-    return EXPECTED_PROBES + effort.exposures * len(ramps) + stripes + captures
+    return EXPECTED_PROBES + of_response + stripes + captures
 
 
 def measure(
@@ -258,14 +304,15 @@ def measure(
     frames: int = 16,
     side: int = 1,
     sparing: bool = False,
+    direct: bool = False,
     progress: ProgressFunction = ignore_progress,
     log: ArrayLog | None = None,
 ) -> Calibration:
     """Measure a set-up, with as many photographs as `expected_photographs` says.
 
     The camera must resolve blocks of `side`; `sparing`: with few photographs, before a scan of few
-    patterns at one exposure; `log` has photographs of an earlier run; the other arguments, and
-    errors, are as in `ltcl.acquire`.
+    patterns at one exposure, and `direct`: of direct light; `log` has photographs of an earlier
+    run; the other arguments, and errors, are as in `ltcl.acquire`.
 
     >>> from ltcl.acquisition import VirtualRig
     >>> calibration = measure(
@@ -274,7 +321,7 @@ def measure(
     >>> bool(abs(calibration.white.value - 0.5).max() < 0.02), calibration.resampling.seen.all()
     (True, np.True_)
     """
-    effort = _effort(shots.keeps_photographs, sparing)
+    effort = _effort(shots.keeps_photographs, sparing, direct)
     if sparing:
         frames = min(frames, MAX_SPARING_REPEATS)
     expected = expected_photographs(
@@ -284,6 +331,7 @@ def measure(
         aligned=geometry == "aligned",
         by_hand=shots.keeps_photographs,
         sparing=sparing,
+        direct=direct,
     )
 
     def count(done: int) -> None:
@@ -298,13 +346,14 @@ def measure(
 
     # 2. Geometry.
     with session.naming_photographs():
-        view = _measure_geometry(session, geometry, white_exposure)
+        view = _measure_geometry(session, effort, geometry, white_exposure)
     if view.sharpness is not None:
         view.sharpness.check(side)
 
     # 3. Black, white, uniform codes and blocks.
-    times = _choose_times(session, white_exposure, exposures, sparing)
-    repeats = effort.repeats(frames, view.camera_pixels)
+    times = _choose_times(session, effort, white_exposure, exposures, sparing)
+    height, width = view.resampling.camera_grid
+    repeats = effort.repeats(frames, height * width, view.camera_pixels)
     requests = effort.requests(shots.grid, shots.channels, repeats, times)
     before, dark, bright, *uniform, few, after, others = session.take(requests)
 
@@ -341,25 +390,33 @@ def measure(
         sharpness=view.sharpness,
         anchor=Anchor.of(blocks, resampling),
         mapping=view.mapping,
+        stripes=_stripes_of_scan(view, times),
     )
 
 
 def _choose_times(
-    session: CaptureSession, white: float, exposures: Sequence[float] | None, sparing: bool
+    session: CaptureSession,
+    effort: Effort,
+    white: float,
+    exposures: Sequence[float] | None,
+    sparing: bool,
 ) -> CaptureTimes:
     """Exposures of black, white and the scan, by that of white."""
     shots = session.shots
     longest = longest_exposure(session, white)
+    white_times = [white / 2, white, longest]
     if exposures is not None:
         scan = offered_exposures(shots, exposures)
     elif sparing:
         # Half of the pixels are lit: no camera pixel is dark.
         scan = offered_exposures(shots, [white])
+        if effort.spares_witnesses:
+            white_times = [white / 2, white]
     else:
         scan = scan_exposures(shots, white, longest)
     return CaptureTimes(
         black=sorted({white, longest}),
-        white=offered_exposures(shots, [white / 2, white, longest]),
+        white=offered_exposures(shots, white_times),
         scan=scan,
     )
 
@@ -394,8 +451,9 @@ def _response_from_ramps(
     shots = session.shots
     shortest = white_exposure / RESPONSE_SPAN
     longest = white_exposure * RESPONSE_SPAN
-    times = [*offered_exposures(shots, bracket(shortest, longest, effort.exposures))]
     height, width = shots.camera_grid or (0, 0)
+    exposures = effort.response_exposures(height * width)
+    times = [*offered_exposures(shots, bracket(shortest, longest, exposures))]
     ramps = effort.ramps(shots.grid, height * width, getattr(shots.rig, "lit", None))
     if times[0] * MIN_DARK_RATIO > white_exposure:
         ramps.append(np.zeros(shots.grid, np.float32))
@@ -409,7 +467,11 @@ def _response_from_ramps(
     subject = f"the response of the camera, photographs {first} to {shots.number}"
     with acquisition_error(subject):
         response = radiometry.calibrate(
-            images, times, levels=shots.levels, saturation=SATURATED_CODE
+            images,
+            times,
+            levels=shots.levels,
+            saturation=SATURATED_CODE,
+            samples=RESPONSE_SAMPLES,
         )
     return response, hot
 
@@ -443,14 +505,25 @@ def _are_saturated(
 
 
 def _side_by_side(photographs: Sequence[Photograph], hot: np.ndarray) -> np.ndarray:
-    """Photographs of one exposure as a single picture of sampled pixels, without hot ones."""
-    return np.hstack([_without_hot_pixels(photograph, hot) for photograph in photographs])
+    """Photographs of one exposure as a single picture of some pixels, without hot ones."""
+    parts = []
+    for photograph in photographs:
+        step = photograph.step_of(MAX_RESPONSE_PIXELS)
+        parts.append(_without_hot_pixels(photograph, hot, step))
+    return np.hstack(parts)
 
 
-def _without_hot_pixels(photograph: Photograph, hot: np.ndarray) -> np.ndarray:
-    """Sampled pixels of a photograph; hot ones are those before them."""
-    step = photograph.step
-    return fill_hot_pixels(photograph.sampled, hot[::step, ::step])
+def _without_hot_pixels(photograph: Photograph, hot: np.ndarray, step: int) -> np.ndarray:
+    """Pixels of a photograph at a distance `step`; hot ones are those before them."""
+    return fill_hot_pixels(photograph.at_step(step), hot[::step, ::step])
+
+
+def _stripes_of_scan(view: _View, times: CaptureTimes) -> list[Photograph]:
+    """The photographs of the bits of Gray code, if those of the scan have their exposure."""
+    if not view.stripes or list(times.scan) != [view.stripes[0].seconds]:
+        return []
+    layout = GrayCode(view.resampling.grid).layout_of(len(view.stripes))
+    return [view.stripes[number] for number in layout.first.tolist()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -471,7 +544,7 @@ class _View:
 
 
 def _measure_geometry(
-    session: CaptureSession, geometry: str | Correspondence, seconds: float
+    session: CaptureSession, effort: Effort, geometry: str | Correspondence, seconds: float
 ) -> _View:
     """Find the projector pixel of each camera pixel."""
     shots = session.shots
@@ -483,7 +556,7 @@ def _measure_geometry(
     stripes: list[Photograph] = []
     light = None
     if isinstance(geometry, str):
-        patterns = GrayCode(shots.grid).patterns()
+        patterns = GrayCode(shots.grid, effort.spares_witnesses).patterns()
         [stripes] = session.take([[(codes, seconds) for codes in patterns]])
         # Linear in light: a pixel that is half lit shows half of it.
         light = PhotographFile(session.file)
@@ -541,7 +614,7 @@ def _bursts(photographs: Sequence[Photograph], hot: np.ndarray) -> list[list[np.
     """Images of one pattern by exposure, if there is more than one."""
     by_exposure: dict[float, list[np.ndarray]] = {}
     for photograph in photographs:
-        image = _without_hot_pixels(photograph, hot)
+        image = _without_hot_pixels(photograph, hot, photograph.step)
         by_exposure.setdefault(photograph.seconds, []).append(image)
     bursts = [by_exposure[seconds] for seconds in sorted(by_exposure)]
     return [images for images in bursts if len(images) > 1]
@@ -556,25 +629,22 @@ def _measure_projector(
 ) -> tuple[Response, np.ndarray | None]:
     """Response of the projector, and how its colours mix; None with one channel.
 
-    `uniform` are photographs of uniform codes for each channel, `dark` and `bright` those of black
-    and of white.
+    `uniform` are photographs of uniform codes, then those of each colour if there are any; `dark`
+    and `bright` those of black and of white.
     """
     ambient = session.merge_sampled(dark)
     lit = session.merge_sampled(bright)
-    pictures = []
-    for photographs in uniform:
-        pictures.append([session.merge_sampled([photograph]) for photograph in photographs])
-    is_grey = session.shots.channels == 1
-    if is_grey:
-        pictures[0].append(lit)
-    for photographs, channel in zip(uniform, pictures, strict=True):
-        consistency.check_uniform(session, photographs, channel, ambient)
+    grey, *colours = uniform
+    pictures = [session.merge_sampled([photograph]) for photograph in grey]
+    codes = [0.0, *effort.codes, 1.0]
+    if not colours:
+        consistency.check_uniform(session, grey, pictures, [lit], ambient)
+        with acquisition_error("the projector"):
+            return radiometry.projector_response(codes, [[ambient, *pictures, lit]]), None
+    [full_colours] = colours
+    full = [session.merge_sampled([photograph]) for photograph in full_colours]
+    consistency.check_uniform(session, grey, pictures, full, ambient, full_colours)
+    consistency.check_colours(full, lit, ambient)
     with acquisition_error("the projector"):
-        codes = [0.0, *effort.codes, 1.0]
-        channels = [[ambient, *channel] for channel in pictures]
-        projector = radiometry.projector_response(codes, channels)
-        if is_grey:
-            return projector, None
-        full = [channel[-1] for channel in pictures]
-        consistency.check_colours(full, lit, ambient)
+        projector = radiometry.colour_response(codes, pictures, full, ambient)
         return projector, radiometry.mixing(full, ambient)

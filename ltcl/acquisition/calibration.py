@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Any
 
@@ -29,7 +29,8 @@ from ltcl.acquisition.geometry.blocks import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, on_projector
 from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
-from ltcl.acquisition.scratch import ImageFile, StoredImage
+from ltcl.acquisition.scratch import ImageFile, StoredImage, scratch_array
+from ltcl.acquisition.session import Photograph
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
 from ltcl.transport.transport import Transport
@@ -89,6 +90,9 @@ class Calibration:
     mapping : StoredMap, optional
         The map behind the resampling, for a store; `stored_map` reads it again. None with an
         aligned camera.
+    stripes : sequence of Photograph
+        Photographs of the bits of Gray code, which are patterns of a sketch as well, if they have
+        the exposure of the scan; not kept.
     """
 
     exposures: tuple[float, ...]
@@ -103,6 +107,7 @@ class Calibration:
     sharpness: Sharpness | None = None
     anchor: Anchor | None = None
     mapping: StoredMap | None = None
+    stripes: Sequence[Photograph] = ()
 
     @property
     def light(self) -> np.ndarray:
@@ -252,13 +257,13 @@ def _small_arrays(store: BlockStore, names: Iterable[str]) -> dict[str, np.ndarr
 
 
 def _joined(store: BlockStore, names: list[str]) -> np.ndarray:
-    """Join arrays of a store one below the other, without having all in memory."""
+    """Join arrays of a store one below the other; a large array is in a temporary file."""
     file = ImageFile()
     strips = []
     for name in names:
         strips.append(file.append(np.array(store.extra(name))))
     length = sum(strip.shape[0] for strip in strips)
-    joined = np.empty((length, *strips[0].shape[1:]), strips[0].dtype)
+    joined = scratch_array((length, *strips[0].shape[1:]), strips[0].dtype)
     top = 0
     for strip in strips:
         joined[top : top + strip.shape[0]] = strip.read()
@@ -338,6 +343,9 @@ def _resampling_from_arrays(arrays: dict[str, np.ndarray]) -> Resampling:
 class Setup:
     """A calibration on the pixels of T, which are `blocks` of projector pixels.
 
+    Those of one of several projectors are squares of camera pixels: `CombinedSetup.of_scan` has
+    codes on the pixels of the projector itself.
+
     Examples
     --------
     >>> import tempfile, ltcl
@@ -397,12 +405,13 @@ class Setup:
 
         The light is clipped to [0, 1].
         """
-        light = np.clip(self._in_channels("pattern", pattern), 0.0, 1.0)
+        light = np.clip(self._in_channels("pattern", pattern, self.grid), 0.0, 1.0)
         return self.blocks.enlarged(self.calibration.projector.codes(light))
 
     def light(self, codes: Any) -> np.ndarray:
-        """Light of codes (h, w[, 3]) in [0, 1], relative to white."""
-        return self.calibration.projector.linear(self._in_channels("codes", codes))
+        """Light of codes (h, w[, 3]) in [0, 1] on the projector's pixels, relative to white."""
+        own = self._in_channels("codes", codes, self.pixels)
+        return self._block_means(self.calibration.projector.linear(own))
 
     def relative_error(self, rig: Any, T: Transport) -> tuple[float, ...]:
         """Relative error of T for each channel, by random patterns p of 0 and 1.
@@ -438,10 +447,10 @@ class Setup:
             return picture
         return self.calibration.resampling.apply(picture)
 
-    def _in_channels(self, name: str, picture: Any) -> np.ndarray:
-        """A checked picture of as many channels as the projector has."""
+    def _in_channels(self, name: str, picture: Any, grid: tuple[int, int]) -> np.ndarray:
+        """A checked picture on a grid, of as many channels as the projector has."""
         values = checks.finite(name, checks.real(name, picture)).astype(np.float32)
-        checks.shape(name, values, self.grid, (*self.grid, 3))
+        checks.shape(name, values, grid, (*grid, 3))
         if values.ndim == 2 and self.calibration.projector.channels == 3:
             return np.repeat(values[..., None], 3, axis=-1)
         return values

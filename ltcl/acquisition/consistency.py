@@ -24,7 +24,7 @@ import numpy as np
 
 from ltcl.acquisition import agreement, anchor
 from ltcl.acquisition.agreement import ADVICE, CameraModel
-from ltcl.acquisition.geometry import Correspondence, Resampling, decode
+from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, decode
 from ltcl.acquisition.geometry.photographs import PhotographFile
 from ltcl.acquisition.radiance import RadiancePicture, on_projector, strips
 from ltcl.acquisition.radiometry import Radiance
@@ -54,6 +54,8 @@ MIN_SIGMAS = 3.0
 PROJECTOR_UNEVENNESS = 0.1
 # Correlation of a picture of blocks with their pattern: 0.98 and more with the right map.
 MIN_MAP_CORRELATION = 0.9
+# The same where coarse stripes have no inverses: 0.74 and less if one shows another.
+MIN_COARSE_CORRELATION = 0.85
 # Share of a pixel's own light in what white shows there, at least, in most scenes.
 MIN_DIRECT_SHARE = 0.5
 
@@ -202,17 +204,20 @@ def check_superposition(
 
 @dataclass(frozen=True, kw_only=True)
 class _UniformReference:
-    """Black and white at some `pixels` of the photographs, (n, c), with their variances."""
+    """Black, and k pictures of light, at some `pixels` of the photographs, with their variances.
+
+    Black is (n, c); the light is that of white, or of three colours, (k, n, c).
+    """
 
     pixels: np.ndarray
     black: np.ndarray
     black_variance: np.ndarray
     light: np.ndarray
-    white_variance: np.ndarray
+    lit_variance: np.ndarray
 
     @classmethod
-    def from_pictures(cls, ambient: Radiance, white: Radiance) -> _UniformReference:
-        known = white.valid & ambient.valid
+    def from_pictures(cls, ambient: Radiance, lit: Sequence[Radiance]) -> _UniformReference:
+        known = np.all([picture.valid for picture in (ambient, *lit)], axis=0)
         in_all_channels = known.reshape(*known.shape[:2], -1).all(axis=2)
         pixels = agreement.spread(np.flatnonzero(in_all_channels))
 
@@ -224,70 +229,93 @@ class _UniformReference:
             pixels=pixels,
             black=black,
             black_variance=sampled(ambient.variance),
-            light=sampled(white.value) - black,
-            white_variance=sampled(white.variance),
+            light=np.stack([sampled(picture.value) - black for picture in lit]),
+            lit_variance=np.stack([sampled(picture.variance) for picture in lit]),
         )
 
-    def share_of_white(self, picture: Radiance) -> tuple[float, float]:
-        """Part g of white that a picture shows, by least squares, and its standard deviation."""
+    def shares(self, picture: Radiance) -> tuple[np.ndarray, np.ndarray]:
+        """Parts g (k,) of the light that a picture shows, and their standard deviations.
+
+        By least squares: g = (A A^T)^-1 A y of light A and picture y, without black.
+        """
         value = agreement.sample(picture.value, self.pixels)
         variance = agreement.sample(picture.variance, self.pixels)
         valid = agreement.sample(picture.valid, self.pixels)
-        weight = self.light[valid]
-        total = max(float(np.sum(weight**2)), 1e-30)
-        products = (value - self.black) * self.light
-        share = float(np.sum(products[valid])) / total
+        A = self.light[:, valid]
+        inverse = np.linalg.pinv(A @ A.T) @ A
         noise = (variance + self.black_variance)[valid]
-        deviation = float(np.sqrt(np.sum(weight**2 * noise))) / total
-        return share, deviation
+        return inverse @ (value - self.black)[valid], np.sqrt(inverse**2 @ noise)
 
-    def expected(self, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance under a part of white, and its variance."""
-        light = share * self.light
-        unevenness = (PROJECTOR_UNEVENNESS * share * self.light) ** 2
-        variance = self.black_variance + share**2 * self.white_variance + unevenness
-        return self.black + light, variance
+    def expected(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance under parts of the light, and its variance."""
+        light = np.tensordot(shares, self.light, 1)
+        unevenness = (PROJECTOR_UNEVENNESS * light) ** 2
+        lit_variance = np.tensordot(shares**2, self.lit_variance, 1)
+        return self.black + light, self.black_variance + lit_variance + unevenness
 
 
 def check_uniform(
     session: CaptureSession,
     photographs: Sequence[Photograph],
     pictures: Sequence[Radiance],
+    lit: Sequence[Radiance],
     ambient: Radiance,
+    colours: Sequence[Photograph] = (),
 ) -> None:
-    """Refuse photographs of uniform codes that do not show black and a rising part of white.
+    """Refuse photographs of uniform codes that do not show black and a rising part of the light.
 
-    The last of `pictures` is white; if it is that of a colour, so is the last photograph.
+    `lit` is white, or each colour, whose photographs are `colours`.
     """
-    *darker_pictures, white = pictures
-    reference = _UniformReference.from_pictures(ambient, white)
-    about_white = ""
-    if len(photographs) > len(darker_pictures):
-        about_white = f", which {session.name(photographs[-1])} is"
-    previous_share = 0.0
+    reference = _UniformReference.from_pictures(ambient, lit)
+    about_colours = ""
+    if colours:
+        names = [session.name(photograph) for photograph in colours]
+        about_colours = f", by its colours in {', '.join(names)}"
+    previous_shares = np.zeros(len(lit))
     previous_name = None
-    for photograph, picture in zip(photographs, darker_pictures, strict=False):
+    for photograph, picture in zip(photographs, pictures, strict=True):
         name = session.name(photograph)
-        share, share_noise = reference.share_of_white(picture)
+        shares, noise = reference.shares(picture)
         sampled = agreement.sample(photograph.sampled, reference.pixels)
         deviation = agreement.find_deviation(
-            [sampled], [photograph.seconds], session.camera, reference.expected(share)
+            [sampled], [photograph.seconds], session.camera, reference.expected(shares)
         )
-        if deviation is not None:
+        tolerance = MIN_SIGMAS * noise + PROJECTOR_UNEVENNESS * previous_shares
+        is_darker = shares < previous_shares - tolerance
+        wrong_name = name if deviation is not None else None
+        if previous_name is not None and is_darker.any():
+            wrong_name = wrong_name or _colour_cast(previous_name, previous_shares, name, shares)
+        if wrong_name is not None:
             raise AcquisitionError(
-                f"{name}, of a uniform code, does not show a part of white{about_white}: "
+                f"{wrong_name}, of a uniform code, does not show a part of white{about_colours}: "
                 f"another light was on, or it is another pattern; {ADVICE}"
             )
-        unevenness = PROJECTOR_UNEVENNESS * previous_share
-        tolerance = MIN_SIGMAS * share_noise + unevenness
-        if previous_name is not None and share < previous_share - tolerance:
-            ratio = share / previous_share
+        if previous_name is not None and is_darker.any():
+            channel = int(is_darker.argmax())
+            ratio = shares[channel] / previous_shares[channel]
             raise AcquisitionError(
                 f"{previous_name} or {name} deviates: it shows {ratio:.2g} times "
                 f"the light of a darker code; {ADVICE}"
             )
-        previous_share = share
+        previous_shares = shares
         previous_name = name
+
+
+def _colour_cast(
+    first: str, first_shares: np.ndarray, second: str, second_shares: np.ndarray
+) -> str | None:
+    """Name of the one of two photographs of grey codes that has the colour of another light.
+
+    None if neither has.
+    """
+    casts = []
+    for shares in (first_shares, second_shares):
+        casts.append(float(np.ptp(shares)) / max(float(shares.mean()), 1e-30))
+    if casts[0] > 2.0 * casts[1] + PROJECTOR_UNEVENNESS:
+        return first
+    if casts[1] > 2.0 * casts[0] + PROJECTOR_UNEVENNESS:
+        return second
+    return None
 
 
 def check_map(
@@ -298,7 +326,7 @@ def check_map(
     blocks: RadiancePicture,
     white: RadiancePicture,
 ) -> None:
-    """Refuse Gray code in which a pattern was exchanged with its inverse.
+    """Refuse Gray code with a pattern and its inverse exchanged, or one without an inverse wrong.
 
     Its map is mirrored in part. The picture of blocks tells: it is more like their pattern in the
     map that exchanging them back gives. `light` is linear, of the stripes; blocks and white are
@@ -307,7 +335,8 @@ def check_map(
     likeness = _block_correlation(resampling, blocks, white)
     if likeness > MIN_MAP_CORRELATION:
         return
-    for k in range(0, len(stripes) - 2, 2):
+    layout = GrayCode(resampling.grid).layout_of(len(stripes))
+    for k in layout.first[layout.has_inverse].tolist():
         exchanged = light.exchanged(k, k + 1)
         with contextlib.suppress(InputError):
             mapping = decode(exchanged, resampling.grid, levels=session.shots.levels)
@@ -319,6 +348,13 @@ def check_map(
                 raise AcquisitionError(
                     f"{first} and {second} are exchanged, a pattern and its inverse; {ADVICE}"
                 )
+    coarse = layout.first[~layout.has_inverse].tolist()
+    if coarse and likeness < MIN_COARSE_CORRELATION:
+        raise AcquisitionError(
+            f"{session.name(stripes[coarse[0]])} or a later one to "
+            f"{session.name(stripes[coarse[-1]])}, of coarse stripes without their inverses, shows "
+            f"another pattern: the map that they give does not fit that of blocks; {ADVICE}"
+        )
 
 
 def _block_correlation(

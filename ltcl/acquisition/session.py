@@ -87,13 +87,21 @@ class Photograph:
     @property
     def step(self) -> int:
         """Distance of sampled pixels along both sides: about `MAX_SAMPLED_PIXELS` at most."""
+        return self.step_of(MAX_SAMPLED_PIXELS)
+
+    def step_of(self, pixels: int) -> int:
+        """Distance along both sides of about so many pixels at most."""
         height, width = self.stored.shape[:2]
-        return math.ceil(math.sqrt(height * width / MAX_SAMPLED_PIXELS))
+        return math.ceil(math.sqrt(height * width / pixels))
 
     @property
     def sampled(self) -> np.ndarray:
         """The image at sampled pixels."""
-        return self.read(slice(None, None, self.step))[:, :: self.step]
+        return self.at_step(self.step)
+
+    def at_step(self, step: int) -> np.ndarray:
+        """The image at pixels of this distance along both sides."""
+        return self.read(slice(None, None, step))[:, ::step]
 
     def read(self, rows: slice) -> np.ndarray:
         """The image in some rows."""

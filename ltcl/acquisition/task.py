@@ -30,6 +30,7 @@ from ltcl.acquisition.rig import Rig, RigError, Shots
 from ltcl.acquisition.scanning import adaptive, columns, direct, plan, sketch
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import LAMP_GAIN, LIT, ScanCamera, ScanGrid
+from ltcl.acquisition.scanning.sketch_pictures import keep_stripes
 from ltcl.acquisition.session import (
     ProgressFunction,
     check_same,
@@ -350,6 +351,7 @@ def _calibrate(
     calibration = calibrate.measure(
         shots,
         sparing=plan.is_sparing(settings.strategy, shots.grid),
+        direct=settings.strategy == "direct",
         geometry=settings.geometry,
         response=settings.response,
         exposures=settings.exposures,
@@ -375,6 +377,8 @@ def _calibrate(
     lit = getattr(shots.rig, "lit", None)
     if lit is not None:
         store.extra(LIT, np.asarray(lit, np.float32))
+    if chosen.strategy == "sketch":
+        store.update(stripes=keep_stripes(store, grid))
     store.update(
         settings=settings.to_json(), why=reason, plan=asdict(chosen), strategy=chosen.strategy
     )
@@ -431,6 +435,7 @@ def _choose_plan(
         order=settings.order,
         threshold=settings.threshold,
         calibration=shots.count,
+        stripes=len(calibration.stripes),
         fixed_exposures=True,
     )
     if settings.strategy != "auto":
@@ -449,7 +454,8 @@ def _store_sizes(
         if strategy == "sketch":
             first = chosen.photographs
             rounds = sketch.most_rounds(settings.photographs, settings.rtol, first, exposures)
-            most = sketch.most_patterns(grid.grid, rounds)
+            stripes = len(grid.calibration.stripes)
+            most = sketch.most_patterns(grid.grid, rounds, stripes)
         elif strategy == "direct":
             most = direct.most_patterns(grid.grid)
         else:
@@ -514,7 +520,10 @@ def _run_pictures(
     log = PictureLog(store, camera, count)
     strategy = store.attributes["strategy"]
     if strategy == "sketch":
-        sketched = sketch.scan(grid, log, progress, _rounds(store, settings))
+        # Scans of earlier versions photograph them as all patterns.
+        stripes_by = store.attributes.get("stripes", ())
+        rounds = _rounds(store, settings)
+        sketched = sketch.scan(grid, log, progress, rounds, stripes_by)
         store.update(patterns=log.done)
         sketch.finish(store, sketched)
         if sketched.error > NOTABLE_ERROR:

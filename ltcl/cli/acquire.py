@@ -384,6 +384,8 @@ def update(
     _check_card(project, take)
     settings = {} if photographs is None else {"photographs": photographs}
     by_hand = target.with_name(f"{target.name}.photographs")
+    if project.name and not target.exists():
+        keep_facts(project, target)
     with project.rig(photographs=by_hand) as rig:
         if take is not None:
             copy_from_card(rig, take, project)
@@ -406,8 +408,6 @@ def update(
             if projector is not None:
                 again += f" --projector {projector}"
             return _ask_for_photograph(by_hand, error, rig.missing(), again)
-    if project.name:
-        keep_facts(project, target)
     report = UpdateReport(
         folder=folder,
         store=target,
@@ -427,7 +427,22 @@ def update(
         failing=float(result.failing.mean()),
         judgement=result.judgement,
     )
-    return Answer(report, [str(result), f"transport in {target}"])
+    lines = [str(result), f"transport in {target}"]
+    if project.name and result.holds:
+        lines.append(_combine_again(folder, project, target))
+    return Answer(report, lines)
+
+
+def _combine_again(folder: Path, updated: Any, target: Path) -> str:
+    """The command that makes one transport of a projector that was updated and the others."""
+    from ltcl import acquisition
+
+    stores = []
+    for project in acquisition.Project.open_all(folder):
+        store = target if project.name == updated.name else project.store
+        stores.append(shlex.quote(str(store)))
+    out = shlex.quote(str(folder / "combined.npz"))
+    return f"next: ltcl combine {' '.join(stores)} --out {out}"
 
 
 def _channels(result: Any) -> Channels:

@@ -31,10 +31,12 @@ from ltcl.operators import (
     IdentityPlus,
     Operator,
     Pyramid,
+    ScaledBasis,
     ScaledColumns,
     SubsetBasis,
     Tiles,
     Wavelet,
+    block_diagonal,
     triangles,
 )
 from ltcl.operators.pyramid import hat_levels
@@ -133,6 +135,7 @@ def trials(device: Device) -> Iterator[Trial]:
         call=partial(_joined_triangles, device, S),
         truth=np.linalg.inv(np.tril(S)),
     )
+    yield _colours_of_a_sketch(device, scene.grid)
     yield from _solves(device, S, x[:, 0])
     yield _frame(scene, device)
 
@@ -157,6 +160,34 @@ def _operators(device: Device, scene: Any, S: np.ndarray) -> dict[str, tuple[Ope
         tiles = Tiles(device, R, width, precision)
         operators[f"tiles of {width}, {precision}"] = (tiles, tiles.to_dense())
     return operators
+
+
+def _colours_of_a_sketch(device: Device, grid: tuple[int, int]) -> Trial:
+    """Products with the three colours of a sketch in one pass."""
+    random = np.random.default_rng(1)
+    W = Hats(device, grid)
+    nodes, pixels = W.shape
+    hats = _hats(grid)
+    blocks = []
+    matrices = []
+    for _ in range(3):
+        core = random.random((nodes, nodes)) / nodes
+        w = random.random(pixels) + 0.5
+        out = ScaledBasis(W, w)
+        S = IdentityPlus(Compressed(CSR(device, scipy.sparse.csr_array(core)), out, W, 0.0))
+        blocks.append(ScaledColumns(S, np.ones(pixels)))
+        matrices.append(np.eye(pixels) + w[:, None] * (hats.T @ core @ hats))
+    joined = block_diagonal(blocks)
+    x = random.random(3 * pixels)
+    planes = x.reshape(3, -1)
+    forward = [matrix @ plane for matrix, plane in zip(matrices, planes, strict=True)]
+    back = [matrix.T @ plane for matrix, plane in zip(matrices, planes, strict=True)]
+    return Trial(
+        kind="product",
+        name="colours of a sketch",
+        call=lambda: np.concatenate([joined @ x, joined.T @ x]),
+        truth=np.concatenate(forward + back),
+    )
 
 
 def _frame(scene: Any, device: Device) -> Trial:

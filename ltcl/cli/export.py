@@ -78,7 +78,8 @@ def export(
     losses: list[MapLossReport | None] = [None] * len(sources)
     if not no_error:
         losses = [_measure_loss(context, source.store, device) for source in sources]
-    remark = f"{REMARK}; {_describe_losses(losses)}"
+    names = [projector.name for projector in projectors]
+    remark = f"{REMARK}; {_describe_losses(names, losses)}"
     with fill_folder(out) as temporary:
         files = _write_files(temporary, projectors, chosen_formats, remark)
         text = "\n".join(_readme(projectors, remark, files)) + "\n"
@@ -117,16 +118,18 @@ def _measure_loss(context: Context, path: Path | None, device: str | None) -> Ma
     return MapLossReport.from_attributes(MapLoss.measure(T))
 
 
-def _describe_losses(losses: Sequence[MapLossReport | None]) -> str:
-    measured = [loss for loss in losses if loss is not None]
-    if not measured:
-        return "how much that is was not measured"
+def _describe_losses(names: Sequence[str], losses: Sequence[MapLossReport | None]) -> str:
     errors = []
-    for loss in measured:
+    for name, loss in zip(names, losses, strict=True):
+        if loss is None:
+            continue
+        of_projector = f"{name} " if len(losses) > 1 else ""
         errors.append(
-            f"{_percent(loss.maps)} by maps alone, {_percent(loss.direct)} with direct light "
-            f"undone, {_percent(loss.ltcl)} by ltcl"
+            f"{of_projector}{_percent(loss.maps)} by maps alone, {_percent(loss.direct)} with "
+            f"direct light undone, {_percent(loss.ltcl)} by ltcl"
         )
+    if not errors:
+        return "how much that is was not measured"
     return "error of a landscape on the wall, as T predicts it: " + "; ".join(errors)
 
 

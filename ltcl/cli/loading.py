@@ -86,11 +86,30 @@ def load_setup(transport: Path, calibration: Path | None = None) -> Any:
     if calibration is None and not is_measured(transport):
         return None
     # The import takes a second.
-    from ltcl.acquisition import Setup
+    from ltcl.acquisition import CombinedSetup, Setup
 
-    if calibration is None:
-        return Setup.of(transport)
-    return Setup.of(calibration)
+    scan = transport if calibration is None else calibration
+    setup = CombinedSetup.of_scan(scan)
+    if setup is not None:
+        return setup
+    _note_squares(scan)
+    return Setup.of(scan)
+
+
+def _note_squares(scan: Path) -> None:
+    """Tell that codes are not for a projector, where a store lacks the files beside it."""
+    from ltcl.acquisition.calibration import stored_map
+    from ltcl.acquisition.projectors.combined import facts_path
+    from ltcl.acquisition.projectors.warp import is_of_squares
+
+    # Stores of earlier versions have no map, and were not made of several projectors.
+    with suppress(InputError):
+        if is_of_squares(stored_map(store.BlockStore.open(scan))):
+            note(
+                f"{scan}: has squares of camera pixels, as scans of several projectors; codes are "
+                f"on them, not on the projector's pixels, unless {facts_path(scan).name} and the "
+                "map that it names stand beside it"
+            )
 
 
 def setup_of_several(T: Transport) -> Any:

@@ -46,9 +46,9 @@ def read(
 ) -> np.ndarray:
     """Read a linear picture on a `grid`, float32 (h, w[, 3]), by --encoding and --resize.
 
-    Integers are codes for the projector of `setup`, if there is one and no other encoding is
-    requested. Photographs, not `upright`, keep the camera's pixels. InputError, which names the
-    `owner` of the grid, if the size is another.
+    Integers are codes for the pixels of the projector of `setup`, if there is one and no other
+    encoding is requested. Photographs, not `upright`, keep the camera's pixels. InputError, which
+    names the `owner` of the grid, if the size is another.
     """
     from ltcl import images
 
@@ -57,6 +57,7 @@ def read(
     if setup is not None and encoding == "auto" and _has_integers(path):
         projector = setup
         encoding = "linear"
+        grid = setup.pixels
     picture = images.read(path, encoding=encoding, upright=upright)
     how = context.options["resize"]
     if how is not None:

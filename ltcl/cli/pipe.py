@@ -71,6 +71,8 @@ def check(context: Context, gain: Any) -> None:
         )
     if context.options["video_size"] is not None:
         parse_video_size(context.options["video_size"])
+    if sys.stdin is None:
+        raise InputError("stdin is closed; with --pipe it must be a pipe or a file")
     if sys.stdout is None or sys.stdout.isatty():
         raise InputError("stdout is a terminal; with --pipe it must be a pipe or a file")
 
@@ -82,7 +84,8 @@ def run(context: Context, scene: Any, gain: Any, resize: str, settings: dict[str
 
     source = _source(context, scene.T.camera_grid)
     if gain is None:
-        can_follow = scene.setup is not None and scene.T.is_square
+        # That of several projectors is between the camera's pixels.
+        can_follow = scene.setup is not None and scene.T.scene.is_square
         gain = "follow" if can_follow else 1.0
     encoding = context.options["encoding"]
     if encoding == "auto":

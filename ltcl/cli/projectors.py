@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ltcl import store
-from ltcl.cli import options
+from ltcl.cli import loading, options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.options import argument, option, out_option
 from ltcl.cli.reports.acquisition import ProjectorsReport
@@ -78,8 +79,8 @@ def combine(
         camera_grid=T.camera_grid,
         channels=T.channels,
         fed=[list(grid) for grid in _fed_grids(T)],
-        contrast=None if T.contrast is None else T.contrast.measured,
-        contrast_uniform=None if T.contrast is None else T.contrast.uniform,
+        contrast=_finite(T.contrast and T.contrast.measured),
+        contrast_uniform=_finite(T.contrast and T.contrast.uniform),
         differences=T.gamut.differences.tolist(),
     )
     return Answer(report, _combine_lines(out, T))
@@ -112,15 +113,22 @@ def _is_same(scan: Path, other: Path) -> bool:
 def _combined(paths: Sequence[Path], settings: dict[str, Any], device: Any) -> Any:
     """The combination of stores of scans, with their set-ups, or of other files."""
     from ltcl.acquisition.projectors import combine_scans
-    from ltcl.acquisition.projectors.combined import facts_path
+    from ltcl.acquisition.projectors.combined import facts_path, has_facts
     from ltcl.transport.projectors import combine as combine_transports
 
-    are_scans = [facts_path(path).exists() for path in paths]
+    are_scans = [has_facts(path) for path in paths]
     if all(are_scans):
         return combine_scans(paths, device=device, **settings)
     if any(are_scans):
         other = paths[are_scans.index(False)]
         raise InputError(f"{other}: is no scan of one of several projectors, but others are")
+    for path in paths:
+        if loading.is_measured(path):
+            raise InputError(
+                f"{path}: is the scan of one projector alone, on its pixels, not on the camera's; "
+                "those of several are scanned by an acquisition.toml with [[projector]], and have "
+                f"{facts_path(path).name} beside them"
+            )
     if settings["black"] == "uniform":
         raise InputError(
             f"--black is uniform, but {paths[0]} is a file without black; give stores of scans, or "
@@ -138,6 +146,13 @@ def _fed_grids(T: Any) -> list[tuple[int, int]]:
     if setup is None:
         return []
     return [projector.warp.pixels for projector in setup.projectors]
+
+
+def _finite(contrast: float | None) -> float | None:
+    """A contrast as JSON has it: None where it is unknown, or without any black."""
+    if contrast is None or not math.isfinite(contrast):
+        return None
+    return contrast
 
 
 def _combine_lines(out: Path, T: Any) -> list[str]:

@@ -32,8 +32,9 @@ def relight(
     names.
     """
     T = loading.load(context, transport, notes_dark=False)
-    setup = loading.load_setup(transport)
-    patterns = pictures.read_all(context, pattern, T.grid, "the projector", setup)
+    setup = loading.load_setup(transport) or loading.setup_of_several(T)
+    owner = "the projector" if T.scene is T else "the picture of all projectors side by side"
+    patterns = pictures.read_all(context, pattern, T.grid, owner, setup)
     relit = {}
     for name, light in patterns.items():
         relit[name] = relighting.relight(T, light)

@@ -39,6 +39,9 @@ DETAIL = 8
 COMPENSATION_STEPS = ("the room", "its light transport", "the target", "compensation")
 STEPS_AFTER_IT = ("analysis", "bounces", "convergence")
 RTOL = 1e-3
+# It needs no measured speeds of the device and few kernels, all of which have to be compiled before
+# the first picture.
+FIRST_METHOD = "gmres"
 BOUNCES = 4
 # Each bounce inherits the errors of those before it.
 BOUNCE_RTOL = 1e-4
@@ -116,7 +119,8 @@ def compensate_corner(size: int, device: Any, begin: Callable[[str], object]) ->
     target = reachable_target(scene, T)
 
     begin(compensation_step)
-    compensation = compensate(T, target.picture, gain=1.0 / target.brightest, rtol=RTOL)
+    gain = 1.0 / target.brightest
+    compensation = compensate(T, target.picture, gain=gain, method=FIRST_METHOD, rtol=RTOL)
     columns = target.picture.reshape(-1, 3).T
     # Where the walls' colours are undone but no bounces, T F^-1 target = S target is seen.
     undone = [np.asarray(S @ column) for S, column in zip(T.systems, columns, strict=True)]
@@ -197,8 +201,10 @@ def reachable_target(scene: RefinedScene, T: Transport) -> Target:
     parts = np.stack([sunset, mist], axis=-1).reshape(-1, 3, 2)
     columns = parts.transpose(1, 0, 2).astype(np.float64)  # (3, N, 2)
     light = []
-    for S, column in zip(T.systems, columns, strict=True):
-        light.append(solve(S, column, rtol=RTOL).x.astype(np.float64))
+    for S, pictures in zip(T.systems, columns, strict=True):
+        # One by one: kernels for two at once would be compiled for this alone.
+        solutions = [solve(S, picture, FIRST_METHOD, rtol=RTOL).x for picture in pictures.T]
+        light.append(np.stack(solutions, axis=-1).astype(np.float64))
 
     too_little = 0.0
     enough = 1.0

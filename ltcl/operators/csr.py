@@ -36,8 +36,8 @@ class Pattern:
         None if the host does not keep them.
     cuts : list of (start, stop)
         The rows of each slab.
-    slabs : list of (pointers, columns)
-        On the device; pointers count from 0 in each slab.
+    uploaded : list of (pointers, columns), optional
+        What `slabs` is; None if it is uploaded at its first use, from `indices`.
     """
 
     device: Device
@@ -45,29 +45,36 @@ class Pattern:
     indptr: np.ndarray
     indices: np.ndarray | None
     cuts: list[tuple[int, int]]
-    slabs: list[tuple[Array, Array]]
+    uploaded: list[tuple[Array, Array]] | None = None
 
     @classmethod
     def from_csr(cls, device: Device, matrix: Any) -> Pattern:
-        """The pattern of a checked `csr_array`, uploaded."""
+        """The pattern of a checked `csr_array`."""
         indptr = matrix.indptr.astype(np.int64)
         # Pointers weigh as much as one nonzero.
         row_bytes = np.maximum(4 * np.diff(indptr), 4)
         cuts = cut(device, row_bytes, "the sparse matrix")
-        slabs = []
-        for start, stop in cuts:
-            pointers = indptr[start : stop + 1]
-            columns = matrix.indices[pointers[0] : pointers[-1]]
-            local_pointers = device.upload(pointers - pointers[0], np.int32)
-            slabs.append((local_pointers, device.upload(columns, np.int32)))
         return cls(
             device=device,
             shape=matrix.shape,
             indptr=indptr,
             indices=matrix.indices,
             cuts=cuts,
-            slabs=slabs,
         )
+
+    @cached_property
+    def slabs(self) -> list[tuple[Array, Array]]:
+        """Pointers and columns of each slab on the device; pointers count from 0 in each."""
+        if self.uploaded is not None:
+            return self.uploaded
+        assert self.indices is not None  # noqa: S101 - the host has them, or they were uploaded
+        slabs = []
+        for start, stop in self.cuts:
+            pointers = self.indptr[start : stop + 1]
+            columns = self.indices[pointers[0] : pointers[-1]]
+            local_pointers = self.device.upload(pointers - pointers[0], np.int32)
+            slabs.append((local_pointers, self.device.upload(columns, np.int32)))
+        return slabs
 
     def with_values(self, data: np.ndarray, first: int = 0) -> list[Slab]:
         """The slabs of a matrix of this pattern with values `data` (nnz,), from row `first` on."""
@@ -96,6 +103,8 @@ class CSR(SparseRows):
     matrix : scipy.sparse matrix or array, (M, N)
     pattern : Pattern, optional
         Pattern of another channel; shared if the nonzeros are in the same places.
+    later : bool
+        Upload the matrix at its first product, as there may be none.
 
     Raises
     ------
@@ -116,20 +125,32 @@ class CSR(SparseRows):
     file: ClassVar[str] = "csr"
     numbers: ClassVar[str] = "values"
 
-    def __init__(self, device: Device, matrix: Any, pattern: Pattern | None = None) -> None:
+    def __init__(
+        self, device: Device, matrix: Any, pattern: Pattern | None = None, *, later: bool = False
+    ) -> None:
         matrix = checks.csr("matrix", matrix)
         super().__init__(device, matrix.shape)
         if pattern is not None and (pattern.device is not device or not pattern.matches(matrix)):
             pattern = None
-        bytes_per_entry = 8 if pattern is None else 4
-        device.require(matrix.nnz * bytes_per_entry, f"a sparse matrix of {matrix.nnz} nonzeros")
-        self.begin(device, matrix.shape, matrix.nnz)
+        self._new_bytes = matrix.nnz * (8 if pattern is None else 4)
+        self.nnz: int = matrix.nnz
+        self._host = matrix
+        if not later:
+            self._require_memory()
+            self.begin(device, matrix.shape, matrix.nnz)
         if pattern is None:
             pattern = Pattern.from_csr(device, matrix)
         self.pattern = pattern
-        self.slabs = self.pattern.with_values(matrix.data)
-        self.nnz: int = matrix.nnz
-        self._host = matrix
+        if not later:
+            self.slabs = self.pattern.with_values(matrix.data)
+
+    def _require_memory(self) -> None:
+        """Refuse a matrix for which the device has no room."""
+        self.device.require(self._new_bytes, f"a sparse matrix of {self.nnz} nonzeros")
+
+    def _upload_later(self) -> list[Slab]:
+        self._require_memory()
+        return self.pattern.with_values(self._host.data)
 
     @classmethod
     def begin(cls, device: Device, shape: tuple[int, int], nnz: int) -> None:
@@ -159,7 +180,12 @@ class CSR(SparseRows):
 
     @classmethod
     def from_arrays(
-        cls, device: Device, arrays: Mapping[str, np.ndarray], pattern: Pattern | None = None
+        cls,
+        device: Device,
+        arrays: Mapping[str, np.ndarray],
+        pattern: Pattern | None = None,
+        *,
+        later: bool = False,
     ) -> CSR:
         """The operator whose `to_arrays` gave `arrays`; arrays that do not fit are refused."""
         rows, columns = (int(n) for n in arrays["shape"])
@@ -169,7 +195,7 @@ class CSR(SparseRows):
         indptr = arrays["indptr"]
         checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), shape)
         matrix = scipy.sparse.csr_array((data, indices, indptr), shape=shape)
-        return cls(device, matrix, pattern)
+        return cls(device, matrix, pattern, later=later)
 
     def _float64_form(self, *, reads_blocks: bool = False) -> Float64Form | None:
         return Float64Form(matrix=self._host)
@@ -229,7 +255,7 @@ class RowBlocks(CSR):
             indptr=np.concatenate(pointers),
             indices=None,
             cuts=[(slab.first, slab.end) for slab in self.slabs],
-            slabs=places,
+            uploaded=places,
         )
         self.nnz = int(self.pattern.indptr[-1])
 

@@ -21,6 +21,7 @@ from ltcl.device.kernels import Queued, in_order
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis, SubsetBasis
+from ltcl.operators.colour_hats import COLOURS, join_colours, share_entries
 from ltcl.operators.compressed import Compressed
 from ltcl.operators.csr import CSR
 from ltcl.operators.epilogue import Epilogue
@@ -138,7 +139,7 @@ def block_diagonal(blocks: Sequence[Operator]) -> Operator:
     first = check_blocks(blocks)
     if len(blocks) == 1:
         return first
-    for join in (_join_systems, _join_scaled, _join_compressed, _join_csr, _join_tiles):
+    for join in JOINS:
         joined = join(blocks)
         if joined is not None:
             return joined
@@ -159,9 +160,9 @@ def joined_once(blocks: Sequence[Operator]) -> Operator:
     return joined
 
 
-def are_small(blocks: Sequence[Operator]) -> bool:
-    """True if their launches take longer than what they multiply with, so that one is better."""
-    return sum(block.nbytes for block in blocks) <= MAX_SMALL_BYTES
+def are_quicker_joined(blocks: Sequence[Operator]) -> bool:
+    """True if launches take longer than what they multiply with, or all share what is read."""
+    return share_entries(blocks) or sum(block.nbytes for block in blocks) <= MAX_SMALL_BYTES
 
 
 def check_blocks(blocks: Sequence[Operator]) -> Operator:
@@ -291,6 +292,13 @@ def _join_systems(blocks: Sequence[Operator]) -> Operator | None:
     return joined
 
 
+def _join_sketch(blocks: Sequence[Operator]) -> Operator | None:
+    """The three colours of a sketch of many pixels in one pass."""
+    if len(blocks) != COLOURS:
+        return None
+    return join_colours(blocks, BlockDiagonal(blocks))
+
+
 def _join_scaled(blocks: Sequence[Operator]) -> Operator | None:
     """diag(A_1, ...) diag(d), where all are A diag(d) - diag(shift)."""
     scaled = [block for block in blocks if isinstance(block, ScaledColumns)]
@@ -360,6 +368,10 @@ def _join_tiles(blocks: Sequence[Operator]) -> Operator | None:
     if len(packed) != len(blocks) or _are_large(blocks):
         return None
     return Tiles(blocks[0].device, joined_diagonally(packed))
+
+
+# Ways to join operators, of which the first that can is taken.
+JOINS = (_join_systems, _join_sketch, _join_scaled, _join_compressed, _join_csr, _join_tiles)
 
 
 def _are_large(blocks: Sequence[Operator]) -> bool:

@@ -121,6 +121,8 @@ class Knowledge:
         The same system between the coefficients of its basis.
     joined : tuple
         Weak references to the systems of all colours, of which it is the first, and all as one.
+    colour_rows : tuple
+        The same for the matrices of all colours of a sketch, and their entries as one.
     relaxations : dict
         Block inverses and windows of `ltcl.operators.relaxation`.
     walk_tables : dict
@@ -140,6 +142,7 @@ class Knowledge:
     factorization: Any = None
     coefficient_system: Operator | None = None
     joined: tuple[tuple[weakref.ref[Operator], ...], Operator] | None = None
+    colour_rows: tuple[tuple[weakref.ref[Operator], ...], Any] | None = None
     relaxations: dict[tuple[Any, ...], Any] = field(default_factory=dict)
     walk_tables: dict[str, Any] = field(default_factory=dict)
     is_quicker_in_shares: dict[int, bool] = field(default_factory=dict)

@@ -43,9 +43,26 @@ class MultiscaleSums(Basis):
         super().__init__(device, grid, self.file, sum(self._sizes))
 
     def _bind_transform(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Queued:
-        """The launches of all levels: large ones one by one, the others in one.
+        return self.bind_levels(x, out, epilogue, transpose, self.scratch(x.columns))
 
-        Sums are gathered from the finest level on, and spread from the coarsest on.
+    def scratch(self, columns: int) -> Array:
+        """Room for the sums of all levels; wide loads reach a spare one behind each level."""
+        return self.device.empty((sum(self._sizes) + len(self.levels), columns))
+
+    def bind_levels(
+        self,
+        x: Array,
+        out: Array,
+        epilogue: Epilogue,
+        transpose: bool,
+        sums: Array,
+        first_level: int = 0,
+    ) -> Queued:
+        """The launches of all levels from one on: large ones one by one, the others in one.
+
+        Sums are gathered from the finest level on, and spread from the coarsest on. `out` then has
+        the sums of these levels alone; what is spread to the finest of them is in `sums`, which
+        has those of level l behind l spare ones.
         """
         name = "spread" if transpose else "gather"
         kernel, pieces = self._kernel(self.file, name, x.columns)
@@ -58,17 +75,16 @@ class MultiscaleSums(Basis):
             "a": epilogue.a,
             "b": epilogue.b,
             "x": x,
-            # Wide loads reach a spare sum behind each level.
-            "sums": self.device.empty((sum(self._sizes) + count) * x.columns),
+            "sums": sums,
             "y": epilogue.operand(x),
             "out": out,
         }
         if transpose:
             arguments["levels"] = count
         small = bases.small_level_pixels(self.device)
-        large = sum(size > small for size in self._sizes)
+        large = max(first_level, sum(size > small for size in self._sizes))
         launches: list[Queued] = []
-        for level in range(large):
+        for level in range(first_level, large):
             levels = {"first_level": level, "end_level": level + 1}
             launches.append(bind_grid(kernel, pieces, self.levels[level], **levels, **arguments))
         if large < count:

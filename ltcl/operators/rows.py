@@ -207,11 +207,11 @@ class RowOperator(ReadableRows):
     entries_of_turn: int = 4
     defines: dict[str, Any]
     unit: float = 1.0
-    slabs: list[Slab]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(device, shape)
         self.defines = {}
+        self._slabs: list[Slab] | None = None
         self._fastest: dict[tuple[int, int], Variant] = {}
 
     @abc.abstractmethod
@@ -219,13 +219,30 @@ class RowOperator(ReadableRows):
         """A function that queues the product with A^T at each call."""
 
     @property
+    def slabs(self) -> list[Slab]:
+        """The slabs, which some formats upload at the first call."""
+        if self._slabs is None:
+            self._slabs = self._upload_later()
+        return self._slabs
+
+    @slabs.setter
+    def slabs(self, slabs: list[Slab]) -> None:
+        self._slabs = slabs
+
+    def _upload_later(self) -> list[Slab]:
+        """The slabs of a format that does not upload them when it is made."""
+        return []
+
+    @property
     def has_entries(self) -> bool:
         """True: its entries lie on one device, in rows."""
         return True
 
     def arrays(self) -> set[Array]:
-        """The arrays of all slabs."""
-        return {array for slab in self.slabs for array in slab.arrays}
+        """The arrays of all slabs, as far as they are uploaded."""
+        if self._slabs is None:
+            return set()
+        return {array for slab in self._slabs for array in slab.arrays}
 
     def norm_bound(self) -> NormBound:
         """The Frobenius norm, a bound on the 2-norm of |A|."""

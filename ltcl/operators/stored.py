@@ -28,11 +28,13 @@ from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis, ScaledBasis, SubsetBasis
+from ltcl.operators.colour_hats import COLOURS
 from ltcl.operators.compressed import Compressed
 from ltcl.operators.csr import CSR, Pattern, plain_arrays
 from ltcl.operators.dense import Dense
 from ltcl.operators.identity_plus import IdentityPlus
 from ltcl.operators.patch_hats import PATCH_HATS, PatchHats
+from ltcl.operators.pyramid import Hats
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet, basis
 
@@ -167,15 +169,20 @@ class StoredSystems:
     def _read_operator(self, arrays: Mapping[str, Any]) -> Operator:
         if str(arrays["kind"]) != "compressed":
             return self._read_core(arrays)
+        out = self._read_basis(int(arrays["out"]))
+        into = self._read_basis(int(arrays["into"]))
+        # The three colours of a sketch of many pixels are multiplied as one.
+        is_sketch = isinstance(out, ScaledBasis) and isinstance(into, Hats)
+        later = is_sketch and f"system_{COLOURS - 1}.sign" in self._arrays
         return Compressed(
-            self._read_core(under(arrays, "core")),
-            self._read_basis(int(arrays["out"])),
-            self._read_basis(int(arrays["into"])),
+            self._read_core(under(arrays, "core"), later=later),
+            out,
+            into,
             float(arrays["error"]),
             diagonal=arrays.get("diagonal"),
         )
 
-    def _read_core(self, arrays: Mapping[str, Any]) -> Operator:
+    def _read_core(self, arrays: Mapping[str, Any], *, later: bool = False) -> Operator:
         kind = str(arrays["kind"])
         if kind not in KINDS:
             raise InputError(
@@ -183,7 +190,7 @@ class StoredSystems:
                 "compressed, between bases: compress again"
             )
         if kind == "csr":
-            core = CSR.from_arrays(self._device, arrays, self._pattern)
+            core = CSR.from_arrays(self._device, arrays, self._pattern, later=later)
             # The next channel may share it.
             self._pattern = core.pattern
         else:

@@ -142,10 +142,14 @@ def draw(
         for homography, painting in painted:
             place, nearness = _hit(homography, points)
             is_shown = nearness > nearest
-            if is_shown.any():
-                nearest[is_shown] = nearness[is_shown]
-                pixels = place * painting.shape[1::-1] - 0.5
-                values[is_shown] = _interpolate(painting, pixels)[is_shown]
+            columns = np.flatnonzero(is_shown.any(axis=0))
+            if len(columns):
+                # A wall covers a part of the image.
+                part = (slice(None), slice(columns[0], columns[-1] + 1))
+                is_painted = is_shown[part]
+                nearest[part][is_painted] = nearness[part][is_painted]
+                pixels = place[part] * painting.shape[1::-1] - 0.5
+                values[part][is_painted] = _interpolate(painting, pixels)[is_painted]
         image[row : row + ROWS_AT_ONCE] = _shrink(values, supersample)
     return image
 

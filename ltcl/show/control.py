@@ -25,6 +25,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import socketserver
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -151,6 +152,20 @@ class ShowControl:
             self.state = replace(self.state, **values)
 
 
+class _DatagramServer(socketserver.UDPServer):
+    """Hands each datagram and its sender to a function."""
+
+    def __init__(
+        self, address: tuple[str, int], take: Callable[[bytes, tuple[str, int]], None]
+    ) -> None:
+        super().__init__(address, socketserver.BaseRequestHandler)
+        self._take = take
+
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        """Hand over one datagram."""
+        self._take(request[0], client_address)
+
+
 class OscServer(contextlib.AbstractContextManager):
     """Takes OSC messages for a show, in a thread of its own.
 
@@ -175,16 +190,11 @@ class OscServer(contextlib.AbstractContextManager):
 
     def __init__(self, control: ShowControl, port: int, host: str = "127.0.0.1") -> None:
         checks.load_extra("pythonosc", "show", "OSC")
-        from pythonosc.dispatcher import Dispatcher
-        from pythonosc.osc_server import BlockingOSCUDPServer
-
         self._control = control
         # Of the last message.
         self._sender: tuple[str, int] | None = None
-        dispatcher = Dispatcher()
-        dispatcher.set_default_handler(self._receive, needs_reply_address=True)
         try:
-            self._server = BlockingOSCUDPServer((host, port), dispatcher)
+            self._server = _DatagramServer((host, port), self._take)
         except (OSError, OverflowError) as error:
             raise InputError(f"OSC cannot listen on {host}:{port}: {error}") from error
         self.host, self.port = self._server.server_address[:2]
@@ -203,8 +213,21 @@ class OscServer(contextlib.AbstractContextManager):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _receive(self, sender: tuple[str, int], address: str, *values: Any) -> None:
+    def _take(self, datagram: bytes, sender: tuple[str, int]) -> None:
+        """Obey the messages of a datagram."""
+        from pythonosc.osc_packet import OscPacket
+
         self._sender = sender
+        try:
+            messages = OscPacket(datagram).messages
+        except Exception:  # noqa: BLE001 - whatever the parser makes of bytes of strangers
+            self._tell_error(f"datagram of {len(datagram)} bytes is no OSC message")
+            return
+        # Those of a bundle for a later time, too: waiting for it would hold up all others.
+        for timed in messages:
+            self._receive(sender, timed.message.address, timed.message.params)
+
+    def _receive(self, sender: tuple[str, int], address: str, values: Sequence[Any]) -> None:
         try:
             self._obey(sender, address, values)
         except (LtclError, TypeError, ValueError) as error:
@@ -225,11 +248,11 @@ class OscServer(contextlib.AbstractContextManager):
             control.set_frozen(_flag(*_counted(values, 1)))
         elif name == "projector":
             number, is_on = _counted(values, 2)
-            control.set_projector(number, _flag(is_on))
+            control.set_projector(_whole(number), _flag(is_on))
         elif name == "statistics":
             port = sender[1]
             if values:
-                port = checks.count("port", *_counted(values, 1), most=MAX_PORT)
+                port = checks.count("port", _whole(*_counted(values, 1)), most=MAX_PORT)
             self._send_statistics((sender[0], port))
         else:
             raise InputError("is no address of a show")
@@ -260,6 +283,13 @@ def _counted(values: Sequence[Any], count: int) -> Sequence[Any]:
     if len(values) != count:
         raise InputError(f"has {len(values)} values; it must have {count}")
     return values
+
+
+def _whole(value: Any) -> Any:
+    """A whole number, also from controllers that send all numbers as floats."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
 
 
 def _flag(value: Any) -> bool:

@@ -47,6 +47,9 @@ FARTHEST_BOUND = 1e30
 # Rounding hides any further gain after so many steps without a better certificate.
 PATIENCE = 50
 
+# Rounding of a step, in units of that of A x: its way is from one place in the box to another.
+WAY_OF_STEP = 4.0
+
 # Rows of numbers that the kernels keep, before the partial sums: alpha, the curvature of the last
 # direction, lambda, and one that is free.
 NUMBER_ROWS = 4
@@ -55,6 +58,9 @@ _DIRECTION = "bounded_direction"
 _DOTS = "vector_dots"
 _MOVE = "bounded_move"
 _LOOK = "bounded_look"
+
+# Rows of x that the host works on at once.
+ROWS_AT_ONCE = 1 << 14
 
 # lower, upper (N,)
 Box = tuple[np.ndarray, np.ndarray]
@@ -299,14 +305,17 @@ class Search:
         self._step_seconds = 0.0
 
     def run(self) -> None:
-        """Take steps until the search ends; its end is said of a residual computed from x alone."""
+        """Take steps until the search ends.
+
+        Its end is said of a residual computed from x alone, or of one that differs from it by so
+        little rounding that the end is the same.
+        """
         descent = self.descent
         while True:
             self._measure()
             self.unsolved = self.excess > self.tolerance
             status = self._judge()
-            is_certain = descent.has_true_residual or self._is_late()
-            if status is not None and not is_certain:
+            if status is not None and not self._is_certain(status):
                 descent.refresh()
                 self.hidden = descent.rounding()
                 continue
@@ -315,6 +324,22 @@ class Search:
                 self.status = status
                 return
             descent.step(self.unsolved & ~self.is_stagnant)
+
+    def _is_certain(self, status: Status) -> bool:
+        """Return False if the residual has to be computed from x before the search may end."""
+        descent = self.descent
+        if descent.has_true_residual or self._is_late():
+            return True
+        if status is not Status.CONVERGED:
+            return False
+        # Each step rounds by a product with its way, which is within the box as x is.
+        hidden = (1.0 + WAY_OF_STEP * descent.steps) * descent.rounding()
+        excess = self.excess + 2.0 * (hidden - self.hidden)
+        if np.any(excess > self.tolerance):
+            return False
+        self.hidden = hidden
+        self.excess = excess
+        return True
 
     def _is_late(self) -> bool:
         """True if there is no time for as long a step as the last one."""
@@ -426,8 +451,8 @@ class Descent:
     b, x : Array
     norms : (k,)
         Those of w b.
-    has_true_residual : bool
-        Whether r was computed from x itself.
+    steps : int
+        Steps since r was computed from x itself.
     """
 
     def __init__(
@@ -438,7 +463,8 @@ class Descent:
         self.A = A
         self.planes = planes
         self.products = 0
-        self.has_true_residual = False
+        self.steps = 0
+        self._has_residual = False
         self._box = box
         self.b = device.empty((rows, columns))
         self.x = device.empty((width, columns))
@@ -459,6 +485,11 @@ class Descent:
         self._is_weighted = w is not None
         self._allocate()
         self._bind()
+
+    @property
+    def has_true_residual(self) -> bool:
+        """True if r was computed from x itself."""
+        return self._has_residual and self.steps == 0
 
     def _allocate(self) -> None:
         """Allocate the vectors and numbers that stay on the device."""
@@ -608,7 +639,8 @@ class Descent:
         self.A.apply_transpose(self._u, self._q)
         self._look_anew()
         self.products += 1
-        self.has_true_residual = True
+        self.steps = 0
+        self._has_residual = True
 
     def shift(self, change: float, direction: Target) -> None:
         """Add `change` times another target to b, without a product; `read` needs a step first."""
@@ -640,7 +672,7 @@ class Descent:
         for launch in self._launches:
             launch()
         self.products += 2
-        self.has_true_residual = False
+        self.steps += 1
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Read the error and the Frank-Wolfe gap of every column, which waits."""
@@ -661,13 +693,23 @@ class Descent:
         """Numbers of columns as an array that broadcasts to x."""
         if self.planes == 1:
             return numbers
-        return np.repeat(numbers, self.x.shape[0] // self.planes)[:, None]
+        rows = self.x.shape[0] // self.planes
+        return np.repeat(numbers, rows)[:, None]
 
     def saturated(self, x: np.ndarray) -> np.ndarray:
         """Return the entries that a step along -g takes beyond a bound, touched or not."""
+        g = self.g.get()
+        alpha = np.broadcast_to(self.along_x(self._alpha), x.shape)
         lower, upper = _as_columns(self._box)
-        stepped = x - self.along_x(self._alpha) * self.g.get()
-        return (lower < upper) & ((stepped < lower) | (stepped > upper))
+        is_saturated = np.empty(x.shape, bool)
+        # What is between fits the caches.
+        for first in range(0, len(x), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            low = lower[rows]
+            high = upper[rows]
+            stepped = x[rows] - alpha[rows] * g[rows]
+            is_saturated[rows] = (low < high) & ((stepped < low) | (stepped > high))
+        return is_saturated
 
 
 def _as_columns(box: Box) -> Box:

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from ltcl.operators import Operator
-from ltcl.operators.diagonal_blocks import are_small, joined_once
+from ltcl.operators.colour_hats import share_entries
+from ltcl.operators.diagonal_blocks import are_quicker_joined, joined_once
 from ltcl.solvers.auto import SMALL, solve_automatically
 from ltcl.solvers.problem import LinearProblem, SolveSettings
 from ltcl.solvers.result import Solution
@@ -38,9 +39,11 @@ def may_join(
         return False
     for S in systems:
         is_small = not isinstance(S, Operator) or S.shape[0] <= SMALL
-        if is_small or S.coefficient_basis is None or S.device is not systems[0].device:
+        if is_small or S.device is not systems[0].device:
             return False
-    return are_small(systems)
+    if any(S.coefficient_basis is None for S in systems) and not share_entries(systems):
+        return False
+    return are_quicker_joined(systems)
 
 
 def solve_joined(

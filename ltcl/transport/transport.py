@@ -33,6 +33,8 @@ from ltcl.operators import (
     as_operator,
     interreflections,
 )
+from ltcl.operators.colour_hats import mixed_colours, share_entries
+from ltcl.operators.diagonal_blocks import joined_once
 from ltcl.operators.interreflection import can_mask_pixels, common_device, nbytes, underlying_system
 from ltcl.solvers import Inverse
 from ltcl.transport import coverage, diagnostics, stored
@@ -520,9 +522,11 @@ class Transport:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all S on the device, or of T if it has no S; shared patterns count once."""
+        """Bytes of all S on the device, or of T if it has no S; what they share counts once."""
         if not self.is_square:
             return nbytes(self.operators)
+        if share_entries(self.systems):
+            return nbytes([joined_once(self.systems)])
         return nbytes(self.systems)
 
     @property
@@ -564,7 +568,7 @@ class Transport:
             return (Coupled(rows),)
         operators = tuple(self._operator(channel) for channel in range(self.channels))
         if self.mixing is not None:
-            return (Coupled.mixed(operators, self.mixing),)
+            return (mixed_colours(operators, self.mixing),)
         return operators
 
     def _operator(self, channel: int) -> Operator:

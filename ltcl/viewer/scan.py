@@ -119,6 +119,7 @@ class Scan(ViewerScene):
             aligned=facts["aligned"],
             by_hand=facts["by_hand"],
             sparing=is_sparing(settings.strategy, facts["grid"]),
+            direct=settings.strategy == "direct",
         )
         height, width = facts["grid"]
         self.pixels = height * width

@@ -221,6 +221,21 @@ def test_missing_photographs_are_named(opencv, tmp_path):
         import_gray_code(tmp_path / "empty", GRID)
 
 
+def test_photographs_too_few_or_too_many_are_told(tmp_path, caplog):
+    """One is missing, so that another one would be of two patterns; or the grid is smaller."""
+    patterns = opencv_patterns((32, 64))
+    names = [f"{k}.png" for k in range(len(patterns))]
+    save_all(tmp_path, patterns, names)
+    with caplog.at_level("WARNING"):
+        import_gray_code(tmp_path, (32, 64))
+        assert caplog.text == ""
+        import_gray_code(tmp_path, (32, 32))
+    assert "2 photographs are of no pattern, the first one 20.png" in caplog.text
+    (tmp_path / names[3]).unlink()
+    with pytest.raises(errors.FileError, match=r"23 photographs, of which 22\.png .* and of white"):
+        import_gray_code(tmp_path, (32, 64))
+
+
 def test_exchanged_sides_are_refused(tmp_path):
     """48 x 64 pixels have as many stripes as 64 x 48, and numbers that those have not."""
     patterns = opencv_patterns((48, 64))

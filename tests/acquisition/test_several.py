@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -305,12 +306,36 @@ def test_one_of_several_must_be_named(tmp_path: Path) -> None:
         Project.open_all(tmp_path)
 
 
-def test_other_stores_are_refused(tmp_path: Path) -> None:
+def test_other_stores_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = ltcl.scenes.dihedral(4).transport()
     rig = ltcl.acquisition.VirtualRig(truth, truth.grid)
     acquire(rig, geometry="aligned", store=tmp_path / "T.zarr")
     with pytest.raises(InputError, match="no finished scan"):
         combine_scans([tmp_path / "T.zarr", tmp_path / "T.zarr"])
+    shutil.copytree(tmp_path / "T.zarr", tmp_path / "other.zarr")
+    words = ["combine", str(tmp_path / "T.zarr"), str(tmp_path / "other.zarr")]
+    assert main([*words, "--out", str(tmp_path / "both.npz")]) == 1
+    assert "T.zarr: is the scan of one projector alone" in capsys.readouterr().err
+    assert not (tmp_path / "both.npz").exists()
+
+
+def test_a_store_may_be_the_working_folder(scanned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(scanned / "left.zarr")
+    setup = CombinedSetup.of_scan(".")
+    assert setup is not None
+    assert setup.names == ("left",)
+
+
+def test_other_files_in_the_folder_of_scans_are_no_scans(scanned: Path, tmp_path: Path) -> None:
+    """Files with the names of stores, such as what `ltcl convert` makes of them."""
+    files = []
+    for name in ("left", "right"):
+        (tmp_path / f"{name}.projector.json").symlink_to(scanned / f"{name}.projector.json")
+        files.append(tmp_path / f"{name}.npz")
+        ltcl.save(files[-1], ltcl.load(scanned / f"{name}.zarr", on_dark="mask"))
+    out = tmp_path / "both.npz"
+    assert main(["combine", *map(str, files), "--out", str(out), "--quiet"]) == 0
+    assert CombinedSetup.of(ltcl.load(out)) is None
 
 
 def test_damaged_facts_are_named(scanned: Path, tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_progress(tmp_path: Path, strategy: str) -> None:
     path = tmp_path / "T.zarr"
     settings: dict[str, Any] = {"geometry": "aligned", "strategy": strategy, "store": path}
     # In the middle of the scan.
-    stopped = camera(60 if strategy in ("sketch", "direct") else 350)
+    stopped = camera({"sketch": 60, "direct": 60}.get(strategy, 350))
     first = Steps(stopped)
     with pytest.raises(AcquisitionError, match="unplugged"):
         acquire(stopped, **settings, progress=first)

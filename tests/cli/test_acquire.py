@@ -291,6 +291,20 @@ def test_a_scan_is_carried_over_to_an_older_lamp(program, finished):
 
 
 @pytest.mark.slow
+def test_one_of_several_projectors_is_updated(program, room_of_two, tmp_path):
+    folder = tmp_path / "room"
+    shutil.copytree(room_of_two, folder)
+    facts = (folder / "right.projector.json").read_bytes()
+    words = ("acquire", "update", folder, "--projector", "left")
+    program(*words, "--store", folder / "right.zarr").assert_refused("right.zarr: exists")
+    assert (folder / "right.projector.json").read_bytes() == facts
+    printed = program(*words).out
+    command = f"combine {folder}/left.updated.zarr {folder}/right.zarr --out {folder}/combined.npz"
+    assert f"next: ltcl {command}" in printed
+    assert program(*command.split()).code == 0
+
+
+@pytest.mark.slow
 def test_a_person_takes_the_photographs_of_an_update_in_one_round(program, finished):
     dim(finished, 0.95)
     with Project.open(finished).rig() as camera:

@@ -143,3 +143,34 @@ def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
     common = ["compensate", store, grey, "--out", tmp_path / "out"]
     assert "T.zarr: 1 of 32 " in program(*common).err
     program(*common, "--on-dark", "raise").assert_refused("T.zarr", "on_dark")
+
+
+@pytest.mark.parametrize(("scan", "pixels"), [("left.zarr", (13, 16)), ("both.npz", (13, 32))])
+def test_one_of_several_projectors_is_fed_on_its_own_pixels(
+    program, room_of_two: Path, tmp_path: Path, scan: str, pixels: tuple[int, int]
+) -> None:
+    """T is on squares of camera pixels, alone as well as in a combination."""
+    transport = room_of_two / scan
+    if scan == "both.npz":
+        transport = tmp_path / scan
+        program("combine", room_of_two, "--out", transport)
+    picture = write(tmp_path / "even.exr", np.full((6, 12), 0.5, np.float32))
+    program("compensate", transport, picture, "--out", tmp_path / "out")
+    codes = tmp_path / "out" / "even_pattern.png"
+    assert read_codes(codes).shape == pixels
+    assert program("relight", transport, codes, "--out", tmp_path / "relit").code == 0
+    relit = images.read(tmp_path / "relit" / "even_pattern_relit.exr")
+    pattern = images.read(tmp_path / "out" / "even_pattern.exr")
+    expected = ltcl.load(transport, on_dark="mask") @ pattern
+    np.testing.assert_allclose(relit, expected, atol=0.01 * expected.max())
+
+
+def test_a_store_without_the_files_beside_it_is_told(
+    program, room_of_two: Path, tmp_path: Path
+) -> None:
+    """Then its codes are on squares of camera pixels, which no projector has."""
+    (tmp_path / "left.zarr").symlink_to(room_of_two / "left.zarr")
+    picture = write(tmp_path / "even.exr", np.full((6, 12), 0.5, np.float32))
+    told = program("compensate", tmp_path / "left.zarr", picture, "--out", tmp_path / "out").err
+    assert "has squares of camera pixels" in told
+    assert "left.projector.json" in told

@@ -31,9 +31,13 @@ def test_formats_are_chosen(program, acquired, tmp_path):
 
 
 def test_folder_of_several_projectors(program, room_of_two, tmp_path):
-    words = ["export", room_of_two, "--no-error", "--out", tmp_path / "out"]
+    words = ["export", room_of_two, "--out", tmp_path / "out"]
     report = program(*words, "--format", "png", "--format", "mpcdi", "--json").json
     assert [projector["name"] for projector in report["projectors"]] == ["left", "right"]
     assert [projector["grid"] for projector in report["projectors"]] == [[13, 16]] * 2
     assert report["camera_grid"] == [36, 72]
     assert {"left_blend.png", "right_black.png", "projectors.mpcdi"} <= {*report["files"]}
+    text = (tmp_path / "out" / "README.txt").read_text()
+    for projector in report["projectors"]:
+        error = 100 * projector["loss"]["maps"]
+        assert f"{projector['name']} {error:.1f} % by maps alone" in text

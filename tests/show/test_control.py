@@ -8,11 +8,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import pytest
+from pythonosc.osc_bundle_builder import OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
 from pythonosc.udp_client import DispatchClient
 
 import ltcl
@@ -292,6 +295,35 @@ def test_bad_messages_are_answered(show, address, values, names):
     assert names in texts[0]
     assert control.state is before
     assert projection.codes(FRAME).max() > 0
+
+
+@pytest.mark.parametrize("numbers", [(1, 0), (1.0, 0.0)])
+def test_controllers_may_send_floats(show, numbers):
+    """Many tablets send nothing else."""
+    _, client, control = show
+    client.send_message("/ltcl/projector", numbers)
+    wait_until(lambda: control.state.off == {1})
+
+
+def test_a_bundle_for_later_holds_up_nothing(show):
+    _, client, control = show
+    builder = OscBundleBuilder(int(time.time()) + 3600)
+    message = OscMessageBuilder(address="/ltcl/gain")
+    message.add_arg(0.5)
+    builder.add_content(message.build())
+    client.send(builder.build())
+    wait_until(lambda: control.state.gain == 0.5)
+
+
+@pytest.mark.parametrize("datagram", [b"", b"garbage", b"/\xff\xfe\0,i\0\0\0\0\0\1", b"#bundle\0"])
+def test_other_datagrams_are_answered(show, capfd, datagram):
+    _, client, control = show
+    before = control.state
+    client._sock.sendto(datagram, ("127.0.0.1", client._port))
+    client.send_message("/ltcl/freeze", [1])
+    wait_until(lambda: control.state.is_frozen)
+    assert replace(control.state, is_frozen=False) == before
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_listens_on_loopback_unless_told():

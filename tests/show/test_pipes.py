@@ -6,9 +6,12 @@ from __future__ import annotations
 import io
 import math
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ import pytest
 
 import ltcl
 from ltcl import errors
+from ltcl.cli.main import main
 from ltcl.cli.pipe import describe_pipe
 from ltcl.show import pipes
 from ltcl.show.pipes import RawVideo
@@ -233,3 +237,30 @@ def test_bad_videos_are_refused(given, names):
 def test_bad_sizes_are_refused(text):
     with pytest.raises(errors.InputError, match="video_size is"):
         pipes.parse_video_size(text)
+
+
+@pytest.fixture(scope="module")
+def measured(room_of_two: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The transport of two projectors that were scanned."""
+    file = tmp_path_factory.mktemp("measured") / "both.npz"
+    assert main(["combine", str(room_of_two), "--out", str(file), "--quiet"]) == 0
+    return file
+
+
+def play(transport: Path, *words: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-m", "ltcl", "play", "--pipe", *words, "-", str(transport)]
+    return subprocess.run(command, capture_output=True, check=False, **streams)
+
+
+def test_the_gain_of_measured_projectors_follows(measured: Path) -> None:
+    frame = np.full((6, 12, 3), 150, np.uint8).tobytes()
+    by_default = play(measured, input=frame)
+    assert by_default.returncode == 0, by_default.stderr
+    assert by_default.stdout == play(measured, "--gain", "follow", input=frame).stdout
+    assert by_default.stdout != play(measured, "--gain", "1", input=frame).stdout
+
+
+def test_closed_stdin_is_told(measured: Path) -> None:
+    played = play(measured, preexec_fn=lambda: os.close(0))
+    assert played.returncode == 1
+    assert b"stdin is closed" in played.stderr

@@ -155,6 +155,27 @@ def test_narrow_overlaps_have_linear_weights(shared, power):
     np.testing.assert_allclose(np.diff(distance[alone + 2 : -1]), -1.0)
 
 
+@pytest.mark.parametrize("inner", [24, 12])
+def test_a_projector_inside_of_another_ends_softly(inner):
+    """The outer one, which never has to fade out, gives all of its light everywhere."""
+    camera = (4, 60)
+    size = camera[0] * camera[1]
+    first = (camera[1] - inner) // 2
+    identity = np.eye(size, dtype=np.float32).reshape(size, *camera)
+    inside = identity[:, :, first : first + inner].reshape(size, -1)
+    members = [
+        ltcl.Transport(identity.reshape(size, size), camera, camera_grid=camera),
+        ltcl.Transport(inside, (4, inner), camera_grid=camera),
+    ]
+    outer_share, inner_share = ltcl.combine(members).shares
+    np.testing.assert_array_equal(outer_share.own, 1.0)
+    np.testing.assert_array_equal(outer_share.ceiling, 1.0)
+    own = inner_share.own.reshape(4, inner)
+    assert own[1, 0] < 0.12
+    assert own[1, -1] < 0.12
+    assert own[1, inner // 2] > 0.9
+
+
 def test_own_weights(members):
     weights = [np.ones(T.grid) for T in members]
     T = ltcl.combine(members, blend=weights)
@@ -183,6 +204,31 @@ def test_common_gamut(device, S):
     np.testing.assert_allclose(gamut.light(np.ones((1, 1, 3)))[0, 0], gamut.white)
     assert 0.0 < gamut.differences.max() < 1.0
     assert "projector 2" in str(gamut)
+
+
+def test_rims_are_not_the_light_of_a_projector(device, S):
+    """Each lights the pixels at its rim in part, which are more than one in twenty."""
+    scene = ltcl.Transport(S.astype(np.float32), CAMERA, device=device)
+    gains = [1.0, 1.4, 0.8]
+    members = []
+    for gain, left, right in zip(gains, (-0.1, 0.28, 0.62), (0.43, 0.77, 1.1), strict=True):
+        projector = projectors.Projector(grid=(10, 9), left=left, right=right, gain=gain)
+        direct = scipy.sparse.csr_array(projector.direct().astype(np.float32))
+        members.append(ltcl.Transport(direct, (10, 9), camera_grid=CAMERA, device=device))
+    gamut = ltcl.combine(members, scene=scene).gamut
+    white = projectors.ALBEDO * np.array(gains)
+    np.testing.assert_allclose(gamut.projectors.ravel(), white, rtol=0.02)
+    np.testing.assert_allclose(gamut.white, white.min(), rtol=0.02)
+    np.testing.assert_allclose(
+        gamut.differences, np.abs(white - white.mean()) / white.mean(), atol=0.02
+    )
+
+
+def test_without_black_the_contrast_is_infinite(members):
+    contrast = ltcl.combine(members, blacks=[np.zeros(CAMERA)] * 2).contrast
+    assert contrast is not None
+    assert np.isinf(contrast.measured)
+    assert str(contrast).startswith("contrast inf")
 
 
 def test_scene_between_camera_pixels(T, S):
@@ -238,3 +284,6 @@ def test_refusals(device, members, T):
         T.join([np.ones(one.grid)] * 2)
     with pytest.raises(InputError, match="frames and colours"):
         T.join([np.ones(LEFT.grid), np.ones((*RIGHT.grid, 3))])
+    for call in (ltcl.align, ltcl.compress):
+        with pytest.raises(InputError, match=r"T is of several projectors, .*separate"):
+            call(T)

@@ -12,6 +12,7 @@ where numbers without a name are places in the folder, whose pictures are in nat
 
 from __future__ import annotations
 
+import logging
 import os
 import tomllib
 from dataclasses import dataclass, fields
@@ -23,6 +24,8 @@ from ltcl.acquisition.rigs.photographs import PHOTOGRAPH_SUFFIXES
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file
 from ltcl.images.frames import natural_order
+
+_logger = logging.getLogger(__name__)
 
 # Orders that come along, and what they are.
 ORDERS = {
@@ -208,7 +211,7 @@ class PhotographOrder:
     def files(self, folder: Path, grid: tuple[int, int]) -> dict[str, list[Path]]:
         """Return the files of each series, the coarsest stripes first, and of white and black.
 
-        FileError, which names the photograph, if one is not there.
+        FileError, which names the photograph, if one is not there, or would be of two patterns.
         """
         pictures = list_photographs(folder)
         columns, rows = self.codes(grid)
@@ -232,7 +235,24 @@ class PhotographOrder:
             place = getattr(self, kind)
             if place is not None:
                 files_of_series[kind] = [_find(folder, pictures, kind, place)]
+        _check_once(folder, len(pictures), files_of_series)
+        used = {path for files in files_of_series.values() for path in files}
+        unused = [path.name for path in pictures if path not in used]
+        if self._is_by_places and unused:
+            _logger.warning(
+                "%s: %d photographs are of no pattern, the first one %s; grid or order may be "
+                "another",
+                folder,
+                len(unused),
+                unused[0],
+            )
         return files_of_series
+
+    @property
+    def _is_by_places(self) -> bool:
+        """True if all photographs are found by their places in the folder."""
+        places = [series.name for series in (self.columns, self.rows)]
+        return not any(isinstance(place, str) for place in (*places, self.white, self.black))
 
 
 def list_photographs(folder: Path) -> list[Path]:
@@ -275,6 +295,19 @@ def _find(folder: Path, pictures: list[Path], kind: str, place: str | int) -> Pa
             "counted from 0"
         )
     return pictures[place]
+
+
+def _check_once(folder: Path, count: int, files_of_series: dict[str, list[Path]]) -> None:
+    """Refuse a photograph of two patterns, as places give it where some are missing."""
+    kinds: dict[Path, str] = {}
+    for kind, files in files_of_series.items():
+        for path in files:
+            if path in kinds:
+                raise FileError(
+                    f"{folder}: has {count} photographs, of which {path.name} would be of "
+                    f"{kinds[path]} and of {kind}; some are missing, or grid or order is another"
+                )
+            kinds[path] = kind
 
 
 def _checked_value(key: str, value: Any) -> Any:

@@ -207,11 +207,14 @@ class RefinedEstimator:
         """The same as `Estimator.scale_of_variance`."""
         scales = []
         for channel in range(self.channels):
-            squares = self._pictures(patterns, channel) ** 2
-            sums = self.hats.sums_from(0, squares, power=2)
-            shares = self._at_pixels(sums, [stage.variance[channel] for stage in self.stages])
+            variances = [stage.variance[channel] for stage in self.stages]
             light = self.light[:, channel] ** 2
-            expected = (light[:, None] * shares).sum()
+            expected = 0.0
+            # One by one: the sums of all would take a quarter of the memory of the rows.
+            for frame in range(len(patterns)):
+                squares = self._pictures(patterns[frame : frame + 1], channel) ** 2
+                sums = self.hats.sums_from(0, squares, power=2)
+                expected += float(light @ self._at_pixels(sums, variances)[:, 0])
             noise = len(patterns) * (self.stages[-1].noise * light).sum()
             measured = max(residual_squares[channel] - noise, 0.0)
             scales.append(max(measured / expected, LEAST_SCALE))
@@ -313,7 +316,9 @@ class RefinedEstimator:
         mean = []
         variance = []
         for channel in range(self.channels):
-            mean.append(self._among_all(self.coarse.coefficients(channel) / unit, level))
+            coefficients: Any = self.coarse.coefficients(channel) / unit
+            coefficients.data = with_few_bits(coefficients.data)
+            mean.append(self._among_all(coefficients, level))
             variance.append(self._among_all(self.coarse.variances(channel) / unit**2, level))
         noise = np.mean([prior.noise for prior in self.coarse.priors], axis=0)
         return Stage(level=level, mean=mean, variance=variance, noise=noise)
@@ -411,7 +416,9 @@ class RefinedEstimator:
                 # The first function is the node's own.
                 matters[:, 0] = True
                 factor = factors[channel]
-                rows.add(columns, matters, mean[:, :, channel] / factor, variance / factor**2)
+                coefficients = mean[:, :, channel] / factor
+                coefficients[:, 1:] = with_few_bits(coefficients[:, 1:])
+                rows.add(columns, matters, coefficients, variance / factor**2)
             self._count(len(numbers))
         matrices = [rows.matrices() for rows in collected]
         return Stage(
@@ -559,6 +566,21 @@ class RefinedEstimator:
         self._done += rows
         if self._progress is not None:
             self._progress("fit", self._done, max(self._done, self._total))
+
+
+def with_few_bits(values: np.ndarray) -> np.ndarray:
+    """Values rounded to 8 significant bits, float32.
+
+    Those of a node are read as two bytes then (`ltcl.operators.colour_hats`).
+
+    >>> with_few_bits(np.array([1.0 + 2.0**-7, 1.0 + 2.0**-9])).tolist()
+    [1.0078125, 1.0]
+    """
+    bits = np.asarray(values, np.float32).view(np.uint32)
+    # To the nearest, and to even where two are.
+    is_odd = (bits >> np.uint32(16)) & np.uint32(1)
+    rounded = bits + np.uint32(0x7FFF) + is_odd
+    return (rounded & np.uint32(0xFFFF0000)).view(np.float32)
 
 
 def _stacked(blocks: list[Any]) -> scipy.sparse.csr_array:

@@ -17,6 +17,9 @@ half of the pixels each, so that g_b is the sum of the quartiles of p_b / w; coa
 median of these. The noise is the distance of p_b from the nearer one of the levels that fine
 stripes show. That is less sure: a single photograph decides each bit.
 
+With inverses of the fine bits alone, gains, noise and light are those of these pairs, and a coarse
+bit has q_b = s - p_b. Its difference 2 p_b - s has about twice the variance of that of a pair.
+
 Fine stripes light half of everything evenly, so that a pixel shows `l_d + l_g / 2` when its own
 stripe is on and `l_g / 2` when it is off (Nayar et al. 2006). With the direct light l_d and the
 indirect light l_g known, a bit is certain (Xu and Aliaga 2007) if it is above the noise, and
@@ -30,6 +33,8 @@ as in a closed white room, has no coordinate.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -92,6 +97,9 @@ MAX_GAIN = 2.0
 # Variances of a single photograph in 2 p - w - b, a bit without an inverse.
 SINGLE_VARIANCES = 6.0
 
+# Deviation of 2 p - s, relative to that of p - q, by at least six pairs in s.
+COARSE_DEVIATION = 1.5
+
 # Instead of a division by zero.
 TINY = np.float32(1e-20)
 
@@ -100,15 +108,62 @@ RIGHT_PAIR = (np.s_[..., :-1], np.s_[..., 1:])
 BELOW_PAIR = (np.s_[..., :-1, :], np.s_[..., 1:, :])
 
 
+@dataclass(frozen=True)
+class BitLayout:
+    """Places of the bits among photographs of Gray code.
+
+    Parameters
+    ----------
+    bits : (int, int)
+        Number of bits of a column and of a row.
+    inverses : int
+        Finest bits of each axis that are followed by their inverses.
+
+    Examples
+    --------
+    >>> layout = BitLayout((2, 1), 1)
+    >>> layout.count, layout.first.tolist(), layout.has_inverse.tolist()
+    (7, [0, 1, 3], [False, True, True])
+    """
+
+    bits: tuple[int, int]
+    inverses: int
+
+    @property
+    def has_inverse(self) -> np.ndarray:
+        """True for bits that are followed by their inverses, (B,)."""
+        return significance(self.bits) < self.inverses
+
+    @property
+    def first(self) -> np.ndarray:
+        """Number of the photograph of each bit, (B,)."""
+        photographs = 1 + self.has_inverse.astype(int)
+        return np.cumsum(photographs) - photographs
+
+    @property
+    def count(self) -> int:
+        """Number of photographs, with white and black at the end."""
+        return len(self.has_inverse) + int(self.has_inverse.sum()) + 2
+
+    def pairs_of_axis(self, axis: int) -> np.ndarray:
+        """Numbers of the photographs of rows (axis 0) or columns that inverses follow."""
+        column_bits, _ = self.bits
+        is_of_axis = np.arange(len(self.first)) < column_bits
+        if axis == 0:
+            is_of_axis = ~is_of_axis
+        return self.first[is_of_axis & self.has_inverse]
+
+
 class StripDecoder:
     """Decodes photographs strip by strip of rows into the axes `x` and `y`.
 
     Parameters
     ----------
-    grid, bits : (int, int)
-        Height and width of the projector; number of bits of a column and of a row.
+    grid : (int, int)
+        Height and width of the projector.
+    layout : BitLayout
+        Places of the patterns and their inverses; white and black come last.
     pictures : Photographs
-        Patterns, each followed by its inverse if there are inverses, then white and black.
     min_difference : float
         Least difference of two photographs that counts.
     edges : bool
@@ -118,22 +173,24 @@ class StripDecoder:
     def __init__(
         self,
         grid: tuple[int, int],
-        bits: tuple[int, int],
+        layout: BitLayout,
         pictures: Photographs,
         min_difference: float,
         edges: bool,
     ) -> None:
         self.grid = grid
-        self.bits = bits
+        self.bits = layout.bits
+        self.layout = layout
         self.pictures = pictures
         self.min_difference = min_difference
         self.edges = edges
-        self.has_inverses = pictures.count == 2 * sum(bits) + 2
+        self.has_inverse = layout.has_inverse
+        self.has_inverses = bool(self.has_inverse.any()) or not len(self.has_inverse)
         self.x = Axis.unknown(pictures.shape)
         self.y = Axis.unknown(pictures.shape)
-        self.gains = np.ones((2, sum(bits)), np.float32)
+        self.gains = np.ones((2, len(self.has_inverse)), np.float32)
         self.min_noise = 0.0
-        if sum(bits):
+        if len(self.has_inverse):
             self._measure_gains()
 
     def decode(self, rows: slice) -> None:
@@ -150,6 +207,8 @@ class StripDecoder:
         threshold = np.maximum(self.min_difference, MIN_DEVIATIONS * noise)
         is_on = difference > 0
         np.abs(difference, out=difference)
+        if self.has_inverses:
+            difference[~self.has_inverse] /= COARSE_DEVIATION
 
         np.maximum(lowest, 0.0, out=lowest)
         direct = highest - lowest
@@ -184,21 +243,27 @@ class StripDecoder:
         """Patterns and inverses less black, at the same gain, (B, rows, W) each."""
         black = self.pictures.read(-1, rows)
         pattern_gains, inverse_gains = self.gains
-        last = self.pictures.count - 2
-        if self.has_inverses:
-            pattern = self._read_stack(range(0, last, 2), rows, black, pattern_gains)
-            inverse = self._read_stack(range(1, last, 2), rows, black, inverse_gains)
-            return pattern, inverse
-        pattern = self._read_stack(range(last), rows, black, np.ones(last))
-        white = self.pictures.read(-2, rows) - black
-        return pattern, pattern_gains[:, None, None] * white - pattern
+        first = self.layout.first
+        if not self.has_inverses:
+            pattern = self._read_stack(first, rows, black, np.ones(len(first)))
+            white = self.pictures.read(-2, rows) - black
+            return pattern, pattern_gains[:, None, None] * white - pattern
+        paired = self.has_inverse
+        pattern = self._read_stack(first, rows, black, pattern_gains)
+        if paired.all():
+            return pattern, self._read_stack(first + 1, rows, black, inverse_gains)
+        inverse = np.empty_like(pattern)
+        inverse[paired] = self._read_stack(first[paired] + 1, rows, black, inverse_gains[paired])
+        total, _ = self._pair_statistics(pattern[paired], inverse[paired])
+        inverse[~paired] = total - pattern[~paired]
+        return pattern, inverse
 
     def _read_stack(
-        self, numbers: range, rows: slice, black: np.ndarray, gains: np.ndarray
+        self, numbers: np.ndarray, rows: slice, black: np.ndarray, gains: np.ndarray
     ) -> np.ndarray:
         """Photographs less black, over their gains."""
         stack = np.empty((len(numbers), *black.shape), np.float32)
-        for i, number in enumerate(numbers):
+        for i, number in enumerate(numbers.tolist()):
             np.subtract(self.pictures.read(number, rows), black, out=stack[i])
             stack[i] /= gains[i]
         return stack
@@ -224,20 +289,29 @@ class StripDecoder:
 
         (rows, W); one pair has no variance: 0.
         """
-        weight = pattern - inverse
-        weight *= weight
-        weight += TINY
-        weight /= weight.sum(axis=0)
+        if self.has_inverse.all():
+            return self._pair_statistics(pattern, inverse)
+        if self.has_inverses:
+            return self._pair_statistics(pattern[self.has_inverse], inverse[self.has_inverse])
+        weight = _weights(pattern - inverse)
         total = pattern + inverse
         mean = np.einsum("b...,b...->...", weight, total)
-        if self.has_inverses:
-            deviation = total - mean
-            freedom = 1.0 - np.einsum("b...,b...->...", weight, weight)
-            scale = 1.0 / np.maximum(freedom, MIN_FREEDOM)
-        else:
-            deviation = np.minimum(highest - pattern, pattern - lowest)
-            np.maximum(deviation, 0.0, out=deviation)
-            scale = SINGLE_VARIANCES
+        deviation = np.minimum(highest - pattern, pattern - lowest)
+        np.maximum(deviation, 0.0, out=deviation)
+        deviation *= deviation
+        variance = SINGLE_VARIANCES * np.einsum("b...,b...->...", weight, deviation)
+        return mean, np.sqrt(variance)
+
+    def _pair_statistics(
+        self, pattern: np.ndarray, inverse: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same of patterns that all have inverses."""
+        weight = _weights(pattern - inverse)
+        total = pattern + inverse
+        mean = np.einsum("b...,b...->...", weight, total)
+        deviation = total - mean
+        freedom = 1.0 - np.einsum("b...,b...->...", weight, weight)
+        scale = 1.0 / np.maximum(freedom, MIN_FREEDOM)
         deviation *= deviation
         variance = scale * np.einsum("b...,b...->...", weight, deviation)
         return mean, np.sqrt(variance)
@@ -255,8 +329,9 @@ class StripDecoder:
             return
         total = total[is_lit]
         if self.has_inverses:
-            for bit, pair in enumerate(zip(pattern, inverse, strict=True)):
-                p, q = (light[is_lit] / total for light in pair)
+            for bit in np.flatnonzero(self.has_inverse).tolist():
+                p = pattern[bit][is_lit] / total
+                q = inverse[bit][is_lit] / total
                 self.gains[:, bit] = _pair_gains(p, q)
         else:
             self.gains[0] = _single_gains(pattern[:, is_lit] / total, self.bits)
@@ -296,11 +371,23 @@ def _single_gains(pattern: np.ndarray, bits: tuple[int, int]) -> np.ndarray:
     return gains
 
 
+def significance(bits: tuple[int, int]) -> np.ndarray:
+    """Power of two of each bit, (B,): those of columns, highest first, then those of rows."""
+    column_bits, row_bits = bits
+    return np.concatenate([np.arange(column_bits)[::-1], np.arange(row_bits)[::-1]])
+
+
 def _has_fine_stripes(bits: tuple[int, int]) -> np.ndarray:
     """True for bits whose stripes are fine, (B,)."""
-    column_bits, row_bits = bits
-    significance = np.concatenate([np.arange(column_bits)[::-1], np.arange(row_bits)[::-1]])
-    return significance < FINE_BITS
+    return significance(bits) < FINE_BITS
+
+
+def _weights(difference: np.ndarray) -> np.ndarray:
+    """Squares of the differences of patterns and inverses (B, ...), relative to their sum."""
+    difference *= difference
+    difference += TINY
+    difference /= difference.sum(axis=0)
+    return difference
 
 
 def _decode_bits(

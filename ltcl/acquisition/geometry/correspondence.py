@@ -120,8 +120,8 @@ def decode(
     ----------
     images : sequence of (H, W) or (H, W, 3) arrays
         Photographs of `GrayCode(grid).patterns()`, in that order: linear or raw, all of one
-        exposure. Without the inverses, which is less sure: of every other pattern, then white and
-        black.
+        exposure. Or those of `GrayCode(grid, has_few_inverses=True)`, or without the inverses,
+        which is less sure: of every other pattern, then white and black.
     grid : (int, int)
         Height and width of the projector.
     subpixel : bool

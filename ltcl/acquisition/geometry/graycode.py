@@ -4,7 +4,8 @@
 Neighbouring columns differ in one bit, so a pixel on the edge of a stripe has one undecided bit
 only, and its coordinate lies between two neighbours. The patterns are those of OpenCV's
 structured_light, in its order: column bits, highest first, each followed by its inverse; then row
-bits; then white and black. `bits` decides what photographs of them show.
+bits; then white and black. `bits` decides what photographs of them show. To spare photographs,
+inverses of coarse bits may be left out: white tells them from black, and few edges are theirs.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.geometry.axis import Axis
-from ltcl.acquisition.geometry.bits import BRIGHTEST_QUANTILE, StripDecoder
+from ltcl.acquisition.geometry.bits import BRIGHTEST_QUANTILE, BitLayout, StripDecoder
 from ltcl.acquisition.geometry.photographs import PhotographFile, PhotographList, Photographs
 from ltcl.acquisition.radiometry.strips import in_strips
 from ltcl.errors import InputError
@@ -37,6 +38,9 @@ MIN_CODES = 1.5
 # Rows of a photograph that determine it.
 MAX_SAMPLED_ROWS = 512
 
+# Finest bits of each axis that are followed by their inverses where photographs are spared.
+FEW_INVERSES = 3
+
 
 @dataclass(frozen=True)
 class GrayCode:
@@ -46,6 +50,8 @@ class GrayCode:
     ----------
     grid : (int, int)
         Height and width of the projector.
+    has_few_inverses : bool
+        Inverses of the three finest bits of each axis alone.
 
     Raises
     ------
@@ -63,9 +69,11 @@ class GrayCode:
     """
 
     grid: tuple[int, int]
+    has_few_inverses: bool = False
 
     def __post_init__(self) -> None:
         checks.grid("grid", self.grid)
+        checks.flag("has_few_inverses", self.has_few_inverses)
 
     @property
     def bits(self) -> tuple[int, int]:
@@ -76,17 +84,39 @@ class GrayCode:
     @property
     def count(self) -> int:
         """Number of patterns."""
-        return 2 * sum(self.bits) + 2
+        return self.layout.count
+
+    @property
+    def layout(self) -> BitLayout:
+        """Places of the bits among the patterns."""
+        return BitLayout(self.bits, FEW_INVERSES if self.has_few_inverses else max(self.bits))
+
+    def layout_of(self, count: int) -> BitLayout:
+        """Places of the bits among so many photographs, with all, few or no inverses."""
+        allowed = []
+        for inverses in (max(self.bits), FEW_INVERSES, 0):
+            layout = BitLayout(self.bits, inverses)
+            if layout.count == count:
+                return layout
+            allowed.append(layout.count)
+        every, few, none = allowed
+        raise InputError(
+            f"photographs are {count}; they must be {every}, one for each pattern, "
+            f"{few} with inverses of fine bits alone, or {none} without the inverses"
+        )
 
     def patterns(self) -> list[np.ndarray]:
         """Patterns as codes (h, w) in {0, 1}, float32, which are not to be written to."""
         h, w = self.grid
         column_bits, row_bits = self.bits
+        codes = [bit[None, :] for bit in _gray_bits(w, column_bits)]
+        codes += [bit[:, None] for bit in _gray_bits(h, row_bits)]
         patterns = []
-        for bit in _gray_bits(w, column_bits):
-            patterns += self._with_inverse(bit[None, :])
-        for bit in _gray_bits(h, row_bits):
-            patterns += self._with_inverse(bit[:, None])
+        for bit, has_inverse in zip(codes, self.layout.has_inverse, strict=True):
+            code = bit.astype(np.float32)
+            patterns.append(np.broadcast_to(code, self.grid))
+            if has_inverse:
+                patterns.append(np.broadcast_to(1.0 - code, self.grid))
         patterns.append(np.ones(self.grid, np.float32))
         patterns.append(np.zeros(self.grid, np.float32))
         return patterns
@@ -103,8 +133,8 @@ class GrayCode:
         Parameters
         ----------
         images : sequence of (H, W) or (H, W, 3) arrays
-            Photographs of `patterns()`, in that order, or of these without the inverses, as in
-            `ltcl.acquisition.geometry.decode`.
+            Photographs of `patterns()`, in that order, or of these with few or without inverses, as
+            in `ltcl.acquisition.geometry.decode`.
         levels : int, optional
             Number of codes of the camera if images are floats.
         edges : bool
@@ -120,26 +150,17 @@ class GrayCode:
             As in `ltcl.acquisition.geometry.decode`.
         """
         count = len(images)
-        without_inverses = sum(self.bits) + 2
-        if count not in (self.count, without_inverses):
-            raise InputError(
-                f"photographs are {count}; they must be {self.count}, one for each pattern, "
-                f"or {without_inverses} without the inverses"
-            )
+        layout = self.layout_of(count)
         pictures: Photographs
         if isinstance(images, PhotographFile):
             pictures = images
         else:
             pictures = PhotographList(images)
         min_difference = _min_difference(pictures, levels)
-        decoder = StripDecoder(self.grid, self.bits, pictures, min_difference, edges)
+        decoder = StripDecoder(self.grid, layout, pictures, min_difference, edges)
         H, W = pictures.shape
         in_strips(H, max(STRIP_VALUES // (W * count), MIN_STRIP_ROWS), decoder.decode)
         return decoder.x, decoder.y
-
-    def _with_inverse(self, bit: np.ndarray) -> list[np.ndarray]:
-        code = bit.astype(np.float32)
-        return [np.broadcast_to(code, self.grid), np.broadcast_to(1.0 - code, self.grid)]
 
 
 def _gray_bits(size: int, bits: int) -> list[np.ndarray]:

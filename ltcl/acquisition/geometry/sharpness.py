@@ -175,11 +175,14 @@ def _measure_leak(
     """
     if R.grid[axis] == 1:
         return 0.0
-    code = GrayCode(R.grid)
-    numbers = _finest_patterns(code, axis)
-    has_photographs = len(light) > numbers[-1] + 1
     is_seen = np.moveaxis(R.seen, axis, -1)[:, 1:-1]
-    if len(numbers) < MIN_PATTERNS or not has_photographs or not is_seen.any():
+    if not len(light) or not is_seen.any():
+        return None
+    code = GrayCode(R.grid)
+    has_few_inverses = len(light) != code.count
+    code = GrayCode(R.grid, has_few_inverses)
+    numbers = code.layout.pairs_of_axis(axis)[-FINE_BITS:].tolist()
+    if len(numbers) < MIN_PATTERNS or len(light) != code.count:
         return None
 
     # A (n - 2, patterns, 2) has the columns b_n and (b_n-1 + b_n+1) / 2.
@@ -202,15 +205,3 @@ def _measure_leak(
         return None
     q = np.median(neighbours[is_lit] / direct[is_lit])
     return float(np.clip(q, 0.0, 1.0))
-
-
-def _finest_patterns(code: GrayCode, axis: int) -> range:
-    """Numbers of the finest patterns of an axis; each is followed by its inverse."""
-    column_bits, row_bits = code.bits
-    if axis == 1:
-        first = 0
-        last = 2 * column_bits
-    else:
-        first = 2 * column_bits
-        last = 2 * (column_bits + row_bits)
-    return range(max(first, last - 2 * FINE_BITS), last, 2)

@@ -48,9 +48,16 @@ class FedProjector:
 
     def codes(self, light: np.ndarray) -> np.ndarray:
         """Codes (h, w[, 3]) on its own pixels for light on the pixels of T."""
-        if self.response.channels == 3 and light.ndim == 2:
-            light = np.repeat(light[..., None], 3, axis=-1)
-        return self.warp.enlarged(self.response.codes(light))
+        return self.warp.enlarged(self.response.codes(self._in_channels(light)))
+
+    def light(self, codes: np.ndarray) -> np.ndarray:
+        """Mean light on the pixels of T of codes (h, w[, 3]) on its own pixels."""
+        return self.warp.reduced(self.response.linear(self._in_channels(codes)))
+
+    def _in_channels(self, picture: np.ndarray) -> np.ndarray:
+        if self.response.channels == 3 and picture.ndim == 2:
+            return np.repeat(picture[..., None], 3, axis=-1)
+        return picture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,6 +68,8 @@ class CombinedSetup:
     ----------
     projectors : tuple of FedProjector
     channels : 1 or 3
+    ambient : (h, w[, 3]), optional
+        Light under black projectors, where T is the scan of one alone; a combination has it itself.
 
     Examples
     --------
@@ -71,10 +80,9 @@ class CombinedSetup:
 
     projectors: tuple[FedProjector, ...]
     channels: int
+    ambient: np.ndarray | None = None
     # Several responses: codes are made of light here, not by one curve.
     response = None
-    # The combination has it.
-    ambient = None
 
     @classmethod
     def of(cls, T: Any) -> CombinedSetup | None:
@@ -96,6 +104,21 @@ class CombinedSetup:
                 FedProjector(warp=Warp(places, member.grid), response=Response(response), name=name)
             )
         return cls(projectors=tuple(projectors), channels=T.channels)
+
+    @classmethod
+    def of_scan(cls, path: str | os.PathLike[str]) -> CombinedSetup | None:
+        """The set-up of one of several projectors alone, by its store; None for other stores."""
+        store = as_path(path)
+        if not has_facts(store):
+            return None
+        setup = Setup.of(store)
+        facts = read_facts(store)
+        projector = FedProjector(
+            warp=Warp.of(facts.view().mapping, facts.side),
+            response=setup.calibration.projector,
+            name=facts.name,
+        )
+        return cls(projectors=(projector,), channels=setup.channels, ambient=setup.ambient)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -137,6 +160,14 @@ class CombinedSetup:
             codes.append(projector.codes(share))
         return self.montage.join(codes)
 
+    def light(self, codes: Any) -> np.ndarray:
+        """Light (h, w[, 3]), relative to white, of codes in [0, 1] on the projectors' pixels."""
+        values = checks.finite("codes", checks.real("codes", codes)).astype(np.float32)
+        lights = []
+        for projector, own in zip(self.projectors, self.montage.split(values), strict=True):
+            lights.append(projector.light(own))
+        return self.light_montage.join(lights)
+
 
 def _check_places(name: str, places: np.ndarray, grid: tuple[int, int]) -> None:
     is_map = places.ndim == 2 and places.dtype.kind in "iu" and places.size > 0
@@ -146,7 +177,14 @@ def _check_places(name: str, places: np.ndarray, grid: tuple[int, int]) -> None:
 
 def facts_path(store: Path) -> Path:
     """File beside the store of a scan of one of several projectors."""
+    if store.name in ("", ".."):
+        store = store.resolve()
     return store.with_suffix(FACTS_SUFFIX)
+
+
+def has_facts(store: Path) -> bool:
+    """True if this is the store of a scan of one of several projectors, with its facts beside."""
+    return store.is_dir() and facts_path(store).exists()
 
 
 def write_facts(store: Path, *, view: Path, side: int) -> None:
@@ -190,7 +228,7 @@ def read_facts(store: Path) -> ScanFacts:
     path = facts_path(store)
     try:
         facts = json.loads(input_file(path).read_text(encoding="utf-8"))
-        view = store.parent / str(facts["map"])
+        view = path.parent / str(facts["map"])
         side = checks.count("side", facts["side"], least=MIN_SIDE)
     except (ValueError, KeyError, TypeError, InputError) as error:
         raise FileError(f"{path}: is damaged: {error}") from None
@@ -236,7 +274,7 @@ def combine_scans(
     ambient = []
     for number, path in enumerate(as_path(store) for store in stores):
         store = BlockStore.open(path)
-        if not store.final or not facts_path(path).exists():
+        if not store.final or not has_facts(path):
             raise InputError(
                 f"{path}: is no finished scan of one of several projectors, as 'ltcl acquire run' "
                 "makes of an acquisition.toml with [[projector]]"

@@ -70,6 +70,21 @@ def camera_geometry(camera_grid: tuple[int, int], side: int) -> Correspondence:
     return Correspondence(x, y, is_inside, (height, width))
 
 
+def is_of_squares(mapping: Correspondence) -> bool:
+    """True if a map is that of `camera_geometry`, of one of several projectors.
+
+    >>> is_of_squares(camera_geometry((9, 12), 3)), is_of_squares(Correspondence.aligned((9, 12)))
+    (True, False)
+    """
+    step = float(np.nan_to_num(np.diff(mapping.x[0, :2])).max(initial=0.0))
+    side = round(1.0 / step) if step > 0.0 else 0
+    if side < MIN_SIDE or min(mapping.camera_grid) < side:
+        return False
+    squares = camera_geometry(mapping.camera_grid, side)
+    is_same_column = np.array_equal(mapping.x, squares.x, equal_nan=True)
+    return is_same_column and np.array_equal(mapping.y, squares.y, equal_nan=True)
+
+
 @dataclass(frozen=True, eq=False)
 class Warp:
     """The map from the pixels of T to those of a projector.
@@ -132,6 +147,16 @@ class Warp:
         shown = flat[np.maximum(self.places, 0)]
         shown[self.places < 0] = 0
         return shown
+
+    def reduced(self, picture: np.ndarray) -> np.ndarray:
+        """Means of a picture (h, w[, 3]) of the projector over each pixel of T; 0 without any."""
+        is_shown = self.places >= 0
+        shape = (self.grid[0] * self.grid[1], *picture.shape[2:])
+        total = np.zeros(shape, np.float64)
+        np.add.at(total, self.places[is_shown], picture[is_shown])
+        counts = np.bincount(self.places[is_shown], minlength=shape[0])
+        means = total.T / np.maximum(counts, 1)
+        return means.T.reshape(*self.grid, *shape[1:]).astype(np.float32)
 
 
 def _largest_distance(mapping: Correspondence) -> float:

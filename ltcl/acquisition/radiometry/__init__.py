@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from ltcl.acquisition.radiometry.merge import Radiance, merge
 from ltcl.acquisition.radiometry.noise import NoiseModel, black_level, estimate
-from ltcl.acquisition.radiometry.projector import mixing, projector_response
+from ltcl.acquisition.radiometry.projector import colour_response, mixing, projector_response
 from ltcl.acquisition.radiometry.response import Response
 from ltcl.acquisition.radiometry.response_fit import calibrate
 
 __all__ = ["NoiseModel", "Radiance", "Response"]
-__all__ += ["black_level", "calibrate", "estimate", "merge", "mixing", "projector_response"]
+__all__ += ["black_level", "calibrate", "colour_response", "estimate", "merge", "mixing"]
+__all__ += ["projector_response"]

@@ -9,6 +9,13 @@ Under a uniform code c camera pixel p has the radiance L_p(c) = a_p + g(c) s_p: 
 where V are the variances of L, the bias of the products, and w_p = 1 / (V_p(0) + V_p(1)). Isotonic
 regression makes g monotone; between the codes it is a monotone cubic.
 
+With all three channels d at code c the light adds up, each with its own curve,
+
+    L_p(c) = a_p + sum_d g_d(c) s_pd
+
+so that a picture of each channel alone at code 1 and one of all of them at each code give all three
+curves, by least squares over the camera's pixels and channels.
+
 With channel d of the projector lit alone, channel c of the camera has the radiance L_cd(p) above
 black. The mixing is relative to a channel's own light, as `ltcl.Transport(mixing=)` takes it:
 M_cc = 1,
@@ -40,6 +47,9 @@ TABLE_SIZE = 1025
 
 # Standard errors that white must be above black: one black projector in 700 passes.
 MIN_WHITE_DEVIATIONS = 3.0
+
+# Least part of the light of three colours in which they differ, relative to noise.
+MIN_COLOUR_LIGHT = 3.0
 
 # Instead of a division by zero.
 TINY = 1e-300
@@ -89,6 +99,84 @@ def _rises_from_0_to_1(codes: np.ndarray) -> bool:
         return False
     is_rising = np.all(np.diff(codes) > 0)
     return bool(is_rising and codes[0] == 0 and codes[-1] == 1)
+
+
+def colour_response(
+    codes: Any, pictures: Sequence[Radiance], colours: Sequence[Radiance], black: Radiance
+) -> Response:
+    """Response of the three channels of a projector, from pictures of all of them at one code.
+
+    Parameters
+    ----------
+    codes : (K,) array_like
+        Uniform codes that rise from 0 to 1.
+    pictures : sequence of K - 2 Radiance
+        Merged pictures (H, W, 3) of the scene with all channels at each of the codes between.
+    colours : sequence of 3 Radiance
+        Those with red, green or blue alone at code 1.
+    black : Radiance
+        That with all at code 0.
+
+    Returns
+    -------
+    Response
+        1025 values a channel, from 0 to 1.
+
+    Raises
+    ------
+    InputError
+        The codes do not rise from 0 to 1, the number of pictures differs, or a colour is as dark as
+        black, or no other one than the rest.
+
+    Examples
+    --------
+    >>> M, ones = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.1], [0.0, 0.3, 1.0]]), np.ones((4, 5, 3))
+    >>> powers = np.array([1.8, 2.0, 2.2])
+    >>> lit = [
+    ...     Radiance(M @ light * ones, 1e-8 * ones, ones > 0)
+    ...     for light in (*np.eye(3), 0.5**powers, np.zeros(3))
+    ... ]
+    >>> response = colour_response([0, 0.5, 1], lit[3:4], lit[:3], lit[4])
+    >>> bool(np.allclose(response.linear(np.full(3, 0.5)), 0.5**powers, atol=1e-4))
+    True
+    """
+    levels = checks.real("codes", codes).astype(np.float64)
+    checks.finite("codes", levels)
+    if not _rises_from_0_to_1(levels):
+        raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
+    if len(pictures) != len(levels) - 2 or len(colours) != 3:
+        raise InputError(
+            f"pictures holds {len(pictures)} and colours {len(colours)} picture(s); they must hold "
+            f"{len(levels) - 2}, one for each code between 0 and 1, and three"
+        )
+    is_valid = np.all([picture.valid for picture in (black, *colours, *pictures)], axis=0)
+    if not is_valid.any():
+        raise InputError(
+            "pictures have no value that is valid under all codes; other exposures are needed"
+        )
+    a = black.value[is_valid].astype(np.float64)
+    a_variance = black.variance[is_valid].astype(np.float64)
+    lit = np.stack([colour.value[is_valid] for colour in colours]).astype(np.float64)
+    lit_variance = np.stack([colour.variance[is_valid] for colour in colours]).astype(np.float64)
+    s = lit - a
+    for d in range(3):
+        error = np.sqrt(np.sum(a_variance + lit_variance[d]))
+        if np.sum(s[d]) < MIN_WHITE_DEVIATIONS * error:
+            raise InputError(f"colours[{d}] is no brighter than black; {NO_LIGHT}")
+    w = 1.0 / np.maximum(a_variance + lit_variance.sum(axis=0), TINY)
+    # The same noise of black is in all differences, and that of each colour in its own square.
+    bias = w @ a_variance
+    noise = bias + lit_variance @ w
+    squares = (s * w) @ s.T - bias - np.diag(lit_variance @ w)
+    if np.linalg.eigvalsh(squares)[0] < MIN_COLOUR_LIGHT * noise.max():
+        raise InputError(
+            "colours are alike in the camera's channels; the projector must have three"
+        )
+    tables = np.empty((len(pictures), 3))
+    for k, picture in enumerate(pictures):
+        products = (s * w) @ (picture.value[is_valid] - a) - bias
+        tables[k] = np.linalg.solve(squares, products)
+    return Response(np.stack([_monotone_table(levels, g) for g in tables.T]))
 
 
 def _channel_table(codes: np.ndarray, pictures: Sequence[Radiance], name: str) -> np.ndarray:

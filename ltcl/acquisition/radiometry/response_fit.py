@@ -57,7 +57,7 @@ class FitSettings:
     candidates : int
         Pixels of the photographs, spread evenly, of which samples are drawn.
     samples : int
-        Pixels of a channel (1024: 0.14 %, 4096: 0.08 %).
+        Pixels of a channel (1024: 0.14 %, 4096: 0.08 %), unless `calibrate` is told.
     min_pixels : int
         Pixels between black and saturation at two exposures, at least two for an unknown.
     brightness_bins : int
@@ -123,7 +123,12 @@ GREVILLE_ABSCISSAE = _greville_abscissae(KNOTS)
 
 
 def calibrate(
-    images: Sequence[Any], seconds: Any, *, levels: int | None = None, saturation: float = 0.98
+    images: Sequence[Any],
+    seconds: Any,
+    *,
+    levels: int | None = None,
+    saturation: float = 0.98,
+    samples: int = SETTINGS.samples,
 ) -> Response:
     """Estimate the camera's response from photographs of one scene.
 
@@ -137,6 +142,8 @@ def calibrate(
         Number of codes of the camera; None for all of the type.
     saturation : float
         Codes above, of full scale, are not used.
+    samples : int
+        Pixels that are used, at most.
 
     Returns
     -------
@@ -160,14 +167,15 @@ def calibrate(
     stack = exposure_stack(images, seconds, levels)
     stack.check_different_exposures(seconds)
     checks.number("saturation", saturation, above=0.0, most=1.0)
+    checks.count("samples", samples)
     tables = []
     for codes in np.moveaxis(stack.codes(SETTINGS.candidates), -1, 0):
-        fit = CurveFit(_sample_pixels(codes), stack.seconds, stack.levels, saturation)
+        fit = CurveFit(_sample_pixels(codes, samples), stack.seconds, stack.levels, saturation)
         tables.append(_tabulate(fit.run(), TABLE_SIZE))
     return Response(np.stack(tables))
 
 
-def _sample_pixels(codes: np.ndarray) -> np.ndarray:
+def _sample_pixels(codes: np.ndarray, samples: int) -> np.ndarray:
     """Random pixels of codes (K, pixels), spread over all levels of brightness, as float64."""
     brightness = codes.mean(axis=0)
     low = brightness.min()
@@ -178,7 +186,7 @@ def _sample_pixels(codes: np.ndarray) -> np.ndarray:
     # bin.
     bin_sizes = np.bincount(bins)[bins]
     keys = np.random.default_rng(0).exponential(size=len(bins)) * bin_sizes
-    count = min(SETTINGS.samples, len(keys))
+    count = min(samples, len(keys))
     chosen = np.argpartition(keys, count - 1)[:count]
     return codes[:, chosen].astype(np.float64)
 

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.scanning.pictures import Picture, ScanCamera
+from ltcl.acquisition.scratch import scratch_array
 from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
 
@@ -78,24 +79,37 @@ class PictureLog:
         self._write(batch, pictures)
         return pictures
 
+    def name_photographs(self, photographs: Sequence[str]) -> None:
+        """Name the photographs of the first patterns, which were taken before the scan."""
+        for place, photograph in enumerate(photographs):
+            self.names[place] = f"pattern {place + 1} ({photograph})"
+
+    def put(self, pictures: Sequence[Picture]) -> None:
+        """Keep the pictures of the next batch, which were taken before."""
+        self._write(self._batches, pictures)
+        self._batches += 1
+
     def _read(self, batch: int, expected: int) -> list[Picture]:
         """Pictures of a batch in the store, which must be as many as expected."""
         layout = self._store.layout
         _, pixels = layout.block_shape(batch, "columns")
-        values = []
-        variances = []
+        shape = (expected, layout.channels, pixels)
+        # A batch of many pixels would fill the memory.
+        values = scratch_array(shape, np.float32)
+        variances = scratch_array(shape, np.float32)
         for channel in range(layout.channels):
             # Batches of a scan have variances.
             block: Any = self._store.block(channel, batch)
-            values.append(np.reshape(block.matrix.data, (-1, pixels)))
-            variances.append(np.reshape(block.variance, (-1, pixels)))
-        if len(values[0]) != expected:
-            raise AcquisitionError(
-                f"{self._store.path} has {len(values[0])} pictures in batch {batch}; "
-                f"it must have {expected}: it is that of another scan"
-            )
+            stored = len(block.variance) // pixels
+            if stored != expected:
+                raise AcquisitionError(
+                    f"{self._store.path} has {stored} pictures in batch {batch}; "
+                    f"it must have {expected}: it is that of another scan"
+                )
+            values[:, channel] = np.reshape(block.matrix.data, (-1, pixels))
+            variances[:, channel] = np.reshape(block.variance, (-1, pixels))
         pictures = []
-        for value, variance in zip(np.stack(values, 1), np.stack(variances, 1), strict=True):
+        for value, variance in zip(values, variances, strict=True):
             pictures.append(Picture(value=value, variance=variance))
         return pictures
 

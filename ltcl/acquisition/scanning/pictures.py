@@ -191,6 +191,18 @@ class ScanGrid:
             variance=variance.astype(np.float32),
         )
 
+    def merge(self, photographs: Sequence[Photograph]) -> StoredRadiance:
+        """The radiance of a pattern by its photographs, ambient light included."""
+        return merge_photographs(photographs, self.calibration.camera, None, ImageFile())
+
+    def without_ambient(self, lit: Picture) -> Picture:
+        """A picture less the ambient light, of whose variance each picture has the same part."""
+        known = (lit.variance < UNKNOWN) & (self.dark.variance < UNKNOWN)
+        return Picture(
+            value=np.where(known, lit.value - self.dark.value, np.float32(0.0)),
+            variance=np.where(known, lit.variance, UNKNOWN),
+        )
+
     def _block_sums(self, picture: np.ndarray) -> np.ndarray:
         """Sums over the blocks, (channels, M), of a picture (h, w, channels)."""
         sums = np.moveaxis(self.blocks.sum(picture), -1, 0)
@@ -253,8 +265,8 @@ class ScanCamera(ScanGrid):
             photographs = self._photograph(codes, times)
             if self._deviation(photographs) is not None:
                 self._refuse(photographs, batch[k + 1 : k + 2])
-            light = self._merge(photographs)
-            pictures.append(self._without_ambient(self.picture(light)).stored())
+            light = self.merge(photographs.images)
+            pictures.append(self.without_ambient(self.picture(light)).stored())
             stored = anchor.compact(light, self._compact)
             exposed.append(replace(photographs, images=[], light=stored))
             progress(1)
@@ -278,18 +290,6 @@ class ScanCamera(ScanGrid):
         end = self.shots.number + 1
         numbers = range(end - len(images), end)
         return _ExposedPattern(codes=codes, images=images, seconds=seconds, numbers=numbers)
-
-    def _merge(self, photographs: _ExposedPattern) -> StoredRadiance:
-        """The radiance of a pattern."""
-        return merge_photographs(photographs.images, self.calibration.camera, None, ImageFile())
-
-    def _without_ambient(self, lit: Picture) -> Picture:
-        """A picture less the ambient light, of whose variance each picture has the same part."""
-        known = (lit.variance < UNKNOWN) & (self.dark.variance < UNKNOWN)
-        return Picture(
-            value=np.where(known, lit.value - self.dark.value, np.float32(0.0)),
-            variance=np.where(known, lit.variance, UNKNOWN),
-        )
 
     def _deviation(self, photographs: _ExposedPattern) -> Deviation | None:
         """Exposures of a pattern that deviate, at pixels that see the projector, or see it lit."""
@@ -365,7 +365,7 @@ class ScanCamera(ScanGrid):
         gain = known.anchor.lamp_gain(*shot)
         if known.anchor.deviation(*shot, gain) is None:
             return gain
-        light = anchor.compact(self._merge(blocks), self._compact)
+        light = anchor.compact(self.merge(blocks.images), self._compact)
         series = [*exposed, replace(blocks, images=[], light=light)]
         setup = known.white, known.ambient, known.resampling
         shifts = []

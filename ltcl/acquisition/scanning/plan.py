@@ -113,9 +113,13 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class _Outlook:
-    """Patterns of a scan in batches of a size, its stored entries, and the variance of T p."""
+    """Patterns of a scan in batches of a size, its stored entries, and the variance of T p.
+
+    `known` of the patterns are photographed by the calibration.
+    """
 
     patterns: int
+    known: int = 0
     batches: int
     entries: int
     variance: float
@@ -133,6 +137,7 @@ def plans(
     threshold: float = ScanSettings.threshold,
     overhead: float = 0.0,
     calibration: int | None = None,
+    stripes: int | None = None,
     frames: int = ScanSettings.frames,
     aligned: bool = False,
     by_hand: bool = False,
@@ -159,6 +164,8 @@ def plans(
         Seconds of each photograph besides its exposure.
     calibration : int, optional
         Photographs of the calibration; None: as many as expected.
+    stripes : int, optional
+        Photographs of it that are pictures of a sketch as well; None: as many as expected.
     frames, aligned, by_hand
         What the number of these depends on, as in `calibrate.expected_photographs`.
     fixed_exposures : bool
@@ -190,12 +197,22 @@ def plans(
         setup = calibration
         if setup is None:
             setup = expected_photographs(
-                grid, channels, frames, aligned=aligned, by_hand=by_hand, sparing=sparing
+                grid,
+                channels,
+                frames,
+                aligned=aligned,
+                by_hand=by_hand,
+                sparing=sparing,
+                direct=strategy == "direct",
             )
         if strategy == "block":
             pixels = Blocks(grid, min(block, max(grid))).grid
         if strategy == "sketch":
-            outlook = _sketch_outlook(grid, merged, light)
+            known = stripes
+            if known is None:
+                is_shown = not aligned and len(times) == 1
+                known = sketch.count_stripes(grid) if is_shown else 0
+            outlook = _sketch_outlook(grid, merged, light, known)
         elif strategy == "direct":
             outlook = _direct_outlook(grid, merged, light)
         elif strategy == "adaptive":
@@ -203,10 +220,11 @@ def plans(
         else:
             code = columns.choose_code(strategy, pixels, order)
             outlook = _column_outlook(code, math.prod(pixels), merged, light)
-        photographs = setup + len(times) * outlook.patterns + outlook.batches
+        taken = outlook.patterns - outlook.known
+        photographs = setup + len(times) * taken + outlook.batches
         # The calibration's exposures are about the geometric mean of those of the scan.
         calibration_seconds = setup * math.sqrt(times[0] * times[-1])
-        scan_seconds = outlook.patterns * times.sum()
+        scan_seconds = taken * times.sum()
         computing = None
         if megapixels is not None and pace is not None:
             computing = photographs * megapixels * pace
@@ -243,7 +261,9 @@ class _MergedNoise:
         return float(1.0 / np.sum(precision))
 
 
-def _sketch_outlook(grid: tuple[int, int], merged: _MergedNoise, light: Light) -> _Outlook:
+def _sketch_outlook(
+    grid: tuple[int, int], merged: _MergedNoise, light: Light, known: int
+) -> _Outlook:
     """A sketch, each of whose pictures has half of the light; what it cannot resolve is guessed."""
     patterns = sketch.count_patterns(grid)
     white = light.direct + light.indirect
@@ -251,7 +271,8 @@ def _sketch_outlook(grid: tuple[int, int], merged: _MergedNoise, light: Light) -
     noise = functions / patterns * merged.variance(0.5 * white)
     return _Outlook(
         patterns=patterns,
-        batches=-(-patterns // BATCH_SIZE),
+        known=known,
+        batches=-(-(patterns - known) // BATCH_SIZE),
         entries=math.prod(grid) * (patterns + numbers_of_row(grid)),
         variance=noise + (SKETCH_ERROR * white) ** 2,
     )

@@ -107,6 +107,7 @@ class Report:
         first_bounce = np.asarray(scan.extra("first_bounce"))
         entries = _count_entries(scan, first_bounce.shape)
         patterns = int(scan.attributes["patterns"])
+        stripes = len(scan.attributes.get("stripes", ()))
         sharpness = math.nan
         blur = math.nan
         if grid.sharpness is not None:
@@ -124,7 +125,7 @@ class Report:
             grid=scan.layout.grid,
             channels=len(first_bounce),
             patterns=patterns,
-            photographs=patterns * len(calibration.exposures),
+            photographs=(patterns - stripes) * len(calibration.exposures),
             exposures=list(calibration.exposures),
             coverage=float(np.mean(calibration.resampling.coverage > 0)),
             doubtful=float(np.mean(scan.extra("calibration.resampling.doubtful"))),

@@ -6,7 +6,8 @@ functions that widen with the distance from its pixel (`acquisition.estimation`)
 hardly grows with the pixels, so neither does that of the patterns that show them. These are on or
 off, so that the curve of the projector does not matter. Of each scale s = 2^l there are
 
-    stripes    Gray code: 0 1 1 0 of s rows or columns each, repeated
+    stripes    Gray code: 0 1 1 0 of s rows or columns each, repeated; photographs of it that show
+               the geometry are used again
     products   w(row / s) xor w'(column / s) of Walsh functions w and w' of four steps, repeated
 
 Pictures of other kinds are photographed and never fitted (`judges`): the error of T p for them is
@@ -23,7 +24,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import cv2
 import numpy as np
@@ -66,20 +67,93 @@ CAUSES = "another light was on, the exposure was another one, or something moved
 logger = logging.getLogger(__name__)
 
 
-def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
+# Bits (h,) and (w,) of a pattern, which is their exclusive or.
+Sides = tuple[np.ndarray, np.ndarray]
+
+
+class PatternList(Sequence[np.ndarray]):
+    """Patterns (h, w) of 0 and 1, float32, each of which is made of its sides when it is asked for.
+
+    Those of 1920 x 1080 pixels would take a gigabyte. Pictures may follow them.
+    """
+
+    def __init__(self, sides: Sequence[Sides], pictures: Sequence[np.ndarray] = ()) -> None:
+        self._items: list[Sides | np.ndarray] = [*sides, *pictures]
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @overload
+    def __getitem__(self, number: int) -> np.ndarray: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[np.ndarray]: ...
+
+    def __getitem__(self, number: int | slice) -> np.ndarray | list[np.ndarray]:
+        if isinstance(number, slice):
+            return [self[place] for place in range(len(self))[number]]
+        item = self._items[number]
+        if isinstance(item, np.ndarray):
+            return item
+        down, across = item
+        return np.bitwise_xor.outer(down, across).astype(np.float32)
+
+
+def patterns(grid: tuple[int, int]) -> PatternList:
     """The patterns (h, w) of a sketch, of 0 and 1, coarse to fine.
 
     >>> len(patterns((4, 4))), len(patterns((64, 64)))
     (13, 53)
     """
-    return [np.bitwise_xor.outer(down, across).astype(np.float32) for down, across in _sides(grid)]
+    return PatternList(_sides(grid))
 
 
-def _sides(grid: tuple[int, int]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Bits (h,) and (w,) of each pattern, which is their exclusive or; the first of each is 0."""
+def stripes(grid: tuple[int, int]) -> PatternList:
+    """Those of the patterns that are the bits of `geometry.GrayCode`, in its order.
+
+    >>> len(stripes((64, 64)))
+    12
+    """
+    return PatternList(_stripes(grid))
+
+
+def patterns_to_take(grid: tuple[int, int], has_stripes: bool) -> PatternList:
+    """The patterns that a sketch photographs, and those that judge it.
+
+    Its calibration has photographed the stripes, or not.
+
+    >>> len(patterns_to_take((64, 64), has_stripes=True))
+    49
+    """
+    sides = _sides(grid)
+    if has_stripes:
+        known = {_key(bits) for bits in _stripes(grid)}
+        sides = [bits for bits in sides if _key(bits) not in known]
+    return PatternList(sides, judges(grid))
+
+
+def _stripes(grid: tuple[int, int]) -> list[Sides]:
+    """Bits of columns, coarse to fine, then those of rows."""
     row = np.arange(grid[0])
     column = np.arange(grid[1])
-    chosen: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    sides = []
+    for level in reversed(range((grid[1] - 1).bit_length())):
+        sides.append((0 * row, _gray(column >> level)))
+    for level in reversed(range((grid[0] - 1).bit_length())):
+        sides.append((_gray(row >> level), 0 * column))
+    return sides
+
+
+def _key(bits: Sides) -> bytes:
+    """Equal bits have equal keys."""
+    return np.concatenate(bits).astype(np.uint8).tobytes()
+
+
+def _sides(grid: tuple[int, int]) -> list[Sides]:
+    """Bits of each pattern; the first of each is 0."""
+    row = np.arange(grid[0])
+    column = np.arange(grid[1])
+    chosen: dict[bytes, Sides] = {}
     for level in reversed(range((max(grid) - 1).bit_length())):
         down = row >> level
         across = column >> level
@@ -91,7 +165,7 @@ def _sides(grid: tuple[int, int]) -> list[tuple[np.ndarray, np.ndarray]]:
             # A complement shows the same, as white is known.
             bits = of_rows ^ of_rows[0], of_columns ^ of_columns[0]
             if bits[0].any() or bits[1].any():
-                chosen.setdefault(np.concatenate(bits).astype(np.uint8).tobytes(), bits)
+                chosen.setdefault(_key(bits), bits)
     return list(chosen.values())
 
 
@@ -201,9 +275,20 @@ def count_patterns(grid: tuple[int, int]) -> int:
     return len(_sides(grid)) + JUDGES
 
 
-def most_patterns(grid: tuple[int, int], rounds: int = 0) -> int:
-    """Number of patterns that no sketch of so many rounds exceeds, in whole batches."""
-    return BATCH_SIZE * (-(-count_patterns(grid) // BATCH_SIZE) + rounds)
+def count_stripes(grid: tuple[int, int]) -> int:
+    """Patterns that are bits of Gray code."""
+    return len(_stripes(grid))
+
+
+def most_patterns(grid: tuple[int, int], rounds: int = 0, stripes: int = 0) -> int:
+    """Number of patterns that no sketch of so many rounds exceeds, in whole batches.
+
+    `stripes` are those that the calibration has photographed.
+    """
+    batches = rounds
+    for patterns in (stripes, count_patterns(grid) - stripes):
+        batches += -(-patterns // BATCH_SIZE)
+    return BATCH_SIZE * batches
 
 
 def photographs_of_round(exposures: int) -> int:
@@ -285,18 +370,23 @@ def scan(
     log: PictureLog,
     progress: Callable[[str, int, int], object] | None = None,
     rounds: Rounds | None = None,
+    stripes_by: Sequence[str] = (),
 ) -> Sketch:
     """Photograph the patterns and the judges, and estimate T.
 
     `log` takes the pictures, or has those of an earlier run; `progress` is called with "fit", rows
-    that are done, and all; `rounds` of other patterns follow if it says so.
+    that are done, and all; `rounds` of other patterns follow if it says so. `stripes_by` are names
+    of the photographs of stripes, if the log begins with them.
     """
     if rounds is None or math.prod(grid.grid) < LEAST_PIXELS:
         rounds = Rounds()
-    shown = [*patterns(grid.grid), *judges(grid.grid)]
+    pictures = SketchPictures(grid, log)
+    if stripes_by:
+        pictures.take(stripes(grid.grid))
+        log.name_photographs(stripes_by)
+    shown = patterns_to_take(grid.grid, has_stripes=bool(stripes_by))
     log.announce(shown)
-    pictures = SketchPictures(grid, log, JUDGES)
-    pictures.take(shown)
+    pictures.take(shown, JUDGES)
     estimate = _estimate(grid, pictures, progress)
     errors = [estimate.error]
     while rounds.go_on(errors) and log.can_take:

@@ -15,6 +15,7 @@ from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import UNKNOWN, ScanGrid
 from ltcl.acquisition.scratch import ScratchFrames
+from ltcl.store import BlockStore
 
 
 class SketchPictures:
@@ -28,8 +29,6 @@ class SketchPictures:
     grid : ScanGrid
         Its calibration has white.
     log : PictureLog
-    judges : int
-        The first patterns that are photographed end with so many that judge.
 
     Attributes
     ----------
@@ -37,11 +36,11 @@ class SketchPictures:
         The number of each pair in the order in which they were photographed; white is 0.
     """
 
-    def __init__(self, grid: ScanGrid, log: PictureLog, judges: int) -> None:
+    def __init__(self, grid: ScanGrid, log: PictureLog) -> None:
         self.numbers = [0]
         self._grid = grid
         self._log = log
-        self._judges = judges
+        self._judges = 0
         self._light = grid.calibration.light.astype(np.float32)
         pixels = len(grid.seen)
         self._patterns = ScratchFrames((pixels,), np.uint8)
@@ -64,23 +63,27 @@ class SketchPictures:
         """Names of all pairs but white."""
         return [self._log.names[number - 1] for number in self.numbers[1:]]
 
-    def take(self, shown: Sequence[np.ndarray]) -> None:
-        """Photograph patterns (h, w); from the second call on they come before those that judge."""
+    def take(self, shown: Sequence[np.ndarray], judges: int = 0) -> None:
+        """Photograph patterns (h, w), which come before those that judge.
+
+        So many of the last ones judge, in one call alone.
+        """
         first = len(self)
         self.numbers += range(first, first + len(shown))
         arrays = []
         for frames in (self._patterns, self._photographs, self._variance):
             arrays.append(frames.extend(len(shown)))
-        if first > 1:
+        if self._judges:
             first -= self._judges
             judging = self.numbers[first : first + self._judges]
             self.numbers = [*self.numbers[:first], *self.numbers[first + self._judges :], *judging]
             for array in arrays:
                 _move_to_end(array, first, self._judges)
+        self._judges += judges
         patterns, photographs, variance = arrays
         frame = first
         for start in range(0, len(shown), BATCH_SIZE):
-            batch = list(shown[start : start + BATCH_SIZE])
+            batch = [*shown[start : start + BATCH_SIZE]]
             for pattern, picture in zip(batch, self._log.take(batch), strict=True):
                 patterns[frame] = self._grid.light_of(pattern).ravel()
                 photographs[frame] = picture.value.T * self._light
@@ -105,3 +108,19 @@ def _move_to_end(array: np.ndarray, first: int, count: int) -> None:
     """Move frames to the end of an array, over frames that were not written yet."""
     for place in reversed(range(count)):
         array[len(array) - count + place] = array[first + place]
+
+
+def keep_stripes(store: BlockStore, grid: ScanGrid) -> list[str]:
+    """Keep the calibration's photographs of Gray code as the first pictures of a sketch.
+
+    Returns what names them in messages.
+    """
+    log = PictureLog(store, None, lambda done: None)
+    stripes = grid.calibration.stripes
+    for start in range(0, len(stripes), BATCH_SIZE):
+        pictures = []
+        for photograph in stripes[start : start + BATCH_SIZE]:
+            light = grid.merge([photograph])
+            pictures.append(grid.without_ambient(grid.picture(light)).stored())
+        log.put(pictures)
+    return [f"photograph {photograph.number}" for photograph in stripes]

@@ -247,7 +247,9 @@ class CombineReport(Report):
     fed: Annotated[
         list[list[int]], "Height and width of the codes of each projector; empty without scans."
     ]
-    contrast: Annotated[float | None, "Light of white over that of black; null if not known."]
+    contrast: Annotated[
+        float | None, "Light of white over that of black; null if not known, or infinite."
+    ]
     contrast_uniform: Annotated[float | None, "The same with black lifted to one level."]
     differences: Annotated[
         list[float], "Deviation of the colours of each projector from their mean, relative."

@@ -23,9 +23,8 @@ from ltcl.acquisition import Calibration, Correspondence, Project
 from ltcl.acquisition.calibration import stored_map
 from ltcl.acquisition.captures.map_file import read_map
 from ltcl.acquisition.geometry import Resampling
-from ltcl.acquisition.projectors import camera_geometry
-from ltcl.acquisition.projectors.combined import facts_path, read_facts
-from ltcl.acquisition.projectors.warp import MIN_SIDE
+from ltcl.acquisition.projectors.combined import facts_path, has_facts, read_facts
+from ltcl.acquisition.projectors.warp import is_of_squares
 from ltcl.acquisition.radiance import planes
 from ltcl.acquisition.several import scanned_stores
 from ltcl.errors import FileError, InputError
@@ -116,7 +115,7 @@ def _check_once(places: Sequence[Path]) -> None:
 
 def _name(place: Path, number: int, taken: Sequence[str]) -> str:
     """The projector's name in its project, where it has one that is not taken."""
-    if not facts_path(place).exists():
+    if not has_facts(place):
         return f"projector_{number}"
     name = read_facts(place).name
     unused = name
@@ -145,10 +144,10 @@ def _read_scan(path: Path, name: str) -> ExportedScan:
     calibration = Calibration.of(opened)
     mapping = stored_map(opened)
     resampling = calibration.resampling
-    if facts_path(path).exists():
+    if has_facts(path):
         mapping = _own_map(path, mapping)
         resampling = Resampling.of(mapping).ascertained_by(planes(calibration.white, "value"))
-    elif _has_squares(mapping, _slope(mapping)):
+    elif is_of_squares(mapping):
         raise FileError(
             f"{path}: has squares of camera pixels, as scans of several projectors; "
             f"{facts_path(path).name} and the map that it names, which tell the projector's own "
@@ -168,7 +167,7 @@ def _own_map(path: Path, squares: Correspondence) -> Correspondence:
             f"{facts_path(path)}: names a map of {known.camera_grid} camera pixels; the scan has "
             f"{squares.camera_grid}"
         )
-    if _has_squares(squares, facts.side):
+    if is_of_squares(squares):
         return known
     column = (facts.side * (squares.x + 0.5) - 0.5).astype(np.float32)
     row = (facts.side * (squares.y + 0.5) - 0.5).astype(np.float32)
@@ -176,18 +175,3 @@ def _own_map(path: Path, squares: Correspondence) -> Correspondence:
     y = cv2.remap(known.y, column, row, cv2.INTER_LINEAR, borderValue=np.nan)
     is_known = squares.valid & np.isfinite(x) & np.isfinite(y)
     return Correspondence(x, y, is_known, known.grid)
-
-
-def _slope(mapping: Correspondence) -> int:
-    """Camera pixels along a side of a projector pixel, at the upper left corner."""
-    step = float(np.nan_to_num(np.diff(mapping.x[0, :2])).max(initial=0.0))
-    return round(1.0 / step) if step > 0.0 else 0
-
-
-def _has_squares(mapping: Correspondence, side: int) -> bool:
-    """True if a map leads to squares of camera pixels of this side."""
-    if side < MIN_SIDE or min(mapping.camera_grid) < side:
-        return False
-    squares = camera_geometry(mapping.camera_grid, side)
-    is_same_column = np.array_equal(mapping.x, squares.x, equal_nan=True)
-    return is_same_column and np.array_equal(mapping.y, squares.y, equal_nan=True)

@@ -27,7 +27,7 @@ from ltcl.device import Array
 from ltcl.errors import ConvergenceError
 from ltcl.interop.calls import Differentiable
 from ltcl.operators import Operator
-from ltcl.operators.diagonal_blocks import are_small, joined_once
+from ltcl.operators.diagonal_blocks import are_quicker_joined, joined_once
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.tasks.compensation.derivative import CompensationDerivative
 from ltcl.tasks.compensation.gain import exact_gain, gain_within_loss
@@ -474,7 +474,7 @@ def _gather_evidence(
 def _queue_pictures(operators: Sequence[Operator], lights: Columns) -> list[Array]:
     """Queue T p of each system, or of all of them in one product."""
     are_single = all(light.shape[1] == 1 for light in lights)
-    if len(operators) > 1 and are_single and are_small(operators):
+    if len(operators) > 1 and are_single and are_quicker_joined(operators):
         joined = joined_once(operators)
         return [joined.apply(joined.device.upload(np.concatenate(lights)))]
     queued = []

@@ -246,6 +246,8 @@ class Compensator:
         }
         self.follows_gain = isinstance(gain, str) and gain == "follow"
         self._has_gain = not self.follows_gain
+        # The gain may follow again later.
+        self._has_peaks = self.follows_gain
         self._is_closed = False
         self._gain = 1.0
         # A background or weights in colour make grey frames colour, too.
@@ -291,6 +293,7 @@ class Compensator:
     @gain.setter
     def gain(self, value: float) -> None:
         self._gain = checks.number("gain", value, above=0.0, most=MAX_GAIN)
+        self._has_gain = True
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -410,7 +413,7 @@ class Compensator:
             table=self._code_table(colours, white),
             is_bounded=not self._clamp,
             is_warm=self._is_warm,
-            has_peaks=self.follows_gain,
+            has_peaks=self._has_peaks,
             slots=self._depth,
             bounces_every=self._bounces_every,
         )

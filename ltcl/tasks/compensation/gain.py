@@ -214,13 +214,20 @@ class ClosestPictureSearch:
         self.tried: list[GainTrial] = []
 
     def run(self) -> GainTrial:
-        """The trial with the least sine, to the tolerance."""
+        """The trial with the least sine, to the tolerance, or as far as limited solves tell it."""
         sine = 1.0
         for _ in range(MAX_TRIALS):
+            bound_before = self.bound
+            sine_before = sine
             self._try_next(sine)
             self.t, self.bound = lowest_of_tangents(self.tangents, 2 * self.farthest)
             sine = min(trial.sine for trial in self.tried)
             if sine <= max(self.enough, (1.0 + TOLERANCE) * self.bound):
+                break
+            # A solve that may take no more steps, and has told nothing new: nor will the next one.
+            closed_in = max(sine_before - sine, self.bound - bound_before)
+            is_limited = self.tried[-1].is_settled and not self.trials.is_on_host
+            if is_limited and closed_in <= TOLERANCE / 4 * sine:
                 break
         return min(self.tried, key=attrgetter("sine"))
 
@@ -228,8 +235,16 @@ class ClosestPictureSearch:
         on_the_way = TRIAL_FRACTION * (sine - self.bound)
         at_the_end = TOLERANCE / 4 * max(sine, self.enough)
         gain = self.first_gain / self.t
-        trial = self.trials.nearest(gain, self.light, max(on_the_way, at_the_end))
+        trial = self.trials.nearest(gain, self._start(gain), max(on_the_way, at_the_end))
         self.tried.append(trial)
-        self.light = trial.light
         self.tangents.append((trial.slope, (trial.least - trial.slope) / self.t))
         self.farthest = max(self.farthest, self.t)
+
+    def _start(self, gain: float) -> Columns:
+        """The light that came closest, at this gain."""
+        if not self.tried:
+            return self.light
+        closest = min(self.tried, key=attrgetter("sine"))
+        limits = self.trials.problem.limits
+        factor = np.float32(gain / closest.gain)
+        return [limits.clip(factor * light) for light in closest.light]

@@ -24,7 +24,6 @@ from ltcl.operators import CSR, Dense, IdentityPlus, Operator, block_diagonal
 from ltcl.operators.epilogue import Epilogue
 from ltcl.solvers.auto import SMALL
 from ltcl.solvers.bounded import Descent, Search, power_of_two
-from ltcl.solvers.chebyshev import chebyshev_steps
 from ltcl.solvers.survey import survey
 from ltcl.tasks.compensation.codes import CODE_TYPES, CodeTable, light_of_codes
 from ltcl.tasks.compensation.inputs import CompensationRequest
@@ -117,10 +116,16 @@ def _dense_inverses(systems: Sequence[Operator]) -> list[Dense] | None:
 
 
 class ByFixedSteps:
-    """Direct light by so many steps of Chebyshev's iteration as probes need to the tolerance.
+    """Direct light by so many steps as probes need to the tolerance, a product with R each.
 
-    With x = b + e and r = b - S b = -R b, S e = r is solved from e = 0, on coefficients where there
-    is a basis W: x = b + W^T e.
+    From x = b on, a step is
+
+        x' = x + w (b - S x) = (1 - w) x + w b - w R x,
+
+    one product with all its terms. The w are the reciprocals of the roots of Chebyshev's polynomial
+    on the bounds of the spectrum, in the order of Leja, in which rounding does not grow: after all
+    steps x is that of Chebyshev's iteration, whose directions and residuals no vector holds. Where
+    there is a basis W, x is on coefficients: x = b + W^T e.
 
     Attributes
     ----------
@@ -135,48 +140,67 @@ class ByFixedSteps:
     ) -> None:
         self._target = target
         self._direct = direct
-        W = S.coefficient_basis
-        system = S.on_coefficients() if W is not None else S
+        self._W = S.coefficient_basis
+        system = S.on_coefficients() if self._W is not None else S
         assert isinstance(system, IdentityPlus)  # noqa: S101 - so it is made
-        a = target
-        launches: list[Queued] = []
-        if W is not None:
-            a = S.device.empty((W.shape[0], target.columns))
-            launches.append(W.bind(target, a))
-        self._r = a.like()
-        self._e = a.like()
-        launches.append(system.R.bind(a, self._r, Epilogue(a=-system.sign)))
-        launches.append(vectors.bind_fill(self._e, 0.0))
-        self._begin = in_order(launches)
-        self._stepper = system.stepper(self._e, self._r, slots=MAX_FIXED_STEPS + 1)
-        if W is None:
-            self._finish: Queued = vectors.bind_axpby(1.0, target, 1.0, self._e, direct)
-        else:
-            added = Epilogue(b=1.0, y=target)
-            self._finish = W.bind(self._e, direct, added, transpose=True)
-        bounds = survey(S).spectrum
-        self._numbers: list[tuple[float, float]] = []
+        self._system = system
+        self._right = target
+        if self._W is not None:
+            self._right = S.device.empty((self._W.shape[0], target.columns))
+        self.queue: Queued = in_order([])
         self.residual = math.inf
         self.products = 0
-        self._choose_steps(S, bounds, rtol, probes)
+        self._choose_steps(S, survey(S).spectrum, rtol, probes)
 
     def _choose_steps(
         self, S: Operator, bounds: tuple[float, float], rtol: float, probes: np.ndarray
     ) -> None:
         """Take a step more until all probes are within the share of the tolerance."""
-        steps = chebyshev_steps(*bounds)
-        all_numbers = [next(steps) for _ in range(MAX_FIXED_STEPS)]
         for count in range(1, MAX_FIXED_STEPS):
-            # The numbers of the last direction, which no step takes, do not count.
-            self._numbers = all_numbers[: count + 1]
+            self.queue = self._bind(step_lengths(bounds, count))
             residual = max(self._residual(S, probe) for probe in probes)
             if not math.isfinite(residual):
                 break
             if residual <= PROBE_SHARE * rtol:
                 self.residual = residual
-                self.products = count + 1
+                self.products = count
                 return
-        self._numbers = []
+
+    def _bind(self, lengths: Sequence[float]) -> Queued:
+        """The launches of steps of these lengths."""
+        if self._W is None:
+            return self._bind_steps(lengths, self._direct, leaves_change=False)
+        change = self._right.like()
+        added = Epilogue(b=1.0, y=self._target)
+        return in_order(
+            [
+                self._W.bind(self._target, self._right),
+                self._bind_steps(lengths, change, leaves_change=True),
+                self._W.bind(change, self._direct, added, transpose=True),
+            ]
+        )
+
+    def _bind_steps(self, lengths: Sequence[float], out: Array, *, leaves_change: bool) -> Queued:
+        """The launches of steps from the right side b on, which leave x in `out`, or x - b."""
+        b = self._right
+        R = self._system.R
+        sign = self._system.sign
+        taken_off = 1.0 if leaves_change else 0.0
+        between = [b.like() for _ in lengths[1:3]]
+        x = b
+        launches: list[Queued] = []
+        for number, length in enumerate(lengths):
+            is_last = number + 1 == len(lengths)
+            following = out if is_last else between[number % 2]
+            of_b = length - taken_off if is_last else length
+            if x is b:
+                # The operand is the right side.
+                epilogue = Epilogue(a=-length * sign, c=1.0 - length + of_b)
+            else:
+                epilogue = Epilogue(a=-length * sign, b=of_b, y=b, c=1.0 - length)
+            launches.append(R.bind(x, following, epilogue))
+            x = following
+        return in_order(launches)
 
     def _residual(self, S: Operator, probe: np.ndarray) -> float:
         """||b - S x|| / ||b|| of a probe b, of the worst column."""
@@ -186,16 +210,28 @@ class ByFixedSteps:
         left_norms, norms = vectors.norms(left, self._target)
         return float(np.max(left_norms / np.where(norms > 0.0, norms, 1.0)))
 
-    def queue(self) -> None:
-        """Queue all launches."""
-        self._begin()
-        stepper = self._stepper
-        stepper.start(self._numbers[0][1])
-        for keep, gain in self._numbers[1:]:
-            stepper.step(keep, gain)
-        # Norms of the steps are not read.
-        stepper.finish()
-        self._finish()
+
+def step_lengths(bounds: tuple[float, float], count: int) -> list[float]:
+    """Reciprocals of the roots of Chebyshev's polynomial of a degree on an interval.
+
+    In the order of Leja: each root is the one farthest from those before, by the product of all
+    distances.
+
+    >>> [round(1.0 / length, 3) for length in step_lengths((1.0, 3.0), 3)]
+    [2.866, 1.134, 2.0]
+    """
+    lower, upper = bounds
+    angles = np.pi * (np.arange(count) + 0.5) / count
+    roots = 0.5 * (upper + lower) + 0.5 * (upper - lower) * np.cos(angles)
+    left = list(roots)
+    ordered = [left.pop(0)]
+    # Distances in units of a quarter of the interval, so that products stay within range.
+    unit = 0.25 * (upper - lower) or 1.0
+    while left:
+        distances = np.abs(np.subtract.outer(left, ordered)) / unit
+        farthest = int(np.argmax(distances.prod(axis=1)))
+        ordered.append(left.pop(farthest))
+    return [1.0 / float(root) for root in ordered]
 
 
 class BySharing:

@@ -19,8 +19,9 @@ import numpy as np
 
 from ltcl.device.arrays import round_inwards
 from ltcl.errors import InputError
-from ltcl.operators import Operator, ScaledColumns
-from ltcl.operators.diagonal_blocks import are_small, joined_once
+from ltcl.operators import Operator
+from ltcl.operators.colour_hats import scale_columns
+from ltcl.operators.diagonal_blocks import are_quicker_joined, joined_once
 from ltcl.solvers import SolveSettings
 from ltcl.solvers.bounded import Bounded, BoxProblem, minimise_each
 from ltcl.transport.transport import Transport
@@ -216,7 +217,7 @@ class CompensationProblem:
         """True if the systems of all colours may be solved as one, at less cost."""
         if any(desired.shape[1] != 1 for desired in self.desired):
             return False
-        return are_small([system.A for system in self.systems])
+        return are_quicker_joined([system.A for system in self.systems])
 
     def box(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """The lowest and the highest unknowns of a system within the limits, (N,) float32."""
@@ -293,12 +294,22 @@ def stack_channels(channels: Columns, systems: int) -> Columns:
     return [np.concatenate(channels)]
 
 
+def _direct_norms(first_bounce: np.ndarray, mixing: np.ndarray) -> np.ndarray:
+    """Norms of the columns of direct light whose colours are mixed, (1, 3 N)."""
+    squares = np.square(mixing).T @ np.square(first_bounce)
+    return np.sqrt(squares).reshape(1, -1)
+
+
 def channel_systems(T: Transport) -> tuple[ChannelSystem, ...]:
     """The systems of T, uploaded here if they were not yet."""
     if T.is_square and not T.couples:
         F = np.atleast_2d(T.first_bounce)
         return tuple(map(ChannelSystem, T.systems, F))
-    norms = T.column_norms
+    if T.is_square and T.mixing is not None:
+        # Direct light has about these norms, which take products to estimate.
+        norms = _direct_norms(T.first_bounce, T.mixing)
+    else:
+        norms = T.column_norms
     inverses = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)
-    operators = map(ScaledColumns, T.operators, inverses)
+    operators = map(scale_columns, T.operators, inverses)
     return tuple(map(ChannelSystem, operators, norms))

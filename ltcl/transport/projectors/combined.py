@@ -44,6 +44,7 @@ from ltcl.transport.projectors.sharing import (
     ProjectorShare,
     drive_divisors,
     find_ramps,
+    inner_pixels,
     share_out,
 )
 from ltcl.transport.transport import Transport, check_transport
@@ -62,7 +63,7 @@ class Contrast:
     Attributes
     ----------
     measured : float
-        With the blacks of all projectors as they are.
+        With the blacks of all projectors as they are; infinite where they are 0.
     uniform : float
         With black lifted to one level.
     """
@@ -280,6 +281,12 @@ class CombinedTransport(Transport):
         """False: S is that of `scene`."""
         return False
 
+    def _require_first_bounce(self) -> np.ndarray:
+        raise InputError(
+            "T is of several projectors, whose S is that of T.scene, between the camera's pixels: "
+            "compensate, relight, separate, analyze and invert take T, others T.scene or one scan"
+        )
+
     @cached_property
     def unlit(self) -> np.ndarray:
         """Camera pixels (M,) without direct light of any projector."""
@@ -358,18 +365,21 @@ class CombinedTransport(Transport):
             level = np.array([total.max() for total in self.blacks])
         for channel, total in enumerate(self.blacks):
             lit = is_lit[channel]
-            black = np.maximum(total[lit, 0], np.finfo(np.float32).tiny)
-            light = self.divisors[channel, lit]
-            measured.append(np.median((light + black) / black))
-            uniform.append(np.median((light + black) / max(level[channel], black.min())))
+            black = np.maximum(total[lit, 0], 0.0)
+            white = self.divisors[channel, lit] + black
+            # Without any black it is infinite.
+            with np.errstate(divide="ignore"):
+                measured.append(np.median(white / black))
+                uniform.append(np.median(white / max(level[channel], black.min())))
         return Contrast(measured=float(min(measured)), uniform=float(min(uniform)))
 
     @cached_property
     def gamut(self) -> Gamut:
         """The colours that all projectors have in common, and how far these differ."""
         whites = []
-        for share in self.shares:
-            white = [share.white(channel) for channel in range(self.channels)]
+        are_inside = inner_pixels(self.shares, self.camera_grid)
+        for share, is_inside in zip(self.shares, are_inside, strict=True):
+            white = [share.white(channel)[is_inside] for channel in range(self.channels)]
             whites.append(np.stack(white))
         return common_gamut(whites, self.mixings)
 

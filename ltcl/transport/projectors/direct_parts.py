@@ -66,7 +66,7 @@ def direct_parts(
         pixels.append(window)
         light = _above_level(total, window, ring, radius)
         allowed = largest * light.max(axis=1, keepdims=True)
-        share = np.minimum(allowed / np.maximum(light, np.finfo(float).tiny), 1.0)
+        share = np.divide(allowed, light, out=np.ones_like(light), where=light > allowed)
         share[~is_direct] = 0.0
         for channel, block in enumerate(blocks):
             values[channel].append(share * _above_level(block, window, ring, radius))

@@ -18,7 +18,8 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import InputError
 
-# Share of the lit camera pixels of a projector that may be dimmer than what counts as reached.
+# Share of the camera pixels of a projector, away from its rim, that may be dimmer than what counts
+# as reached.
 DIM_QUANTILE = 0.05
 # Light below 0 that rounding explains, in units of white.
 SLACK = 1e-9

@@ -82,15 +82,23 @@ class ProjectorShare:
         return np.asarray(self.direct[channel].sum(axis=1)).ravel()
 
 
-def border_distance(is_border: np.ndarray) -> np.ndarray:
-    """Distance (h, w) of each pixel to the outer side of the border pixels, (h, w) bool.
+def border_distances(borders: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Distance (N_k,) of each pixel to the outer side of the border pixels, (h, w) bool.
 
-    Without a border all pixels are alike.
+    A projector without a border never has to fade out: all of it is as far from a border as the
+    pixel of another projector that is farthest from its own.
     """
-    if not is_border.any():
-        return np.ones(is_border.shape)
-    distance = np.asarray(scipy.ndimage.distance_transform_edt(~is_border), np.float64)
-    return distance + 0.5
+    distances = []
+    for is_border in borders:
+        if is_border.any():
+            distance = np.asarray(scipy.ndimage.distance_transform_edt(~is_border), np.float64)
+            distances.append(distance.ravel() + 0.5)
+        else:
+            distances.append(np.zeros(is_border.size))
+    farthest = max(float(distance.max()) for distance in distances)
+    if farthest == 0.0:
+        farthest = 1.0
+    return [distance if distance.any() else distance + farthest for distance in distances]
 
 
 def find_borders(
@@ -104,7 +112,7 @@ def find_borders(
     other one lights the scene, and the border of the camera's picture, are none.
     """
     totals = [_total(direct) for direct in directs]
-    are_lit = _lit_pictures(totals, camera_grid)
+    are_lit = lit_pictures(totals, camera_grid)
     borders = []
     for number, (total, grid) in enumerate(zip(totals, grids, strict=True)):
         is_taken_over = _lit_by_others(are_lit, number) & ~are_lit[number]
@@ -119,7 +127,7 @@ def find_borders(
     return borders
 
 
-def _lit_pictures(
+def lit_pictures(
     totals: Sequence[scipy.sparse.csr_array], camera_grid: tuple[int, int]
 ) -> list[np.ndarray]:
     """Camera pixels (H, W) that each projector lights."""
@@ -152,7 +160,7 @@ def overlap_width(
     mean is half of its width.
     """
     totals = [_total(direct) for direct in directs]
-    are_lit = _lit_pictures(totals, camera_grid)
+    are_lit = lit_pictures(totals, camera_grid)
     widths = []
     for number, (total, distance) in enumerate(zip(totals, distances, strict=True)):
         light = _row_sums(scipy.sparse.csr_array(total.T))
@@ -174,7 +182,7 @@ def find_ramps(
     if isinstance(blend, str):
         name = checks.one_of("blend", blend, ("auto", *BLENDS))
         borders = find_borders(directs, grids, camera_grid)
-        distances = [border_distance(is_border).ravel() for is_border in borders]
+        distances = border_distances(borders)
         if name == "auto":
             width = overlap_width(directs, distances, camera_grid)
             name = "smooth" if width >= WIDE_OVERLAP else "linear"
@@ -192,6 +200,22 @@ def find_ramps(
             raise InputError(f"{name} reaches {weights.min():.3g}; weights must be at least 0")
         ramps.append(weights)
     return ramps
+
+
+def inner_pixels(
+    shares: Sequence[ProjectorShare], camera_grid: tuple[int, int]
+) -> list[np.ndarray]:
+    """Camera pixels (M,) that each projector lights as the strongest, away from its rim.
+
+    At its rim it lights pixels in part. One that is nowhere the strongest has all that it lights.
+    """
+    are_lit = lit_pictures([_total(share.direct) for share in shares], camera_grid)
+    are_inside = []
+    for share, is_lit in zip(shares, are_lit, strict=True):
+        is_inside = np.asarray(scipy.ndimage.binary_erosion(is_lit, EIGHT, border_value=1)).ravel()
+        is_inside &= share.relative == 1.0
+        are_inside.append(is_inside if is_inside.any() else is_lit.ravel())
+    return are_inside
 
 
 def _total(direct: Sequence[scipy.sparse.csr_array]) -> scipy.sparse.csr_array:

@@ -117,6 +117,24 @@ def test_photographs_without_inverses_are_decoded(fault: str) -> None:
     assert right_share(mapping, camera) > 0.98
 
 
+@pytest.mark.parametrize("fault", FAULTS)
+def test_inverses_of_fine_bits_are_enough_for_linear_photographs(fault: str) -> None:
+    images, camera = photographs(**FAULTS[fault] | {"gamma": 1.0})
+    sparing = GrayCode(GRID, has_few_inverses=True)
+    full = GrayCode(GRID)
+    places = {pattern.tobytes(): number for number, pattern in enumerate(full.patterns())}
+    chosen = [images[places[pattern.tobytes()]] for pattern in sparing.patterns()]
+    assert len(chosen) < len(images)
+    mapping = decode(chosen, GRID)
+    assert mapping.decoded > 0.95
+    assert right_share(mapping, camera) > 0.998
+    every = decode(images, GRID)
+    both = mapping.valid & every.valid
+    few_error = np.hypot(mapping.x - camera.x, mapping.y - camera.y)[both]
+    error = np.hypot(every.x - camera.x, every.y - camera.y)[both]
+    assert np.median(few_error) < 1.5 * np.median(error)
+
+
 def test_flicker_does_not_move_the_edges() -> None:
     steady, camera = photographs(gamma=1.0, noise=0.5)
     flickering, _ = photographs(gamma=1.0, noise=0.5, flicker=0.15)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ltcl.acquisition.radiometry import Radiance, mixing, projector_response
+from ltcl.acquisition.radiometry import Radiance, colour_response, mixing, projector_response
 from ltcl.errors import InputError
 from tests.acquisition.radiometry.cameras import CURVES, corner
 
@@ -63,6 +63,28 @@ def test_a_colour_that_the_channel_does_not_light_does_not_decide():
     )
 
 
+def test_curves_of_three_channels_are_told_apart_in_pictures_of_all_at_once() -> None:
+    """Each has its own curve, and colours mix; noise is a hundredth of white."""
+    M = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.1], [0.0, 0.3, 1.0]])
+    decodes = [CURVES[curve][1] for curve in ("srgb", "linear", "film")]
+    albedo = corner(64)[..., None] * (0.9, 0.6, 0.3)
+    valid = np.full(albedo.shape, True)
+    sigma = 0.005
+
+    def picture(light) -> Radiance:
+        noise = random.normal(0, sigma, albedo.shape)
+        return Radiance(0.02 + albedo * (M @ light) + noise, sigma**2 + 0 * albedo, valid)
+
+    pictures = []
+    for code in CODES[1:-1]:
+        pictures.append(picture(np.array([decode(code) for decode in decodes])))
+    colours = [picture(light) for light in np.eye(3)]
+    response = colour_response(CODES, pictures, colours, picture(np.zeros(3)))
+    codes = np.linspace(0, 1, 500)
+    expected = np.stack([decode(codes) for decode in decodes], axis=-1)
+    np.testing.assert_allclose(response.linear(np.stack([codes] * 3, -1)), expected, atol=5e-3)
+
+
 FLAT = Radiance(np.full((2, 2), 0.1), np.full((2, 2), 1e-6), np.full((2, 2), True))
 DARK = Radiance(np.zeros((2, 2)), np.full((2, 2), np.inf), np.full((2, 2), False))
 
@@ -79,6 +101,25 @@ DARK = Radiance(np.zeros((2, 2)), np.full((2, 2), np.inf), np.full((2, 2), False
 def test_pictures_without_a_response_are_refused(codes, pictures, message):
     with pytest.raises(InputError, match=message):
         projector_response(codes, [pictures])
+
+
+LIT = [Radiance(FLAT.value + 0.5 * k, FLAT.variance, FLAT.valid) for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("codes", "pictures", "colours", "message"),
+    [
+        ([0.0, 0.5], [], LIT, "codes is"),
+        ([0.0, 0.5, 1.0], [], LIT, "pictures holds 0"),
+        ([0.0, 0.5, 1.0], [FLAT], LIT[:2], "colours 2"),
+        ([0.0, 0.5, 1.0], [DARK], LIT, "no value that is valid"),
+        ([0.0, 0.5, 1.0], [FLAT], LIT, r"colours\[0\] is no brighter"),
+        ([0.0, 0.5, 1.0], [FLAT], [LIT[1], LIT[1], LIT[2]], "are alike"),
+    ],
+)
+def test_pictures_without_three_responses_are_refused(codes, pictures, colours, message):
+    with pytest.raises(InputError, match=message):
+        colour_response(codes, pictures, colours, FLAT)
 
 
 M = np.array([[1.0, 0.3, 0.02], [0.1, 1.0, 0.2], [0.01, 0.15, 1.0]])

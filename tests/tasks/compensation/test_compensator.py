@@ -650,6 +650,23 @@ def test_gain_follows_the_content():
     assert compensator.statistics.gain == pytest.approx(before * 2.0**-0.25, rel=1e-5)
 
 
+def test_a_gain_that_is_set_is_that_of_the_first_frame():
+    T = transport("grey")
+    frame = picture(T, 0.8)
+    compensator = light(T, gain="follow")
+    compensator.follows_gain = False
+    compensator.gain = 0.25
+    # Other bounds take other steps.
+    compensator.bounds = (0.0, 0.9)
+    expected = light(T, gain=0.25, bounds=(0.0, 0.9))(frame)
+    np.testing.assert_allclose(compensator(frame), expected, rtol=1e-5, atol=1e-6)
+    assert compensator.statistics.gain == 0.25
+    compensator.follows_gain = True
+    for _ in range(2):
+        compensator(0.5 * frame)
+    assert compensator.gain > 0.25
+
+
 def test_gain_counts_the_background():
     T = transport("grey")
     frame = picture(T, 0.5)
