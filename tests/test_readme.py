@@ -58,7 +58,7 @@ def sketch_row(name: str) -> list[str]:
         photographs["measured"],
         f"{rounded(facts['seconds until T is there'])} s",
         f"{rounded(facts['memory while T is estimated, MB'])} MB",
-        f"{rounded(facts['T, MB'])} MB",
+        f"{rounded(facts['T on disk, MB'])} MB",
         f"{rounded(facts['compensate, s'])} s",
     ]
 
