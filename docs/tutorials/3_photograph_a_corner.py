@@ -239,6 +239,12 @@ def auto_exposure(files):
     Image.open(files[44]).save(files[44], exif=exif)
 
 
+def saved_as_jpeg(files):
+    """From photograph 20 on the camera saved JPEG."""
+    for name in range(20, len(files) + 1):
+        change(name, as_jpeg)(files)
+
+
 LAMP = np.linspace(20, 90, 70)
 MISTAKES = {
     "a photograph is missing": lambda files: files[44].unlink(),
@@ -246,7 +252,7 @@ MISTAKES = {
     "the button pressed twice": lambda files: files[46].write_bytes(files[44].read_bytes()),
     "a light switched on": change(33, lambda image: np.minimum(image + LAMP, 255).astype(np.uint8)),
     "the camera was touched": moved,
-    "JPEG in place of raw or PNG": lambda files: [change(k, as_jpeg)(files) for k in range(20, 76)],
+    "JPEG in place of raw or PNG": saved_as_jpeg,
     "automatic exposure": auto_exposure,
     "the camera turned": change(45, np.rot90),
     "one name for two files": lambda files: files[44].with_suffix(".tif").write_bytes(b""),
