@@ -84,14 +84,20 @@ def projector_response(codes: Any, channels: Sequence[Sequence[Radiance]]) -> Re
     >>> projector_response(codes, [pictures]).linear(codes).round(4)
     array([0.    , 0.0625, 0.25  , 0.5625, 1.    ], dtype=float32)
     """
-    levels = checks.real("codes", codes).astype(np.float64)
-    checks.finite("codes", levels)
-    if not _rises_from_0_to_1(levels):
-        raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
+    levels = _rising_codes(codes)
     tables = []
     for c, pictures in enumerate(channels):
         tables.append(_channel_table(levels, pictures, f"channels[{c}]"))
     return Response(np.stack(tables))
+
+
+def _rising_codes(codes: Any) -> np.ndarray:
+    """Codes (K,) as float64; InputError if they do not rise from 0 to 1."""
+    levels = checks.real("codes", codes).astype(np.float64)
+    checks.finite("codes", levels)
+    if not _rises_from_0_to_1(levels):
+        raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
+    return levels
 
 
 def _rises_from_0_to_1(codes: np.ndarray) -> bool:
@@ -140,10 +146,7 @@ def colour_response(
     >>> bool(np.allclose(response.linear(np.full(3, 0.5)), 0.5**powers, atol=1e-4))
     True
     """
-    levels = checks.real("codes", codes).astype(np.float64)
-    checks.finite("codes", levels)
-    if not _rises_from_0_to_1(levels):
-        raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
+    levels = _rising_codes(codes)
     if len(pictures) != len(levels) - 2 or len(colours) != 3:
         raise InputError(
             f"pictures holds {len(pictures)} and colours {len(colours)} picture(s); they must hold "

@@ -337,9 +337,7 @@ class ScanCamera(ScanGrid):
         unlike = comparison.unlike_their_patterns()
         if len(unlike):
             names = " and ".join(self._names(exposed[a]) for a in unlike.tolist())
-            raise AcquisitionError(
-                f"{names} does not show the pattern of its place in the list; {ADVICE}"
-            )
+            raise AcquisitionError(f"{names}: another pattern than in the list; {ADVICE}")
         for a, b in comparison.mixed_up():
             first = self._names(exposed[a])
             second = self._names(exposed[b])

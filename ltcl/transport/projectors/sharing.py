@@ -88,17 +88,21 @@ def border_distances(borders: Sequence[np.ndarray]) -> list[np.ndarray]:
     A projector without a border never has to fade out: all of it is as far from a border as the
     pixel of another projector that is farthest from its own.
     """
-    distances = []
+    distances: list[np.ndarray | None] = []
     for is_border in borders:
         if is_border.any():
             distance = np.asarray(scipy.ndimage.distance_transform_edt(~is_border), np.float64)
             distances.append(distance.ravel() + 0.5)
         else:
-            distances.append(np.zeros(is_border.size))
-    farthest = max(float(distance.max()) for distance in distances)
-    if farthest == 0.0:
-        farthest = 1.0
-    return [distance if distance.any() else distance + farthest for distance in distances]
+            distances.append(None)
+    known = [distance for distance in distances if distance is not None]
+    farthest = max((float(distance.max()) for distance in known), default=1.0)
+    filled = []
+    for is_border, distance in zip(borders, distances, strict=True):
+        if distance is None:
+            distance = np.full(is_border.size, farthest)
+        filled.append(distance)
+    return filled
 
 
 def find_borders(
