@@ -102,7 +102,7 @@ class JointEntries:
         counts, indices, numbers = zip(*_in_threads(join_rows, nodes), strict=True)
         return cls(
             pixels=pixels,
-            indptr=np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
+            indptr=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int32),
             indices=np.concatenate(indices),
             numbers=np.concatenate(numbers),
         )
@@ -115,15 +115,17 @@ class JointEntries:
     def transposed(self) -> JointEntries:
         """The entries of the K^T."""
         nodes = len(self.indptr) - 1
-        moved = np.arange(len(self.indices), dtype=np.int32)
         if self.are_halves:
             moved = self.numbers.view(np.int64)
+        else:
+            moved = np.arange(len(self.indices), dtype=np.int32)
         matrix = scipy.sparse.csr_array((moved, self.indices, self.indptr), shape=(nodes, nodes))
         by_column: Any = matrix.tocsc()
+        numbers = by_column.data
         if self.are_halves:
-            numbers = by_column.data.view(np.uint64)
+            numbers = numbers.view(np.uint64)
         else:
-            numbers = self.numbers[by_column.data]
+            numbers = self.numbers[numbers]
         return replace(self, indptr=by_column.indptr, indices=by_column.indices, numbers=numbers)
 
 
@@ -135,10 +137,11 @@ def _in_threads(work: Callable[[slice], Any], rows: int) -> list[Any]:
 
 
 def _rows_of_core(K: Any, rows: slice) -> Any:
-    """Some rows of a csr_array, whose numbers are not copied."""
+    """Some rows of a csr_array, whose numbers are not copied, with indices of 32 bits."""
     indptr = K.indptr[rows.start : rows.stop + 1]
     entries = slice(indptr[0], indptr[-1])
-    parts = (K.data[entries], K.indices[entries], indptr - indptr[0])
+    indices = K.indices[entries].astype(np.int32, copy=False)
+    parts = (K.data[entries], indices, (indptr - indptr[0]).astype(np.int32))
     return scipy.sparse.csr_array(parts, shape=(rows.stop - rows.start, K.shape[1]))
 
 
@@ -418,8 +421,9 @@ class ColourHats(Operator):
         """A diag(d), d (3 N,), which reads it along; None unless colours are mixed."""
         if not self._factors.has_mixing or self._factors.columns is not None:
             return None
-        factors = replace(self._factors, columns=self.device.upload(d))
-        return ColourHats(self.rows, factors, ScaledColumns(self.each, d))
+        each = ScaledColumns(self.each, d)
+        factors = replace(self._factors, columns=each.uploaded_d)
+        return ColourHats(self.rows, factors, each)
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()

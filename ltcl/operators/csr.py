@@ -194,6 +194,9 @@ class CSR(SparseRows):
         indices = arrays["indices"]
         indptr = arrays["indptr"]
         checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), shape)
+        # With pointers of 64 bits SciPy would keep the indices so, too.
+        index_dtype = scipy.sparse.get_index_dtype(maxval=max(len(data), columns))
+        indptr = indptr.astype(index_dtype, copy=False)
         matrix = scipy.sparse.csr_array((data, indices, indptr), shape=shape)
         return cls(device, matrix, pattern, later=later)
 
