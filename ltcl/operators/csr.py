@@ -171,8 +171,8 @@ class CSR(SparseRows):
         yield 0, self._host.astype(np.float64)
 
     def matrix(self) -> scipy.sparse.csr_array:
-        """The matrix (M, N) on the host, with the float32 values of the device."""
-        return scipy.sparse.csr_array(self._host.astype(np.float32))
+        """The matrix (M, N) on the host, with the float32 values of the device, to be read only."""
+        return scipy.sparse.csr_array(self._host.astype(np.float32, copy=False))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, from which `from_arrays` makes the same operator, to the bit."""
