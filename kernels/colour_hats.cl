@@ -15,9 +15,9 @@
 //
 // hats.cl makes the levels between. A work-item takes a row of K, or some neighbouring pixels.
 //
-// Optional defines: NARROW, 1 where entries of rows of pixels are narrow; SCALED, 1 if `inner`
-// or `outer` counts, else it is not read; OWN and COLUMNS, the same for these; MIXED, 1 where
-// colours of x are mixed, 2 where those of the result are; BLOCK, pixels of an item, 1 by default.
+// Optional defines: NARROW, 1 where entries of rows of pixels are narrow; INNER, OUTER, OWN and
+// COLUMNS, 1 if these factors count, else they are not read; MIXED, 1 where colours of x are mixed,
+// 2 where those of the result are; BLOCK, pixels of an item, 1 by default.
 //
 // Layout: x, y, out, inner, outer, columns are planes, (3, pixels); nodes and light are (nodes, 4).
 //   pointers  [rows + 1], where the entries of each row begin
@@ -31,8 +31,11 @@
 #ifndef NARROW
 #define NARROW 0
 #endif
-#ifndef SCALED
-#define SCALED 0
+#ifndef INNER
+#define INNER 0
+#endif
+#ifndef OUTER
+#define OUTER 0
 #endif
 #ifndef OWN
 #define OWN 0
@@ -84,7 +87,7 @@ kernel void colour_hats_scale(
             light[c * BLOCK + p] = x[first + p + c * pixels];
 #endif
         }
-#if SCALED
+#if INNER
     for (int c = 0; c < COLOURS; ++c)
         EACH_PIXEL(p)
             light[c * BLOCK + p] *= inner[first + p + c * pixels];
@@ -198,7 +201,7 @@ kernel void colour_hats_finish(
         values[BLOCK + p] = sum.s1;
         values[2 * BLOCK + p] = sum.s2;
     }
-#if SCALED
+#if OUTER
     for (int d = 0; d < COLOURS; ++d)
         EACH_PIXEL(p)
             values[d * BLOCK + p] *= outer[first + p + d * pixels];

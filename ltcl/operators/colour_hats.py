@@ -28,7 +28,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.device import Array, Device
-from ltcl.device.kernels import Queued, in_order
+from ltcl.device.kernels import Kernel, Queued, in_order
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import ScaledBasis
 from ltcl.operators.compressed import Compressed
@@ -51,7 +51,9 @@ LOWER_BITS = np.uint32(0xFFFF)
 PRESENCE = 48
 # Rows that are joined at once.
 ROWS_AT_ONCE = 1 << 15
-ALL_HALVES = (1 << PRESENCE) - 1
+# Wide entries that are uploaded at once.
+ENTRIES_AT_ONCE = 1 << 17
+ALL_HALVES = np.uint64((1 << PRESENCE) - 1)
 ALL_BITS = (1 << 32) - 1
 # Values of the define MIXED: colours of the operand are mixed, or those of the result.
 MIXED_OPERAND = 1
@@ -74,7 +76,7 @@ class JointEntries:
     indptr, indices : (nodes + 1,), (entries,)
     numbers : (entries,) uint64 or (entries, 3) uint32
         The upper halves of the bits of three reals, from the lowest bits on, where the lower halves
-        are 0; or all bits.
+        are 0, below 16 bits that are free; or all bits.
     """
 
     pixels: int
@@ -97,13 +99,12 @@ class JointEntries:
             before = np.concatenate([[0], np.cumsum(is_kept)])
             return np.diff(before[indptr]), indices[is_kept], numbers[is_kept]
 
-        blocks = _in_threads(join_rows, nodes)
-        counts, indices, numbers = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        counts, indices, numbers = zip(*_in_threads(join_rows, nodes), strict=True)
         return cls(
             pixels=pixels,
-            indptr=np.concatenate([[0], np.cumsum(counts)]),
-            indices=indices,
-            numbers=numbers,
+            indptr=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int32),
+            indices=np.concatenate(indices),
+            numbers=np.concatenate(numbers),
         )
 
     @property
@@ -114,15 +115,18 @@ class JointEntries:
     def transposed(self) -> JointEntries:
         """The entries of the K^T."""
         nodes = len(self.indptr) - 1
-        places = np.arange(len(self.indices), dtype=np.int32)
-        matrix = scipy.sparse.csr_array((places, self.indices, self.indptr), shape=(nodes, nodes))
+        if self.are_halves:
+            moved = self.numbers.view(np.int64)
+        else:
+            moved = np.arange(len(self.indices), dtype=np.int32)
+        matrix = scipy.sparse.csr_array((moved, self.indices, self.indptr), shape=(nodes, nodes))
         by_column: Any = matrix.tocsc()
-        return replace(
-            self,
-            indptr=by_column.indptr,
-            indices=by_column.indices,
-            numbers=self.numbers[by_column.data],
-        )
+        numbers = by_column.data
+        if self.are_halves:
+            numbers = numbers.view(np.uint64)
+        else:
+            numbers = self.numbers[numbers]
+        return replace(self, indptr=by_column.indptr, indices=by_column.indices, numbers=numbers)
 
 
 def _in_threads(work: Callable[[slice], Any], rows: int) -> list[Any]:
@@ -133,10 +137,11 @@ def _in_threads(work: Callable[[slice], Any], rows: int) -> list[Any]:
 
 
 def _rows_of_core(K: Any, rows: slice) -> Any:
-    """Some rows of a csr_array, whose numbers are not copied."""
+    """Some rows of a csr_array, whose numbers are not copied, with indices of 32 bits."""
     indptr = K.indptr[rows.start : rows.stop + 1]
     entries = slice(indptr[0], indptr[-1])
-    parts = (K.data[entries], K.indices[entries], indptr - indptr[0])
+    indices = K.indices[entries].astype(np.int32, copy=False)
+    parts = (K.data[entries], indices, (indptr - indptr[0]).astype(np.int32))
     return scipy.sparse.csr_array(parts, shape=(rows.stop - rows.start, K.shape[1]))
 
 
@@ -161,7 +166,7 @@ def _join_halves(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
         # Zeros would not count as entries.
         numbers |= 1 << (PRESENCE + colour)
         total = total + scipy.sparse.csr_array((numbers, K.indices, K.indptr), shape=K.shape)
-    return total.indptr, total.indices, (total.data & ALL_HALVES).view(np.uint64)
+    return total.indptr, total.indices, total.data.view(np.uint64) & ALL_HALVES
 
 
 def _join_reals(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
@@ -189,13 +194,13 @@ class DeviceRows:
         of_pixels = _narrow_entries(entries)
         self.is_narrow = of_pixels is not None
         if of_pixels is None:
-            bases = np.zeros(1, np.int32)
-            of_pixels = bases, _wide_entries(entries, slice(0, count))
-        self.bases = device.upload(of_pixels[0], np.int32)
-        self.entries = device.upload(of_pixels[1], of_pixels[1].dtype)
+            self.bases = device.upload(np.zeros(1), np.int32)
+            self.entries = _upload_wide(device, entries, slice(0, count))
+        else:
+            self.bases = device.upload(of_pixels[0], np.int32)
+            self.entries = device.upload(of_pixels[1], np.uint16)
         self.pointers = device.upload(entries.indptr[: pixels + 1], np.int32)
-        coarse = _wide_entries(entries, slice(count, None))
-        self.coarse_entries = device.upload(coarse, np.uint32)
+        self.coarse_entries = _upload_wide(device, entries, slice(count, entries.indptr[-1]))
         self.coarse_pointers = device.upload(entries.indptr[pixels:] - count, np.int32)
 
     @property
@@ -208,6 +213,18 @@ class DeviceRows:
             self.coarse_entries,
             self.coarse_pointers,
         ]
+
+
+def _upload_wide(device: Device, entries: JointEntries, chosen: slice) -> Array:
+    """Wide entries on the device; the host never holds all of them."""
+    count = int(chosen.stop - chosen.start)
+    uploaded = device.empty((count, COLOURS + 1), np.uint32)
+    for first in range(0, count, ENTRIES_AT_ONCE):
+        size = min(ENTRIES_AT_ONCE, count - first)
+        start = int(chosen.start) + first
+        block = _wide_entries(entries, slice(start, start + size))
+        uploaded.set_rows(first, device.upload(block, np.uint32))
+    return uploaded
 
 
 def _wide_entries(entries: JointEntries, chosen: slice) -> np.ndarray:
@@ -225,12 +242,15 @@ def _wide_entries(entries: JointEntries, chosen: slice) -> np.ndarray:
 
 
 def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | None:
-    """The base of each pixel's row, and narrow entries, (count, 4) uint16; None if too wide."""
+    """The base of each pixel's row, and narrow entries, (count, 4) uint16; None if too wide.
+
+    Entries become narrow where they are, as their numbers leave room for the nodes.
+    """
     if not entries.are_halves:
         return None
     pixels = entries.pixels
     bases = np.zeros(pixels, np.int32)
-    narrow = np.empty(entries.indptr[pixels], np.uint64)
+    narrow = entries.numbers[: entries.indptr[pixels]]
 
     def narrow_rows(rows: slice) -> bool:
         """Write the bases and entries of some rows; returns whether all nodes are near."""
@@ -248,7 +268,8 @@ def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | No
         near_bases = np.repeat(np.arange(rows.start, rows.stop), counts)
         distance = columns - np.where(is_far, np.repeat(bases[rows], counts), near_bases)
         code = (2 * distance + is_far) & 0xFFFF
-        narrow[own] = entries.numbers[own] | code.astype(np.uint64) << np.uint64(PRESENCE)
+        narrow[own] &= ALL_HALVES
+        narrow[own] |= code.astype(np.uint64) << np.uint64(PRESENCE)
         return not np.any((distance < -MAX_DISTANCE) | (distance >= MAX_DISTANCE))
 
     if not all(_in_threads(narrow_rows, pixels)):
@@ -339,15 +360,28 @@ class Factors:
         """All arrays of many numbers."""
         return [self.inner, self.outer, self.own, self.columns]
 
-    def mixing_defines(self, transpose: bool) -> dict[str, int]:
-        """Defines of the kernels that say how colours are mixed."""
-        if not self.has_mixing:
-            return {}
-        place = MIXED_RESULT if transpose else MIXED_OPERAND
-        return {"MIXED": place, "COLUMNS": int(self.columns is not None)}
+    def scales(self, transpose: bool) -> tuple[Array | None, Array | None]:
+        """The factors of nodes, and those of the result."""
+        if transpose:
+            return self.outer, self.inner
+        return self.inner, self.outer
+
+    def defines(self, transpose: bool) -> dict[str, int]:
+        """Defines of the kernels that say which factors there are, and how colours are mixed."""
+        inner, outer = self.scales(transpose)
+        mixed = 0
+        if self.has_mixing:
+            mixed = MIXED_RESULT if transpose else MIXED_OPERAND
+        return {
+            "INNER": int(inner is not None),
+            "OUTER": int(outer is not None),
+            "OWN": int(self.own is not None),
+            "MIXED": mixed,
+            "COLUMNS": int(self.columns is not None),
+        }
 
     def mixing_arguments(self, transpose: bool, unread: Array) -> dict[str, Array]:
-        """Arguments of the kernels for that."""
+        """Arguments of the kernels that say how colours are mixed."""
         return {
             "mixing": self.transposed_mixing if transpose else self.mixing,
             "columns": unread if self.columns is None else self.columns,
@@ -387,8 +421,9 @@ class ColourHats(Operator):
         """A diag(d), d (3 N,), which reads it along; None unless colours are mixed."""
         if not self._factors.has_mixing or self._factors.columns is not None:
             return None
-        factors = replace(self._factors, columns=self.device.upload(d))
-        return ColourHats(self.rows, factors, ScaledColumns(self.each, d))
+        each = ScaledColumns(self.each, d)
+        factors = replace(self._factors, columns=each.uploaded_d)
+        return ColourHats(self.rows, factors, each)
 
     def _queue_product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         self._bind_product(x, out, epilogue, transpose)()
@@ -401,23 +436,27 @@ class ColourHats(Operator):
         sums = self.rows.W.scratch(NODE_VALUES)
         launches = [
             self._bind_scale(rows, x, nodes, transpose),
-            *self._bind_levels(rows, nodes, sums),
+            *self._bind_levels(rows, nodes, sums, transpose),
             self._bind_finish(rows, nodes, sums, x, out, epilogue, transpose),
         ]
         return in_order(launches)
 
+    def _kernel(self, name: str, rows: DeviceRows, transpose: bool) -> Kernel:
+        """A kernel of the one program of these rows."""
+        defines = self._factors.defines(transpose)
+        return self.device.kernel(
+            "colour_hats",
+            f"colour_hats_{name}",
+            NARROW=int(rows.is_narrow),
+            BLOCK=self._block,
+            **defines,
+        )
+
     def _bind_scale(self, rows: DeviceRows, x: Array, nodes: Array, transpose: bool) -> Queued:
         """The launch that makes the nodes of level 0."""
         factors = self._factors
-        inner = factors.outer if transpose else factors.inner
-        kernel = self.device.kernel(
-            "colour_hats",
-            "colour_hats_scale",
-            SCALED=int(inner is not None),
-            BLOCK=self._block,
-            **factors.mixing_defines(transpose),
-        )
-        return kernel.bind(
+        inner, _ = factors.scales(transpose)
+        return self._kernel("scale", rows, transpose).bind(
             -(-rows.pixels // self._block),
             self._group,
             pixels=rows.pixels,
@@ -427,15 +466,16 @@ class ColourHats(Operator):
             **factors.mixing_arguments(transpose, x),
         )
 
-    def _bind_levels(self, rows: DeviceRows, nodes: Array, sums: Array) -> list[Queued]:
+    def _bind_levels(
+        self, rows: DeviceRows, nodes: Array, sums: Array, transpose: bool
+    ) -> list[Queued]:
         """The launches of all coarser levels: sums under hats, rows of K, light between nodes."""
         coarse = rows.nodes - rows.pixels
         if not coarse:
             return []
         W = self.rows.W
         light = nodes.like()
-        kernel = self.device.kernel("colour_hats", "colour_hats_rows")
-        multiply = kernel.bind(
+        multiply = self._kernel("rows", rows, transpose).bind(
             coarse,
             GROUP,
             first=rows.pixels,
@@ -461,18 +501,9 @@ class ColourHats(Operator):
     ) -> Queued:
         """The launch over all pixels."""
         factors = self._factors
-        outer = factors.inner if transpose else factors.outer
+        _, outer = factors.scales(transpose)
         height, width = self.rows.W.grid
-        kernel = self.device.kernel(
-            "colour_hats",
-            "colour_hats_finish",
-            NARROW=int(rows.is_narrow),
-            SCALED=int(outer is not None),
-            OWN=int(factors.own is not None),
-            BLOCK=self._block,
-            **factors.mixing_defines(transpose),
-        )
-        return kernel.bind(
+        return self._kernel("finish", rows, transpose).bind(
             (-(-width // self._block), height),
             (self._group, 1),
             height=height,

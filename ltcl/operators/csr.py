@@ -171,8 +171,8 @@ class CSR(SparseRows):
         yield 0, self._host.astype(np.float64)
 
     def matrix(self) -> scipy.sparse.csr_array:
-        """The matrix (M, N) on the host, with the float32 values of the device."""
-        return scipy.sparse.csr_array(self._host.astype(np.float32))
+        """The matrix (M, N) on the host, with the float32 values of the device, to be read only."""
+        return scipy.sparse.csr_array(self._host.astype(np.float32, copy=False))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, from which `from_arrays` makes the same operator, to the bit."""
@@ -194,6 +194,9 @@ class CSR(SparseRows):
         indices = arrays["indices"]
         indptr = arrays["indptr"]
         checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), shape)
+        # With pointers of 64 bits SciPy would keep the indices so, too.
+        index_dtype = scipy.sparse.get_index_dtype(maxval=max(len(data), columns))
+        indptr = indptr.astype(index_dtype, copy=False)
         matrix = scipy.sparse.csr_array((data, indices, indptr), shape=shape)
         return cls(device, matrix, pattern, later=later)
 

@@ -25,6 +25,11 @@ class ScaledColumns(Operator):
     d : (N,)
     shift : number or (N,)
         Not 0 only for a square A.
+
+    Attributes
+    ----------
+    uploaded_d : Array
+        d on the device.
     """
 
     def __init__(self, A: Operator, d: np.ndarray, shift: Any = 0.0) -> None:
@@ -38,10 +43,10 @@ class ScaledColumns(Operator):
                 f"the operator has shape {A.shape}; A - diag(shift) needs a square one"
             )
         self.A = A
-        self._d = A.device.upload(self.d)
+        self.uploaded_d = A.device.upload(self.d)
         # A single number needs no array: it joins the epilogue.
         self._shift = A.device.upload(self.shift) if self.shift.ndim else None
-        super().__init__(A.device, A.shape, A, self._d, self._shift)
+        super().__init__(A.device, A.shape, A, self.uploaded_d, self._shift)
         self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
         if not has_shift:
             self.solution_error = _scaled_error(A.solution_error, self.d)
@@ -70,10 +75,10 @@ class ScaledColumns(Operator):
         if transpose:
             product = self.device.empty(out.shape)
             self.A._queue_product(x, product, Epilogue(a), True)
-            vectors.scale_rows(self._d, product, product)
+            vectors.scale_rows(self.uploaded_d, product, product)
             vectors.axpby(1.0, product, b, epilogue.operand(product), out)
         else:
-            scaled = vectors.scale_rows(self._d, x, x.like())
+            scaled = vectors.scale_rows(self.uploaded_d, x, x.like())
             self.A._queue_product(scaled, out, Epilogue(a, b, y), False)
         if self._shift is not None:
             shifted = vectors.scale_rows(self._shift, x, x.like())

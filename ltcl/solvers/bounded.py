@@ -210,14 +210,13 @@ def minimise_each(
     weights = None
     all_weights = [each.weights for each in scaled if each.weights is not None]
     if all_weights:
-        weights = np.concatenate(all_weights)
-    lower = np.concatenate([each.box[0] for each in scaled])
-    upper = np.concatenate([each.box[1] for each in scaled])
-    b = np.concatenate([each.b for each in scaled])
-    columns = b.shape[1]
+        weights = _stacked(all_weights)
+    lower = _stacked([each.box[0] for each in scaled])
+    upper = _stacked([each.box[1] for each in scaled])
+    columns = problems[0].b.shape[1]
     descent = Descent(A, columns, weights, (lower, upper), planes=len(problems))
-    descent.b.set(b)
-    descent.x.set(np.concatenate([each.first for each in scaled]))
+    descent.b.set(_stacked([each.b for each in scaled]))
+    descent.x.set(_stacked([each.first for each in scaled]))
     descent.begin()
     error_units = np.array([each.unit * each.weight_unit for each in scaled])
     search = Search(descent, rtol, atol / error_units, maxiter, callback)
@@ -710,6 +709,11 @@ class Descent:
             stepped = x[rows] - alpha[rows] * g[rows]
             is_saturated[rows] = (low < high) & ((stepped < low) | (stepped > high))
         return is_saturated
+
+
+def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Arrays one below the other; one alone is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _as_columns(box: Box) -> Box:

@@ -11,12 +11,15 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 import ltcl
 from ltcl import scenes
 from ltcl.acquisition import Calibration, Report, VirtualRig, acquire
 from ltcl.acquisition.calibration import stored_map
+from ltcl.acquisition.estimation.windows import hat_matrix
 from ltcl.acquisition.updating.movement import Movement, interpolation
+from ltcl.acquisition.updating.warp import HostTransport
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.store import BlockStore
 from tests.acquisition.moved_corner import AMBIENT, GRID, camera_transport, rig
@@ -89,6 +92,17 @@ def test_a_nudge_and_an_older_lamp(scan: Scan, tmp_path: Path, strategy: str) ->
     assert report.judged_error == result.error
     assert report.masked == pytest.approx(31 / 256)
     assert "updated from" in report.why
+
+
+@pytest.mark.rare
+def test_by_half_a_pixel(scan: Scan, tmp_path: Path) -> None:
+    """The last row lies half on the old picture: what the camera does not tell apart is masked."""
+    truth = camera_transport(0.5, -1.5)
+    store = tmp_path / "new.zarr"
+    result = ltcl.update(rig(truth), scan("sketch"), store=store, photographs=12)
+    assert result.masked > 16
+    assert result.transport.masked.sum() == result.masked
+    assert true_error(store, result.transport, truth) < 0.02
 
 
 @pytest.mark.rare
@@ -314,3 +328,30 @@ def test_interpolation_keeps_pictures_that_are_linear_and_all_light() -> None:
     # A narrow aperture sees one square, but at its edge.
     narrow = interpolation(np.array([1.3, 1.5]), np.array([2.0, 2.0]), grid, aperture=0.2)
     assert narrow.toarray().max(axis=1) == pytest.approx([1.0, 0.5])
+
+
+def test_focus_moves_with_the_pixels_and_light_across_a_crease_with_the_scene() -> None:
+    """By half a pixel: the pixel that lies on the crease then lights itself across it."""
+    height, width, crease = 12, 16, 8
+    grid = height, width
+    column = np.arange(width)
+    own = 0.5 + 0.3 * np.sin(column)
+    focus = np.eye(width) + 0.1 * np.eye(width, k=1) + 0.1 * np.eye(width, k=-1)
+    crossing = np.zeros((width, width))
+    crossing[crease - 1, crease] = crossing[crease, crease - 1] = 0.08
+    rows = np.eye(height)
+    T = np.kron(rows, own[:, None] * focus + crossing)
+    hats: Any = hat_matrix(grid)
+    core = scipy.sparse.csr_array(np.pad(T, ((0, 0), (0, hats.shape[0] - len(T)))))
+    moved = HostTransport(grid=grid, cores=[core], W=hats).moved(Movement.shift(grid, 0.0, 0.5))
+    new = (moved.cores[0] @ hats).toarray()
+    new = new.reshape(height, width, height, width)[5, :, 5]
+    # New pixel c looks at old places c - 1/2: on the crease lies the middle of pixel `crease`.
+    halfway = np.append(own[0], 0.5 * (own[1:] + own[:-1]))
+    expected = halfway[:, None] * focus
+    across = crossing.copy()
+    across[1:] = 0.5 * (crossing[1:] + crossing[:-1])
+    across[:, 1:] = 0.5 * (across[:, 1:] + across[:, :-1])
+    expected = expected + across
+    np.testing.assert_allclose(new[2:-2, 2:-2], expected[2:-2, 2:-2], atol=1e-6)
+    assert new[crease, crease] == pytest.approx(halfway[crease] + 0.04)

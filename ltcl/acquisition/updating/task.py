@@ -116,7 +116,8 @@ class Update:
     gain : (channels,)
         Light of the lamp, relative to that in the scan.
     masked : int
-        Pixels that see places beyond the old picture, of which nothing is known.
+        Pixels that light places beyond the old picture, or that the camera does not tell from
+        others, of which nothing is known.
     measured_again : int
         Pixels whose rows of T failed after the first photographs, and were measured again.
     errors, previous_errors : (judges,)
@@ -189,7 +190,7 @@ class Update:
         if self.masked:
             lines.append(
                 f"{self.masked} pixels ({self.masked / (h * w):.1%}) are masked: they light places "
-                "beyond the old picture"
+                "beyond the old picture, or the camera does not tell them from others"
             )
         if self.measured_again:
             lines.append(
@@ -271,7 +272,8 @@ def update(
     -------
     Update
         Its transport is like that of `ltcl.acquire`; pixels that light places beyond the old
-        picture are masked. If it does not hold after all photographs, a new scan is needed.
+        picture, or that the camera does not tell from others, are masked. If it does not hold after
+        all photographs, a new scan is needed.
 
     Raises
     ------
@@ -334,7 +336,7 @@ def update(
 class _Carried:
     """A scan that was carried over.
 
-    `photographs` were taken; `masked` counts the pixels that light places beyond the old picture,
+    `photographs` were taken; `masked` counts the pixels of which nothing is known,
     `measured_again` those whose rows failed at first; `own_variance` is that of the light of each
     pixel's own, (channels, N); `arrays` are those of the transport.
     """
@@ -369,9 +371,10 @@ def _carry_over(
 
     # 3. and 4. The transport at the new places, and its judges.
     now = _moved_calibration(calibration, mapping, fit, light)
+    known = known_pixels(movement) & now.resampling.seen.ravel()
     moved = T if movement.is_identity else T.moved(movement)
     correction = _Correction(
-        ScanGrid(now), moved.scaled(fit.gain), unit, known_pixels(movement), light, previous
+        ScanGrid(now), moved.limited(known).scaled(fit.gain), unit, known, light, previous
     )
     corrected = correction.correct(progress)
 
@@ -385,7 +388,7 @@ def _carry_over(
         photographs += BATCH_SIZE
         corrected = correction.correct(progress)
 
-    noise = _CarriedNoise(previous, movement, fit.gain, corrected.judgement.ratio)
+    noise = _CarriedNoise(previous, movement, known, fit.gain, corrected.judgement.ratio)
     return _Carried(
         fit=fit,
         calibration=now,
@@ -705,7 +708,7 @@ class _Correction:
     unit : (channels,)
         Light of pictures for that of the transport.
     known : (N,) bool
-        Pixels of which the old scan knows anything.
+        Pixels of which the old scan knows anything, and that the camera sees.
     light : UpdateLight
     previous : BlockStore
     """
@@ -805,7 +808,12 @@ class _CarriedNoise:
     """Noise of the scan at the new places, as much larger as the errors are."""
 
     def __init__(
-        self, previous: BlockStore, movement: Movement, gain: np.ndarray, ratio: float
+        self,
+        previous: BlockStore,
+        movement: Movement,
+        known: np.ndarray,
+        gain: np.ndarray,
+        ratio: float,
     ) -> None:
         self._rows = row_interpolation(movement)
         self._gain = gain
@@ -815,7 +823,7 @@ class _CarriedNoise:
         first_bounce = np.atleast_2d(previous.extra("first_bounce"))
         is_there = self._at_new_places(first_bounce > 0)
         light = self._at_new_places(first_bounce) / np.maximum(is_there, 0.5)
-        self.first_bounce = np.where(is_there > 0.5, gain[:, None] * light, 0.0)
+        self.first_bounce = np.where(known & (is_there > 0.5), gain[:, None] * light, 0.0)
         variance = self._own_variance(previous, first_bounce)
         self.own_variance = (gain[:, None] * ratio) ** 2 * self._at_new_places(variance)
 

@@ -10,12 +10,16 @@ columns,
 which keeps the light: a pixel of the projector sends the same wherever it falls. Two parts go two
 ways:
 
-    near     entries up to `REACH` pixels from the diagonal, the direct light among them, stay as
-             far from it: new pixel j lights the place that new pixel j looks at, however it falls
-             on the old pixels
+    direct   the diagonal, and around it, up to `REACH` pixels, what a pixel that is out of focus
+             lights: entries stay as far from the diagonal, since new pixel j lights the place that
+             new pixel j looks at, however it falls on the old pixels
     others   rows are interpolated between the old ones, and functions of each level between its
              nodes: C' = B C P, with P_n,m = h_n(g(m)) at the nodes m; what the nodes of the next
              finer level show beyond that, as at a crease, is added there
+
+An entry k pixels from the diagonal holds both. Focus is the same all around, and light that bounced
+between neighbours is not: it crosses a crease, in a line of pixels. So the direct part is, of the
+pixel's own light, the median share of the entries k pixels from the diagonal nearby.
 
 Places beyond the old picture have no known row; their columns go on as at its rim.
 """
@@ -27,6 +31,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its subpackage ndimage is loaded at the first use
 import scipy.sparse
 
 from ltcl.acquisition.estimation.estimator import BASIS
@@ -43,6 +48,8 @@ NEGLIGIBLE_LIGHT = 1e-6
 # relative to that of its row, below which it is left out: a third of these functions stay, and none
 # that pictures would show (with 3e-4 errors grow by a hundredth, with 1e-3 by a tenth).
 NOTABLE_LIGHT = 1e-4
+# Side of the square of pixels over which focus is the same.
+FOCUS_SIDE = 7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,6 +98,14 @@ class HostTransport:
     def scaled(self, gain: np.ndarray) -> HostTransport:
         """The transport of light that is brighter by the gains (channels,)."""
         cores = [factor * core for factor, core in zip(gain, self.cores, strict=True)]
+        return HostTransport(grid=self.grid, cores=cores, W=self.W)
+
+    def limited(self, known: np.ndarray) -> HostTransport:
+        """The transport with empty rows but of the pixels `known`, (N,)."""
+        rows = scipy.sparse.diags_array(known.astype(np.float64))
+        cores = [scipy.sparse.csr_array(rows @ core) for core in self.cores]
+        for core in cores:
+            core.eliminate_zeros()
         return HostTransport(grid=self.grid, cores=cores, W=self.W)
 
     def moved(self, movement: Movement) -> HostTransport:
@@ -180,8 +195,8 @@ class _Warp:
         return scipy.sparse.csr_array(places.T)
 
     def _split(self, level_core: Any) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
-        """Entries near the diagonal, moved along with it, and all others as they were."""
-        height, width = self.grid
+        """Direct light, moved along with the diagonal, and all other entries as they were."""
+        width = self.grid[1]
         entries = scipy.sparse.coo_array(level_core)
         row, column = np.divmod(entries.row, width)
         to_row, to_column = np.divmod(entries.col, width)
@@ -190,22 +205,50 @@ class _Warp:
         is_near = (np.abs(down) <= REACH) & (np.abs(across) <= REACH)
         side = 2 * REACH + 1
         offset = (down + REACH) * side + across + REACH
-        near = np.zeros((height * width, side * side))
+        near = np.zeros((level_core.shape[0], side * side))
         near[entries.row[is_near], offset[is_near]] = entries.data[is_near]
-        moved = self.rows @ near
-        i, k = np.nonzero(moved)
+        direct = _direct_light(near, self.grid)
+        far = scipy.sparse.csr_array(
+            (entries.data[~is_near], (entries.row[~is_near], entries.col[~is_near])),
+            shape=level_core.shape,
+        )
+        return self._beside_diagonal(self.rows @ direct), far + self._beside_diagonal(near - direct)
+
+    def _beside_diagonal(self, near: np.ndarray) -> scipy.sparse.csr_array:
+        """Entries (N, side^2) of windows around the diagonal in their places, (N, N)."""
+        height, width = self.grid
+        side = 2 * REACH + 1
+        i, k = np.nonzero(near)
         row = i // width + k // side - REACH
         column = i % width + k % side - REACH
         is_there = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         i = i[is_there]
-        places = i, (row * width)[is_there] + column[is_there]
-        shape = level_core.shape
-        moved_entries = moved[i, k[is_there]], places
-        far = entries.data[~is_near], (entries.row[~is_near], entries.col[~is_near])
-        return (
-            scipy.sparse.csr_array(moved_entries, shape=shape),
-            scipy.sparse.csr_array(far, shape=shape),
-        )
+        k = k[is_there]
+        places = i, (row * width + column)[is_there]
+        return scipy.sparse.csr_array((near[i, k], places), shape=(len(near), len(near)))
+
+
+def _direct_light(near: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """The direct part of entries (N, side^2) of windows around the diagonal."""
+    middle = near.shape[1] // 2
+    own = near[:, middle]
+    is_lit = own > 0
+    if not is_lit.any():
+        return near
+    direct = np.zeros_like(near)
+    direct[:, middle] = own
+    # What is seen nowhere has the focus of the nearest pixel that is.
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~is_lit.reshape(grid), return_distances=False, return_indices=True
+    )
+    for offset in np.flatnonzero(near.any(axis=0)):
+        if offset == middle:
+            continue
+        share = np.divide(near[:, offset], own, where=is_lit, out=np.zeros_like(own))
+        shares = share.reshape(grid)[tuple(nearest)]
+        typical = scipy.ndimage.median_filter(shares, FOCUS_SIDE, mode="nearest")
+        direct[:, offset] = typical.ravel() * own
+    return direct
 
 
 def without_negligible(core: Any) -> scipy.sparse.csr_array:

@@ -205,7 +205,7 @@ class UpdateReport(FolderReport):
     ]
     largest: Annotated[float, "Largest movement of a pixel, in projector pixels."]
     gain: Annotated[list[float], "Light of the lamp by channel, relative to that in the scan."]
-    masked: Annotated[int, "Pixels that light places beyond the old picture."]
+    masked: Annotated[int, "Pixels beyond the old picture, or not seen."]
     measured_again: Annotated[int, "Pixels that failed at first, and were measured again."]
     error: Annotated[float, "Relative error of T p for pictures that it was not fitted to."]
     bound: Annotated[float, "That of other pictures is below, with a probability of 95 %."]

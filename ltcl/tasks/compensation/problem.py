@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from ltcl.operators import Operator
 from ltcl.operators.colour_hats import scale_columns
 from ltcl.operators.diagonal_blocks import are_quicker_joined, joined_once
 from ltcl.solvers import SolveSettings
-from ltcl.solvers.bounded import Bounded, BoxProblem, minimise_each
+from ltcl.solvers.bounded import ROWS_AT_ONCE, Bounded, BoxProblem, minimise_each
 from ltcl.transport.transport import Transport
 
 # Pictures (M, k) or light (N, k), one array per system.
@@ -73,11 +74,17 @@ class Limits:
         highest = self.low + self.ceilings * (self.high - self.low)
         return np.clip(highest.astype(np.float32), self.low, self.high)[:, None]
 
+    def blocks(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Rows whose arrays fit the caches, and the largest light of each, (rows, 1) or (1, 1)."""
+        for first in range(0, len(self.masked), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            yield rows, self.highest if self.ceilings is None else self.highest[rows]
+
     def clip(self, light: np.ndarray) -> np.ndarray:
         """Light (N, k) moved within the bounds, as float32."""
         # What overflows becomes infinite, and then the bound.
         with np.errstate(over="ignore"):
-            light = light.astype(np.float32)
+            light = light.astype(np.float32, copy=False)
         light = np.clip(light, np.float32(self.low), self.highest)
         if self.masked.any():
             light[self.masked] = 0.0
@@ -222,9 +229,12 @@ class CompensationProblem:
     def box(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """The lowest and the highest unknowns of a system within the limits, (N,) float32."""
         limits = self.limits
-        free_scale = np.where(limits.masked, 0.0, self.systems[index].scale)
-        lower = (free_scale * limits.low).astype(np.float32)
-        upper = (free_scale * limits.highest[:, 0]).astype(np.float32)
+        lower = np.empty(len(limits.masked), np.float32)
+        upper = np.empty(len(limits.masked), np.float32)
+        for rows, highest in limits.blocks():
+            free_scale = np.where(limits.masked[rows], 0.0, self.systems[index].scale[rows])
+            lower[rows] = free_scale * limits.low
+            upper[rows] = free_scale * highest[:, 0]
         return lower, upper
 
     def _box_problem(self, index: int, target: np.ndarray, start: np.ndarray) -> BoxProblem:
@@ -260,13 +270,21 @@ class CompensationProblem:
     ) -> np.ndarray:
         """The light (N, k) of one system of unknowns x, from lower to upper, (N, 1) float32."""
         limits = self.limits
-        free_scale = np.where(limits.masked, 0.0, self.systems[index].scale)[:, None]
-        is_free = free_scale > 0
-        light = np.divide(x, free_scale, out=np.zeros(x.shape), where=is_free)
-        # Division rounds: values at a bound are to stay there.
-        light = np.where(x <= lower, limits.low, light)
-        light = np.where(x >= upper, np.where(is_free, limits.highest, 0.0), light)
-        return limits.clip(light)
+        nearest = np.empty(x.shape, np.float32)
+        for rows, highest in limits.blocks():
+            block = x[rows]
+            free_scale = np.where(limits.masked[rows], 0.0, self.systems[index].scale[rows])[
+                :, None
+            ]
+            is_free = free_scale > 0
+            light = np.divide(block, free_scale, out=np.zeros(block.shape), where=is_free)
+            # Division rounds: values at a bound are to stay there.
+            light = np.where(block <= lower[rows], limits.low, light)
+            light = np.where(block >= upper[rows], np.where(is_free, highest, 0.0), light)
+            # What overflows becomes infinite, and then the bound.
+            with np.errstate(over="ignore"):
+                nearest[rows] = light
+        return limits.clip(nearest)
 
 
 def multiply(factor: float, columns: Columns) -> Columns:
