@@ -265,7 +265,7 @@ def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | No
         has_far = far_count > 0
         bases[rows][has_far] = columns[(indptr[1:] - far_count)[has_far]]
         counts = np.diff(indptr)
-        near_bases = np.repeat(np.arange(rows.start, rows.stop), counts)
+        near_bases = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int32), counts)
         distance = columns - np.where(is_far, np.repeat(bases[rows], counts), near_bases)
         code = (2 * distance + is_far) & 0xFFFF
         narrow[own] &= ALL_HALVES
