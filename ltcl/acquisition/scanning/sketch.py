@@ -436,10 +436,16 @@ def _estimate(
         estimator.learn(fitted.without(wrong_fitted))
         return estimator
 
-    wrong, estimator = find_wrong_pictures(pairs, learn)
+    def judge(wrong: list[int], estimator: Estimator | RefinedEstimator) -> _Estimate:
+        judges_left = pairs.select(np.setdiff1d(judging, wrong))
+        return _judged(estimator, judges_left, [pictures.numbers[number] for number in wrong])
+
+    def error_without(wrong: list[int], estimator: Estimator | RefinedEstimator) -> float:
+        return judge(wrong, estimator).error
+
+    wrong, estimator = find_wrong_pictures(pairs, learn, error_without)
     _refuse_several(wrong, pictures.names)
-    judges_left = pairs.select(np.setdiff1d(judging, wrong))
-    return _judged(estimator, judges_left, [pictures.numbers[number] for number in wrong])
+    return judge(wrong, estimator)
 
 
 def _refuse_several(wrong: Sequence[int], names: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import ltcl
 from ltcl.acquisition.estimation import refinement
-from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
+from ltcl.acquisition.estimation.contradiction import Comparison, find_wrong_pictures
 from ltcl.acquisition.estimation.estimator import Estimator
 from ltcl.acquisition.estimation.pairs import Pairs
 from ltcl.acquisition.estimation.refinement import RefinedEstimator
@@ -31,12 +31,12 @@ def corner() -> np.ndarray:
     return np.asarray(ltcl.scenes.dihedral(12, albedo=0.6).transport().matrices[0], np.float64)
 
 
-def make_pairs(T: np.ndarray, channels: int = 1) -> Pairs:
+def make_pairs(T: np.ndarray, channels: int = 1, noise: float = NOISE) -> Pairs:
     """White, the patterns of a sketch and its judges, with noisy photographs."""
     pictures = [np.ones(GRID), *sketch.patterns(GRID), *sketch.judges(GRID)]
     patterns = np.stack(pictures).reshape(len(pictures), PIXELS)
     light = patterns @ T.T
-    noise = NOISE * light[0].mean()
+    noise = noise * light[0].mean()
     noisy = light + noise * np.random.default_rng(3).standard_normal(light.shape)
     return Pairs(
         grid=GRID,
@@ -56,7 +56,8 @@ def with_lamp(pairs: Pairs, numbers: list[int], strength: float = 0.05) -> Pairs
     return replace(pairs, photographs=photographs)
 
 
-def find(pairs: Pairs, kind: Any = Estimator) -> list[int]:
+def find(pairs: Pairs, kind: Any = Estimator, error: float = 0.01) -> list[int]:
+    """Numbers of wrong pictures, if T p of the others errs by `error`."""
     first_judge = len(pairs) - sketch.JUDGES
 
     def learn(wrong: list[int]) -> Any:
@@ -65,7 +66,7 @@ def find(pairs: Pairs, kind: Any = Estimator) -> list[int]:
         estimator.learn(fitted.without([number for number in wrong if number < first_judge]))
         return estimator
 
-    wrong, _ = find_wrong_pictures(pairs, learn)
+    wrong, _ = find_wrong_pictures(pairs, learn, lambda wrong, estimator: error)
     return wrong
 
 
@@ -108,3 +109,22 @@ def test_where_light_jumps_no_picture_stands_alone() -> None:
     """A mirror sends light of each pixel to the other side of the picture."""
     mirror = np.eye(PIXELS)[::-1]
     assert find(make_pairs(0.5 * np.eye(PIXELS) + 0.2 * mirror)) == []
+
+
+def test_a_light_must_be_stronger_than_the_error_of_the_sketch() -> None:
+    """Behind a block the coarsest patterns err as if another light were on."""
+    comparison = Comparison(
+        strength=np.full(2, 0.1),
+        share=np.array([0.3, 0.7]),
+        surprise=np.full(2, 10.0),
+        pixels=PIXELS,
+    )
+    assert (comparison.contradiction(error=0.05) > 1.0).all()
+    assert (comparison.contradiction(error=0.2) < 1.0).all()
+
+
+def test_what_is_weaker_than_the_error_of_the_sketch_is_kept() -> None:
+    pairs = make_pairs(corner(), noise=0.02)
+    pairs = with_lamp(pairs, [FINE_PATTERN], strength=0.05)
+    assert find(pairs, error=0.03) == [FINE_PATTERN]
+    assert find(pairs, error=0.1) == []
