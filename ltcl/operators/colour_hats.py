@@ -265,7 +265,7 @@ def _narrow_entries(entries: JointEntries) -> tuple[np.ndarray, np.ndarray] | No
         has_far = far_count > 0
         bases[rows][has_far] = columns[(indptr[1:] - far_count)[has_far]]
         counts = np.diff(indptr)
-        near_bases = np.repeat(np.arange(rows.start, rows.stop), counts)
+        near_bases = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int32), counts)
         distance = columns - np.where(is_far, np.repeat(bases[rows], counts), near_bases)
         code = (2 * distance + is_far) & 0xFFFF
         narrow[own] &= ALL_HALVES
@@ -292,8 +292,9 @@ class ColourRows:
         pixels = W.shape[1]
         self.own = np.stack([K.diagonal()[:pixels].astype(np.float64) for K in cores])
         self._lock = threading.Lock()
-        # Until they are transposed.
+        # Until those of the K^T are on the device.
         self._entries: JointEntries | None = JointEntries.of(cores, pixels)
+        self._are_transposed = False
         self.forward = DeviceRows(W.device, self._entries)
         self._transposed: DeviceRows | None = None
 
@@ -301,8 +302,12 @@ class ColourRows:
         """The rows of the K^T."""
         with self._lock:
             if self._transposed is None:
-                assert self._entries is not None  # noqa: S101 - they are transposed once
-                self._transposed = DeviceRows(self.W.device, self._entries.transposed())
+                assert self._entries is not None  # noqa: S101 - they are uploaded once
+                if not self._are_transposed:
+                    # Those of K make room first.
+                    self._entries = self._entries.transposed()
+                    self._are_transposed = True
+                self._transposed = DeviceRows(self.W.device, self._entries)
                 self._entries = None
             return self._transposed
 
