@@ -31,6 +31,9 @@ Updates: a larger corner is scanned by a camera with three pixels to a side of o
 projector's, whose geometry Gray code shows. Then the projector moves by 3.7 pixels, aslant and
 across, its lamp loses 5 %, and 12 photographs carry the sketch over. T p is compared with the light
 of the corner as it is then (`_moved_corner`), on pixels of which something is known.
+
+By hand: the same camera, whose photographs cost a person time, so that the set-up takes few. T p is
+compared in the same way.
 """
 
 from __future__ import annotations
@@ -93,6 +96,10 @@ TURNED = {"aslant, a place behind a mirror": 0.25}
 MAX_UPDATE_PHOTOGRAPHS = 12
 MAX_PHOTOGRAPHS_AGAIN = 60
 MAX_UPDATE_RATIO = 1.2
+# Sides of the projectors of scans by hand, their photographs and the largest error of each kind.
+HAND_SIDES = (16, 32, 64)
+MAX_PHOTOGRAPHS_BY_HAND = 80
+MAX_ERROR_BY_HAND = 0.015
 
 
 def pictures(grid: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -495,6 +502,40 @@ def run_updates(side: int, options: Options) -> list[Updated]:
     return updates
 
 
+class HandRig(MovedCornerRig):
+    """A camera that a person operates: each photograph takes long."""
+
+    keeps_photographs = True
+
+
+def hand_claims(side: int, options: Options) -> list[Claim]:
+    """Check a scan by hand of a corner."""
+    rig = HandRig(side, ALBEDO, seed=2, response="srgb", bits=12)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "T.zarr"
+        T = acquire(rig, strategy="sketch", store=path, device=options.device)
+        errors = errors_on_camera(path, T, rig)
+    name = f"by hand, {side} x {side}"
+    checked = [
+        Claim(
+            text=f"{name}: photographs",
+            measured=str(rig.count),
+            wanted=f"at most {MAX_PHOTOGRAPHS_BY_HAND}",
+            holds=rig.count <= MAX_PHOTOGRAPHS_BY_HAND,
+        )
+    ]
+    for kind, error in errors.items():
+        checked.append(
+            Claim(
+                text=f"{name}: {kind}",
+                measured=f"{error:.2%}",
+                wanted=f"at most {MAX_ERROR_BY_HAND:.1%}",
+                holds=error <= MAX_ERROR_BY_HAND,
+            )
+        )
+    return checked
+
+
 def update_claims(updated: Updated) -> list[Claim]:
     """Check an update."""
     error = root_mean_square(updated.errors)
@@ -658,6 +699,8 @@ def main() -> None:
             facts[f"{updated.name}, {kind}"] = error
             facts[f"{updated.name}, {kind} in the scan"] = updated.old_errors[kind]
         checked += update_claims(updated)
+    for hand_side in HAND_SIDES[:1] if options.smoke else HAND_SIDES:
+        checked += hand_claims(hand_side, options)
     if options.smoke:
         # So few pixels show that it runs, not how few photographs a larger scene takes.
         checked = []

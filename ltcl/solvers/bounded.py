@@ -113,10 +113,9 @@ class BoxProblem:
     def in_units(self) -> _ScaledProblem:
         """The problem in units in which squares stay within float32."""
         # A x is about as large as the x nearest to 0, however dark the target is.
-        darkest = np.clip(0.0, self.lower, self.upper)
-        largest = max(float(np.max(np.abs(self.b))), float(np.max(np.abs(darkest))))
+        largest = max(_largest(self.b), float(np.max(self.lower)), -float(np.min(self.upper)))
         if largest == 0.0:
-            largest = float(np.max(np.abs([self.lower, self.upper])))
+            largest = max(_largest(self.lower), _largest(self.upper))
         unit = power_of_two(largest)
         weight_unit = 1.0
         weights = self.weights
@@ -124,8 +123,10 @@ class BoxProblem:
             weight_unit = power_of_two(float(np.max(weights)))
             weights = weights / weight_unit
         with np.errstate(over="ignore"):
-            lower = np.clip(self.lower / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
-            upper = np.clip(self.upper / unit, -FARTHEST_BOUND, FARTHEST_BOUND)
+            lower = self.lower / unit
+            upper = self.upper / unit
+        for bounds in (lower, upper):
+            np.clip(bounds, -FARTHEST_BOUND, FARTHEST_BOUND, out=bounds)
         box = round_inwards(lower, upper)
         return _ScaledProblem(
             unit=unit,
@@ -230,7 +231,7 @@ def minimise_each(
         box = round_inwards(problems[number].lower, problems[number].upper)
         solved.append(
             Bounded(
-                x=_clip(x.astype(np.float32), box),
+                x=_clip(x.astype(np.float32, copy=False), box),
                 status=end.status,
                 iterations=len(search.history) - 1,
                 products=descent.products,
@@ -725,6 +726,11 @@ def _as_columns(box: Box) -> Box:
 def _clip(x: np.ndarray, box: Box) -> np.ndarray:
     lower, upper = _as_columns(box)
     return np.clip(x, lower, upper)
+
+
+def _largest(values: np.ndarray) -> float:
+    """Return the largest size of values."""
+    return float(np.maximum(np.max(values), -np.min(values)))
 
 
 def power_of_two(largest: float) -> float:
