@@ -15,8 +15,9 @@ agree. It names all that would do.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -32,6 +33,11 @@ from ltcl.acquisition.agreement import (
 PROJECTOR_UNEVENNESS = 0.1
 # Least part of the light of white in a uniform code that is compared.
 MIN_UNIFORM_SHARE = 0.02
+# Score up to which light agrees: 1 for a single comparison, and more where one of many leaves a
+# little to chance; and after a change, which may have come with less noise, as JPEG does, by which
+# that of the camera was measured.
+MAX_SCORE = 1.2
+MAX_SCORE_AFTER = 2.0
 # Most photographs that an explanation names.
 MAX_NAMED = 4
 # Different codes of a photograph, at least, that tell its bits, and the bits that all lack.
@@ -41,10 +47,19 @@ MIN_TRAILING_ZEROS = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Light that should be the same, and the numbers of the photographs behind each row of it."""
+    """Light that should be the same, and the numbers of the photographs behind each row of it.
 
-    light: LinearLight
+    `select` gives some rows of it: the noise of each follows from the mean of these.
+    """
+
+    select: Callable[[Sequence[int]], LinearLight]
     numbers: Sequence[tuple[int, ...]]
+
+    def score(self, rows: Sequence[int]) -> float:
+        """Largest score of some rows, which agree up to 1."""
+        if len(rows) < 2:
+            return 0.0
+        return float(self.select(rows).scores().max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,34 +74,45 @@ class Explanation:
     changes: tuple[int, ...]
     pairs: tuple[int, ...]
 
+    @property
+    def suspects(self) -> set[int]:
+        """Photographs that deviate alone, or from which on others do."""
+        return {*self.single, *self.changes}
+
     def describe(self, name: PhotographName) -> str | None:
         """The explanation in words; None if there is none, or too many photographs explain it."""
-        single = self.single
-        changes = tuple(k for k in self.changes if k not in single)
-        if self.pairs and len(self.pairs) < MAX_NAMED:
+        if len(self.single) > MAX_NAMED or len(self.pairs) > MAX_NAMED // 2:
+            return None
+        if self.pairs:
             names = [f"{name(k)} and {name(k + 1)}" for k in self.pairs]
-            return f"{', or '.join(names)} deviate: they are exchanged, or of other patterns"
-        if len(single) > MAX_NAMED:
-            return None
+            return f"{', or '.join(names)} deviate: they are exchanged, or show other patterns"
         texts = []
-        if single:
-            names = [name(k) for k in single]
-            texts.append(f"{' or '.join(names)} deviates")
+        if self.single:
+            names = [name(k) for k in self.single]
+            texts.append(
+                f"{' or '.join(names)} deviates from others of the same light: another pattern, "
+                "another light, or another exposure"
+            )
+        changes = [k for k in self.changes if k not in self.single]
         if changes:
-            first, last = changes[0], changes[-1]
-            is_range = last - first + 1 == len(changes) and first < last
-            if first == last:
-                where = f"{name(first)} and those after it deviate"
-            elif is_range:
-                where = f"from one of photographs {first} to {last} on, they deviate"
-            elif len(changes) <= MAX_NAMED:
-                where = f"from {' or '.join(map(name, changes))} on, they deviate"
-            else:
-                where = f"from one of {name(first)} to {name(last)} on, they deviate"
+            where = self._describe_changes(changes, name)
             texts.append(f"{where}: the camera or scene moved, or the light changed")
-        if not texts:
-            return None
-        return "; or ".join(texts)
+        return "; or ".join(texts) if texts else None
+
+    def _describe_changes(self, changes: Sequence[int], name: PhotographName) -> str:
+        """The photographs from one of which on the others deviate."""
+        first = changes[0]
+        last = changes[-1]
+        if len(changes) == 1:
+            return f"{name(first)} and those after it deviate"
+        if len(changes) > MAX_NAMED:
+            return (
+                f"{name(last)} and those after it deviate, and perhaps some of photographs {first} "
+                f"to {last - 1}"
+            )
+        if last - first + 1 == len(changes):
+            return f"photographs deviate from one of photographs {first} to {last} on"
+        return f"photographs deviate from {' or '.join(map(name, changes))} on"
 
 
 class Contradictions:
@@ -94,14 +120,16 @@ class Contradictions:
 
     def __init__(self, photographs: Sequence[RecordedPhotograph], camera: CameraModel) -> None:
         self.numbers = [photograph.number for photograph in photographs]
-        self._agreement: dict[tuple[int, tuple[int, ...]], bool] = {}
+        self._scores: dict[tuple[int, tuple[int, ...]], float] = {}
         self.comparisons = _pattern_comparisons(photographs, camera)
         pairs = _inverse_pairs(photographs)
         self.comparisons += _sum_comparisons(pairs, camera)
         self.comparisons += _white_comparisons(photographs, pairs, camera)
 
     def explain(self) -> Explanation:
-        """Find what explains all contradictions."""
+        """Find what explains all contradictions: nothing if there are none beyond doubt."""
+        if self._agree_without(set()):
+            return Explanation(single=(), changes=(), pairs=())
         single = [k for k in self.numbers if self._agree_without({k})]
         changes = [k for k in self.numbers[1:] if self._agree_around(k)]
         pairs = []
@@ -110,21 +138,22 @@ class Contradictions:
         return Explanation(single=tuple(single), changes=tuple(changes), pairs=tuple(pairs))
 
     def _agree_without(self, wrong: set[int]) -> bool:
-        return self._agree_where(wrong.isdisjoint)
+        return self._agree_where(wrong.isdisjoint, MAX_SCORE)
 
     def _agree_around(self, change: int) -> bool:
-        return self._agree_where(lambda numbers: max(numbers) < change) and self._agree_where(
-            lambda numbers: min(numbers) >= change
-        )
+        """True if photographs before a number agree, and those from it on do."""
+        if not self._agree_where(lambda numbers: max(numbers) < change, MAX_SCORE):
+            return False
+        return self._agree_where(lambda numbers: min(numbers) >= change, MAX_SCORE_AFTER)
 
-    def _agree_where(self, is_chosen: Callable[[tuple[int, ...]], bool]) -> bool:
+    def _agree_where(self, is_chosen: Callable[[tuple[int, ...]], bool], max_score: float) -> bool:
         """True if all comparisons of chosen rows agree."""
         for place, comparison in enumerate(self.comparisons):
             rows = [row for row, numbers in enumerate(comparison.numbers) if is_chosen(numbers)]
             key = place, tuple(rows)
-            if key not in self._agreement:
-                self._agreement[key] = len(rows) < 2 or comparison.light.select(rows).agrees()
-            if not self._agreement[key]:
+            if key not in self._scores:
+                self._scores[key] = comparison.score(rows)
+            if self._scores[key] > max_score:
                 return False
         return True
 
@@ -139,10 +168,19 @@ def _pattern_comparisons(
     comparisons = []
     for group in groups.values():
         if len(group) > 1:
-            light = _linear_light(group, camera)
             numbers = [(photograph.number,) for photograph in group]
-            comparisons.append(Comparison(light=light, numbers=numbers))
+            comparison = Comparison(
+                select=partial(_light_of_pattern, group, camera), numbers=numbers
+            )
+            comparisons.append(comparison)
     return comparisons
+
+
+def _light_of_pattern(
+    group: Sequence[RecordedPhotograph], camera: CameraModel, rows: Sequence[int]
+) -> LinearLight:
+    """Light of some photographs of a pattern."""
+    return _linear_light([group[row] for row in rows], camera)
 
 
 def _linear_light(
@@ -179,18 +217,18 @@ def _sum_comparisons(pairs: Sequence[Pair], camera: CameraModel) -> list[Compari
     comparisons = []
     for group in groups.values():
         if len(group) > 1:
-            light = _sums(group, camera)
             numbers = [(first.number, second.number) for first, second in group]
-            comparisons.append(Comparison(light=light, numbers=numbers))
+            comparison = Comparison(select=partial(_sums, group, camera), numbers=numbers)
+            comparisons.append(comparison)
     return comparisons
 
 
-def _sums(pairs: Sequence[Pair], camera: CameraModel) -> LinearLight:
-    """Light of patterns and of their inverses together."""
-    patterns = [first for first, _ in pairs]
-    inverses = [second for _, second in pairs]
+def _sums(pairs: Sequence[Pair], camera: CameraModel, rows: Sequence[int]) -> LinearLight:
+    """Light of some patterns and of their inverses together."""
+    patterns = [pairs[row][0] for row in rows]
+    inverses = [pairs[row][1] for row in rows]
     both = _linear_light([*patterns, *inverses], camera)
-    count = len(pairs)
+    count = len(rows)
     return both.select(range(count)).plus(both.select(range(count, 2 * count)))
 
 
@@ -198,35 +236,55 @@ def _white_comparisons(
     photographs: Sequence[RecordedPhotograph], pairs: Sequence[Pair], camera: CameraModel
 ) -> list[Comparison]:
     """White, sums of patterns and inverses less black, and uniform codes."""
-    whites = [photograph for photograph in photographs if photograph.uniform == 1.0]
     blacks: dict[float, list[RecordedPhotograph]] = defaultdict(list)
     for photograph in photographs:
         if photograph.uniform == 0.0:
             blacks[photograph.seconds].append(photograph)
+    # Long exposures are compared with others of white alone: errors of black show in them.
+    shortest = min(blacks, default=0.0)
+    whites = []
+    for photograph in photographs:
+        if photograph.uniform == 1.0 and photograph.seconds <= shortest:
+            whites.append(photograph)
     if not whites:
         return []
-    white = _median_radiance(whites, camera)
-    parts = [_linear_light(whites, camera, white)]
+    black = {t: t * _median_radiance(_linear_light(dark, camera)) for t, dark in blacks.items()}
+    stripes = [pair for pair in pairs if pair[0].uniform is None and pair[0].seconds in black]
     numbers: list[tuple[int, ...]] = [(photograph.number,) for photograph in whites]
-    for seconds, dark in blacks.items():
-        black = seconds * _median_radiance(dark, camera)
-        group = [pair for pair in pairs if pair[0].seconds == seconds]
-        group = [pair for pair in group if pair[0].uniform is None]
-        if group:
-            parts.append(_sums_less_black(group, camera, white, black))
-            numbers += [(first.number, second.number) for first, second in group]
-        for photograph in photographs:
-            if photograph.seconds == seconds and 0.0 < (photograph.uniform or 0.0) < 1.0:
-                light = _stretched(photograph, camera, white, black)
-                if light is not None:
-                    parts.append(light)
-                    numbers.append((photograph.number,))
-    return [Comparison(light=LinearLight.joined(parts), numbers=numbers)]
+    numbers += [(first.number, second.number) for first, second in stripes]
+
+    # Many sums outvote a photograph of white that is wrong.
+    rough = _median_radiance(_linear_light(whites, camera))
+    white = _median_radiance(_full_light(whites, stripes, camera, rough, black))
+    parts = [_full_light(whites, stripes, camera, white, black)]
+    for photograph in photographs:
+        code = photograph.uniform
+        if code is not None and 0.0 < code < 1.0 and photograph.seconds in black:
+            light = _stretched(photograph, camera, white, black[photograph.seconds])
+            if light is not None:
+                parts.append(light)
+                numbers.append((photograph.number,))
+    return [Comparison(select=LinearLight.joined(parts).select, numbers=numbers)]
 
 
-def _median_radiance(group: Sequence[RecordedPhotograph], camera: CameraModel) -> np.ndarray:
+def _full_light(
+    whites: Sequence[RecordedPhotograph],
+    stripes: Sequence[Pair],
+    camera: CameraModel,
+    white: np.ndarray,
+    black: Mapping[float, np.ndarray],
+) -> LinearLight:
+    """Light of white, then that of pairs of stripes less black, whose noise is that of white."""
+    parts = [_linear_light(whites, camera, white)]
+    for first, second in stripes:
+        both = _linear_light([first, second], camera, white)
+        total = both.select([0]).plus(both.select([1]))
+        parts.append(replace(total, value=total.value - black[first.seconds]))
+    return LinearLight.joined(parts)
+
+
+def _median_radiance(light: LinearLight) -> np.ndarray:
     """Median radiance (n, c) of photographs where they are not saturated; 0 without any."""
-    light = _linear_light(group, camera)
     radiance = light.value / light.seconds
     count = np.isfinite(radiance).sum(axis=0)
     # Saturated values are inf, and last.
@@ -234,18 +292,6 @@ def _median_radiance(group: Sequence[RecordedPhotograph], camera: CameraModel) -
     middle = np.maximum(count - 1, 0) // 2
     median = np.take_along_axis(ordered, middle[None], axis=0)[0]
     return np.where(count > 0, median, 0.0)
-
-
-def _sums_less_black(
-    pairs: Sequence[Pair], camera: CameraModel, white: np.ndarray, black: np.ndarray
-) -> LinearLight:
-    """Light of patterns and inverses without that of black: as white is."""
-    patterns = [first for first, _ in pairs]
-    inverses = [second for _, second in pairs]
-    first = _linear_light(patterns, camera, white)
-    second = _linear_light(inverses, camera, white)
-    total = first.plus(second)
-    return replace(total, value=total.value - black)
 
 
 def _stretched(
@@ -285,7 +331,7 @@ class FewerBits:
     bits: int
 
     def describe(self, name: PhotographName) -> str:
-        """This in words."""
+        """Describe it in words."""
         return (
             f"{name(self.first)} and those after it have codes of {self.bits} bits alone, as JPEG "
             "has, and those before it more: all must be stored alike"

@@ -296,7 +296,8 @@ class CaptureSession:
             text = coarse.describe(self.shots.name)
         elif not finding.is_exchange:
             explanation = Contradictions(photographs, self.camera).explain()
-            text = explanation.describe(self.shots.name) or text
+            if explanation.suspects != set(finding.suspects):
+                text = explanation.describe(self.shots.name) or text
         raise AcquisitionError(f"{text}; {ADVICE}")
 
     @contextlib.contextmanager
