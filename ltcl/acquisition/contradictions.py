@@ -33,6 +33,8 @@ from ltcl.acquisition.agreement import (
 PROJECTOR_UNEVENNESS = 0.1
 # Least part of the light of white in a uniform code that is compared.
 MIN_UNIFORM_SHARE = 0.02
+# Most light of black, relative to white, that is subtracted from sums.
+MAX_BLACK_SHARE = 0.5
 # Score up to which light agrees: 1 for a single comparison, and more where one of many leaves a
 # little to chance; and after a change, which may have come with less noise, as JPEG does, by which
 # that of the camera was measured.
@@ -248,13 +250,18 @@ def _white_comparisons(
             whites.append(photograph)
     if not whites:
         return []
-    black = {t: t * _median_radiance(_linear_light(dark, camera)) for t, dark in blacks.items()}
+    rough = _median_radiance(_linear_light(whites, camera))
+    black = {}
+    for seconds, dark in blacks.items():
+        radiance = _median_radiance(_linear_light(dark, camera))
+        # Otherwise black may be what is wrong, and sums less black tell nothing.
+        if radiance.mean() < MAX_BLACK_SHARE * rough.mean():
+            black[seconds] = seconds * radiance
     stripes = [pair for pair in pairs if pair[0].uniform is None and pair[0].seconds in black]
     numbers: list[tuple[int, ...]] = [(photograph.number,) for photograph in whites]
     numbers += [(first.number, second.number) for first, second in stripes]
 
     # Many sums outvote a photograph of white that is wrong.
-    rough = _median_radiance(_linear_light(whites, camera))
     white = _median_radiance(_full_light(whites, stripes, camera, rough, black))
     parts = [_full_light(whites, stripes, camera, white, black)]
     for photograph in photographs:
