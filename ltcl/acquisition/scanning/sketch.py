@@ -50,6 +50,9 @@ JUDGES = 8
 # Fields of the checkerboard, and lit patches, along the shorter side.
 CHECKERBOARD_FIELDS = 6
 PATCH_SHARE = 8
+# Squared light of a judge, relative to that of as many pixels of white, of which it must have more:
+# a patch may lie where the projector lights nothing, and have no relative error.
+MIN_JUDGE_LIGHT = 0.01
 # Text is drawn so many times as large; letters of size 1 take so many rows, with their spacing.
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
@@ -436,9 +439,12 @@ def _estimate(
         estimator.learn(fitted.without(wrong_fitted))
         return estimator
 
+    white = _squared_light(pairs.select(slice(0, 1)))
+
     def judge(wrong: list[int], estimator: Estimator | RefinedEstimator) -> _Estimate:
         judges_left = pairs.select(np.setdiff1d(judging, wrong))
-        return _judged(estimator, judges_left, [pictures.numbers[number] for number in wrong])
+        wrong_patterns = [pictures.numbers[number] for number in wrong]
+        return _judged(estimator, judges_left, white, wrong_patterns)
 
     def error_without(wrong: list[int], estimator: Estimator | RefinedEstimator) -> float:
         return judge(wrong, estimator).error
@@ -505,10 +511,28 @@ class _Estimate:
         )
 
 
+def is_lit_judge(pattern: np.ndarray, light: float, white: float) -> bool:
+    """True if a picture of a pattern has light; squared ones are those of it and of white.
+
+    Letters vanish in a picture of few rows, and a patch where the projector lights nothing.
+    """
+    return light > MIN_JUDGE_LIGHT * white * float(np.mean(pattern))
+
+
+def _squared_light(pair: Pairs) -> float:
+    """The sum of squares of the known light of a picture."""
+    variance: Any = pair.variance
+    light = np.where(variance < KNOWN_VARIANCE, pair.photographs, 0.0).astype(np.float64)
+    return float((light**2).sum())
+
+
 def _judged(
-    estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
+    estimator: Estimator | RefinedEstimator,
+    pairs: Pairs,
+    white: float,
+    wrong_patterns: list[int],
 ) -> _Estimate:
-    """The error of an estimator for pairs that it has not seen."""
+    """The error of an estimator for pairs that it has not seen; `white` is its squared light."""
     squares = np.zeros(len(pairs))
     is_lit = np.zeros(len(pairs), bool)
     residual_squares = np.zeros(estimator.channels)
@@ -520,11 +544,9 @@ def _judged(
         unexplained = np.where(is_known, judge.photographs - explained, 0.0)
         of_channels = (unexplained**2).sum(axis=(0, 1))
         noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
-        light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
-        energy = max((light**2).sum(), np.finfo(float).tiny)
+        energy = max(_squared_light(judge), np.finfo(float).tiny)
         squares[number] = max(of_channels.sum() - noise, 0.0) / energy
-        # Letters vanish in a picture of few rows.
-        is_lit[number] = judge.patterns.any()
+        is_lit[number] = is_lit_judge(judge.patterns, energy, white)
         residual_squares += of_channels
     return _Estimate(
         estimator=estimator,

@@ -245,6 +245,25 @@ def test_bounces_of_a_clean_sketch_carry_no_warning(
 
 
 @pytest.mark.slow
+def test_a_patch_where_the_projector_lights_nothing_judges_nothing(tmp_path: Path) -> None:
+    """A patch that judges lies on the left half, which is dark: it has no relative error."""
+    truth = corner(8).reshape(8, 16, 8, 16).copy()
+    truth[:, :8] = 0.0
+    truth[:, :, :, :8] = 0.0
+    path = tmp_path / "T.zarr"
+    T = acquire(
+        Unplugged(truth.reshape(128, 128), (8, 16)),
+        geometry="aligned",
+        strategy="sketch",
+        store=path,
+    )
+    report = Report.of(path)
+    assert T.masked.sum() == 64
+    error = relative_error(dense(T), truth.reshape(128, 128), (8, 16))
+    assert 0.5 * error < report.judged_error < 2.0 * error
+
+
+@pytest.mark.slow
 def test_where_light_is_not_smooth_the_error_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
