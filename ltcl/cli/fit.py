@@ -168,6 +168,10 @@ def _read_frames(
             )
         frames.append(picture)
         context.progress(path.name, frame.number, source.count)
+        has_colour = has_colour or picture.ndim == 3
+    if has_colour:
+        # Black frames of a film in colour are grey.
+        frames = [images.as_colour(picture) for picture in frames]
     return np.stack(frames)
 
 

@@ -85,16 +85,20 @@ class JointEntries:
     numbers: np.ndarray
 
     @classmethod
-    def of(cls, cores: Sequence[Any], pixels: int) -> JointEntries:
-        """The entries of K (nodes, nodes) of each colour, float32 in ascending columns."""
+    def of(cls, cores: Sequence[Any], own: np.ndarray) -> JointEntries:
+        """The entries of K (nodes, nodes) of each colour, float32 in ascending columns.
+
+        `own` (3, N) are the diagonals at pixels.
+        """
         nodes = cores[0].shape[0]
+        pixels = own.shape[1]
         join = _join_halves
-        if not all(map(_has_few_bits, cores, [pixels] * COLOURS)):
+        if not all(map(_has_few_bits, cores, own)):
             join = _join_reals
 
         def join_rows(rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             indptr, indices, numbers = join([_rows_of_core(K, rows) for K in cores])
-            row = np.repeat(np.arange(rows.start, rows.stop), np.diff(indptr))
+            row = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int32), np.diff(indptr))
             is_kept = (row >= pixels) | (indices != row)
             before = np.concatenate([[0], np.cumsum(is_kept)])
             return np.diff(before[indptr]), indices[is_kept], numbers[is_kept]
@@ -130,7 +134,7 @@ class JointEntries:
 
 
 def _in_threads(work: Callable[[slice], Any], rows: int) -> list[Any]:
-    """The results for blocks of rows, which fit the caches, in order."""
+    """The results for blocks of rows, or of entries, which fit the caches, in order."""
     blocks = [slice(i, min(i + ROWS_AT_ONCE, rows)) for i in range(0, rows, ROWS_AT_ONCE)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(work, blocks))
@@ -145,16 +149,18 @@ def _rows_of_core(K: Any, rows: slice) -> Any:
     return scipy.sparse.csr_array(parts, shape=(rows.stop - rows.start, K.shape[1]))
 
 
-def _has_few_bits(K: Any, pixels: int) -> bool:
-    """True if all but the diagonal at pixels have 8 significant bits."""
+def _has_few_bits(K: Any, own: np.ndarray) -> bool:
+    """True if all but the diagonal at pixels, `own` (N,), have 8 significant bits."""
 
-    def have(rows: slice) -> bool:
-        block = _rows_of_core(K, rows)
-        row = np.repeat(np.arange(rows.start, rows.stop), np.diff(block.indptr))
-        is_own = (row < pixels) & (block.indices == row)
-        return not np.any((block.data.view(np.uint32) & LOWER_BITS != 0) & ~is_own)
+    def count(entries: slice) -> int:
+        return _count_lower_bits(K.data[entries])
 
-    return all(_in_threads(have, K.shape[0]))
+    return sum(_in_threads(count, len(K.data))) == _count_lower_bits(own.astype(np.float32))
+
+
+def _count_lower_bits(values: np.ndarray) -> int:
+    """Number of float32 values with more than 8 significant bits."""
+    return int(np.count_nonzero(values.view(np.uint32) & LOWER_BITS))
 
 
 def _join_halves(cores: Sequence[Any]) -> tuple[np.ndarray, ...]:
@@ -293,7 +299,7 @@ class ColourRows:
         self.own = np.stack([K.diagonal()[:pixels].astype(np.float64) for K in cores])
         self._lock = threading.Lock()
         # Until those of the K^T are on the device.
-        self._entries: JointEntries | None = JointEntries.of(cores, pixels)
+        self._entries: JointEntries | None = JointEntries.of(cores, self.own)
         self._are_transposed = False
         self.forward = DeviceRows(W.device, self._entries)
         self._transposed: DeviceRows | None = None

@@ -62,6 +62,8 @@ SEED = 0
 # Rounds at most, and by which share one must lower the error for another to follow.
 MAX_ROUNDS = 24
 LEAST_GAIN = 0.03
+# Patterns of a round at least.
+LEAST_PATTERNS = 4
 # Pixels from which on there are patterns for rounds.
 LEAST_PIXELS = 16
 # Why a picture contradicts all others.
@@ -294,20 +296,32 @@ def most_patterns(grid: tuple[int, int], rounds: int = 0, stripes: int = 0) -> i
     return BATCH_SIZE * batches
 
 
-def photographs_of_round(exposures: int) -> int:
+def photographs_of_round(exposures: int, patterns: int = BATCH_SIZE) -> int:
     """Photographs of a round; a batch ends with one that was taken before."""
-    return exposures * BATCH_SIZE + 1
+    return exposures * patterns + 1
 
 
-def most_rounds(photographs: int | None, rtol: float | None, first: int, exposures: int) -> int:
-    """Rounds at most within some photographs, of which set-up and first patterns take `first`.
+def round_sizes(
+    photographs: int | None, rtol: float | None, first: int, exposures: int
+) -> list[int]:
+    """Patterns of each round within some photographs; set-up and first patterns take `first`.
 
-    >>> most_rounds(150, None, 98, 1), most_rounds(None, None, 98, 1)
-    (3, 0)
+    The last round has as many as there are photographs left.
+
+    >>> round_sizes(150, None, 98, 1), round_sizes(145, None, 98, 1), round_sizes(None, None, 98, 1)
+    ([16, 16, 16], [16, 16, 12], [])
     """
     if photographs is None:
-        return 0 if rtol is None else MAX_ROUNDS
-    return min(max((photographs - first) // photographs_of_round(exposures), 0), MAX_ROUNDS)
+        return [] if rtol is None else MAX_ROUNDS * [BATCH_SIZE]
+    sizes: list[int] = []
+    left = photographs - first
+    while len(sizes) < MAX_ROUNDS:
+        patterns = min((left - 1) // exposures, BATCH_SIZE)
+        if patterns < LEAST_PATTERNS:
+            break
+        sizes.append(patterns)
+        left -= photographs_of_round(exposures, patterns)
+    return sizes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,22 +330,23 @@ class Rounds:
 
     Attributes
     ----------
-    most : int
-        Rounds at most.
+    sizes : sequence of int
+        Patterns of each round.
     rtol : float, optional
         Error of the judges that is small enough; None: all rounds are taken.
     """
 
-    most: int = 0
+    sizes: Sequence[int] = ()
     rtol: float | None = None
 
     def go_on(self, errors: list[float]) -> bool:
         """True if another round follows, given the errors after the first patterns and each round.
 
-        >>> Rounds(most=3, rtol=0.01).go_on([0.03, 0.02]), Rounds(most=3, rtol=0.01).go_on([0.009])
+        >>> rounds = Rounds(sizes=[16, 16, 9], rtol=0.01)
+        >>> rounds.go_on([0.03, 0.02]), rounds.go_on([0.009])
         (True, False)
         """
-        if len(errors) > self.most:
+        if len(errors) > len(self.sizes):
             return False
         if self.rtol is None:
             return True
@@ -394,7 +409,8 @@ def scan(
     errors = [estimate.error]
     while rounds.go_on(errors) and log.can_take:
         number = len(errors)
-        shown = _patterns_of_round(grid.grid, log, estimate.estimator, number)
+        size = rounds.sizes[number - 1]
+        shown = _patterns_of_round(grid.grid, log, estimate.estimator, number, size)
         log.announce(shown)
         pictures.take(shown)
         estimate = _estimate(grid, pictures, progress)
@@ -406,16 +422,20 @@ def scan(
 
 
 def _patterns_of_round(
-    grid: tuple[int, int], log: PictureLog, estimator: Estimator | RefinedEstimator, number: int
+    grid: tuple[int, int],
+    log: PictureLog,
+    estimator: Estimator | RefinedEstimator,
+    number: int,
+    size: int,
 ) -> list[np.ndarray]:
     """The patterns of a round: each place is divided at the scales that are unknown there.
 
     They are kept with the pictures, since an estimate that is rounded in another way, on another
-    machine, would make others.
+    machine, would make others, and so would another number of photographs.
     """
 
     def make() -> np.ndarray:
-        shown = refined_patterns(estimator.unknown_light(), BATCH_SIZE, (SEED, number))
+        shown = refined_patterns(estimator.unknown_light(), size, (SEED, number))
         return np.packbits(np.array(shown, bool), axis=2)
 
     bits = np.unpackbits(log.keep(f"round_{number}", make), axis=2, count=grid[1])

@@ -3,7 +3,8 @@
 
 1. the photographs, with the camera as the scan has measured it
 2. where the light falls now, and the gain of the lamp, by the old transport (`movement`)
-3. the old transport at the new places (`warp`), and what it leaves of the pictures (`change`)
+3. the old transport at the new places (`warp`), with the focus there (`focus`), and what it leaves
+   of the pictures (`change`)
 4. pictures that were not fitted judge it, beside what they said of the scan
 5. where they fail, rounds of more photographs, from which these rows are measured again (`match`)
 
@@ -43,6 +44,7 @@ from ltcl.acquisition.scanning.pictures import KNOWN_VARIANCE, UNKNOWN, Picture,
 from ltcl.acquisition.scratch import ImageFile
 from ltcl.acquisition.session import ProgressFunction, check_same, ignore_progress
 from ltcl.acquisition.updating.change import ChangedTransport, with_change
+from ltcl.acquisition.updating.focus import Focus, find_focus
 from ltcl.acquisition.updating.match import Matches, match_rows
 from ltcl.acquisition.updating.movement import (
     Movement,
@@ -392,7 +394,12 @@ def _carry_over(
     # 3. and 4. The transport at the new places, and its judges.
     now = _moved_calibration(calibration, mapping, fit, light)
     known = known_pixels(movement) & now.resampling.seen.ravel()
-    moved = T if movement.is_identity else T.moved(movement)
+    moved = T
+    focus = None
+    if not movement.is_identity:
+        near = T.around_diagonal()
+        focus = find_focus(near, mapping, calibration.resampling, now.resampling, movement)
+        moved = T.moved(movement, focus)
     correction = _Correction(
         ScanGrid(now), moved.limited(known).scaled(fit.gain), unit, known, light, previous
     )
@@ -408,7 +415,7 @@ def _carry_over(
         photographs += BATCH_SIZE
         corrected = correction.correct(progress)
 
-    noise = _CarriedNoise(previous, movement, known, fit.gain, corrected.judgement.ratio)
+    noise = _CarriedNoise(previous, movement, focus, known, fit.gain, corrected.judgement.ratio)
     return _Carried(
         fit=fit,
         calibration=now,
@@ -879,6 +886,7 @@ class _CarriedNoise:
         self,
         previous: BlockStore,
         movement: Movement,
+        focus: Focus | None,
         known: np.ndarray,
         gain: np.ndarray,
         ratio: float,
@@ -891,6 +899,8 @@ class _CarriedNoise:
         first_bounce = np.atleast_2d(previous.extra("first_bounce"))
         is_there = self._at_new_places(first_bounce > 0)
         light = self._at_new_places(first_bounce) / np.maximum(is_there, 0.5)
+        if focus is not None:
+            light = light * focus.own_change(self._rows)
         self.first_bounce = np.where(known & (is_there > 0.5), gain[:, None] * light, 0.0)
         variance = self._own_variance(previous, first_bounce)
         self.own_variance = (gain[:, None] * ratio) ** 2 * self._at_new_places(variance)

@@ -19,7 +19,8 @@ ways:
 
 An entry k pixels from the diagonal holds both. Focus is the same all around, and light that bounced
 between neighbours is not: it crosses a crease, in a line of pixels. So the direct part is, of the
-pixel's own light, the median share of the entries k pixels from the diagonal nearby.
+pixel's own light, the median share of the entries k pixels from the diagonal nearby, beyond what
+the camera's pixels explain (`focus`).
 
 Places beyond the old picture have no known row; their columns go on as at its rim.
 """
@@ -37,6 +38,13 @@ import scipy.sparse
 from ltcl.acquisition.estimation.estimator import BASIS
 from ltcl.acquisition.estimation.windows import REACH, hat_levels, hat_matrix
 from ltcl.acquisition.scanning.adaptive import Cells
+from ltcl.acquisition.updating.focus import (
+    LEAST_LIGHT,
+    MIDDLE,
+    WINDOW,
+    Focus,
+    near_diagonal,
+)
 from ltcl.acquisition.updating.movement import Movement, interpolation
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
@@ -108,9 +116,15 @@ class HostTransport:
             core.eliminate_zeros()
         return HostTransport(grid=self.grid, cores=cores, W=self.W)
 
-    def moved(self, movement: Movement) -> HostTransport:
+    def around_diagonal(self) -> np.ndarray:
+        """Light of pixels up to `REACH` from each, of all channels, (N, 25)."""
+        pixels = self.cores[0].shape[0]
+        near = [near_diagonal(core[:, :pixels].tocoo(), self.grid) for core in self.cores]
+        return np.sum(near, axis=0)
+
+    def moved(self, movement: Movement, focus: Focus | None = None) -> HostTransport:
         """The transport after the projector has moved; rows of unknown places are empty."""
-        warp = _Warp(movement)
+        warp = _Warp(movement, focus)
         return HostTransport(grid=self.grid, cores=[warp.core(C) for C in self.cores], W=self.W)
 
 
@@ -155,8 +169,9 @@ def row_interpolation(movement: Movement) -> scipy.sparse.csr_array:
 class _Warp:
     """The parts of C' = B C P for a movement."""
 
-    def __init__(self, movement: Movement) -> None:
+    def __init__(self, movement: Movement, focus: Focus | None) -> None:
         self.grid = movement.grid
+        self.focus = focus
         self.movement = movement
         self.rows = row_interpolation(movement)
         self.levels = hat_levels(movement.grid)
@@ -198,29 +213,27 @@ class _Warp:
         """Direct light, moved along with the diagonal, and all other entries as they were."""
         width = self.grid[1]
         entries = scipy.sparse.coo_array(level_core)
-        row, column = np.divmod(entries.row, width)
-        to_row, to_column = np.divmod(entries.col, width)
-        down = to_row - row
-        across = to_column - column
-        is_near = (np.abs(down) <= REACH) & (np.abs(across) <= REACH)
-        side = 2 * REACH + 1
-        offset = (down + REACH) * side + across + REACH
-        near = np.zeros((level_core.shape[0], side * side))
-        near[entries.row[is_near], offset[is_near]] = entries.data[is_near]
-        direct = _direct_light(near, self.grid)
+        near = near_diagonal(entries, self.grid)
+        down = entries.col // width - entries.row // width
+        across = entries.col % width - entries.row % width
+        is_far = (np.abs(down) > REACH) | (np.abs(across) > REACH)
         far = scipy.sparse.csr_array(
-            (entries.data[~is_near], (entries.row[~is_near], entries.col[~is_near])),
+            (entries.data[is_far], (entries.row[is_far], entries.col[is_far])),
             shape=level_core.shape,
         )
-        return self._beside_diagonal(self.rows @ direct), far + self._beside_diagonal(near - direct)
+        direct = _direct_light(near, self.grid, self.focus)
+        if self.focus is None:
+            moved = self.rows @ direct
+        else:
+            moved = self.focus.refocused(direct, self.rows)
+        return self._beside_diagonal(moved), far + self._beside_diagonal(near - direct)
 
     def _beside_diagonal(self, near: np.ndarray) -> scipy.sparse.csr_array:
-        """Entries (N, side^2) of windows around the diagonal in their places, (N, N)."""
+        """Entries (N, 25) of windows around the diagonal in their places, (N, N)."""
         height, width = self.grid
-        side = 2 * REACH + 1
         i, k = np.nonzero(near)
-        row = i // width + k // side - REACH
-        column = i % width + k % side - REACH
+        row = i // width + k // WINDOW - REACH
+        column = i % width + k % WINDOW - REACH
         is_there = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         i = i[is_there]
         k = k[is_there]
@@ -228,26 +241,29 @@ class _Warp:
         return scipy.sparse.csr_array((near[i, k], places), shape=(len(near), len(near)))
 
 
-def _direct_light(near: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """The direct part of entries (N, side^2) of windows around the diagonal."""
-    middle = near.shape[1] // 2
-    own = near[:, middle]
+def _direct_light(near: np.ndarray, grid: tuple[int, int], focus: Focus | None) -> np.ndarray:
+    """The direct part of entries (N, 25) of windows around the diagonal."""
+    own = near[:, MIDDLE]
     is_lit = own > 0
     if not is_lit.any():
         return near
     direct = np.zeros_like(near)
-    direct[:, middle] = own
+    direct[:, MIDDLE] = own
+    # Shares that are known beforehand, from which those of the light differ by a median.
+    expected = np.zeros_like(near)
+    if focus is not None:
+        expected = focus.before / np.maximum(focus.before[:, MIDDLE, None], LEAST_LIGHT)
     # What is seen nowhere has the focus of the nearest pixel that is.
     nearest = scipy.ndimage.distance_transform_edt(
         ~is_lit.reshape(grid), return_distances=False, return_indices=True
     )
     for offset in np.flatnonzero(near.any(axis=0)):
-        if offset == middle:
+        if offset == MIDDLE:
             continue
         share = np.divide(near[:, offset], own, where=is_lit, out=np.zeros_like(own))
-        shares = share.reshape(grid)[tuple(nearest)]
-        typical = scipy.ndimage.median_filter(shares, FOCUS_SIDE, mode="nearest")
-        direct[:, offset] = typical.ravel() * own
+        others = (share - expected[:, offset]).reshape(grid)[tuple(nearest)]
+        typical = scipy.ndimage.median_filter(others, FOCUS_SIDE, mode="nearest")
+        direct[:, offset] = (expected[:, offset] + typical.ravel()) * own
     return direct
 
 

@@ -379,7 +379,7 @@ def test_rounds_make_the_error_smaller_within_the_photographs_allowed(
 ) -> None:
     errors = []
     for rounds in (0, 3):
-        allowed = first_count + rounds * ROUND + 5
+        allowed = first_count + rounds * ROUND + sketch.LEAST_PATTERNS
         rig = Unplugged(corner(), SMALL)
         path = tmp_path / f"{rounds}.zarr"
         acquire(rig, geometry="aligned", strategy="sketch", store=path, photographs=allowed)
@@ -388,6 +388,19 @@ def test_rounds_make_the_error_smaller_within_the_photographs_allowed(
         assert report.patterns == sketch.count_patterns(SMALL) + 16 * rounds
         errors.append(report.judged_error)
     assert errors[1] < 0.9 * errors[0]
+
+
+@pytest.mark.slow
+def test_the_last_round_takes_the_photographs_that_are_left(
+    tmp_path: Path, first_count: int
+) -> None:
+    path = tmp_path / "T.zarr"
+    settings: dict[str, Any] = {"geometry": "aligned", "strategy": "sketch"}
+    allowed = first_count + 10
+    rig = Unplugged(corner(), SMALL)
+    acquire(rig, store=path, photographs=allowed, **settings)
+    assert rig.count == allowed
+    assert Report.of(path).patterns == sketch.count_patterns(SMALL) + 9
 
 
 @pytest.mark.rare
