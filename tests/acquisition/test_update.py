@@ -148,7 +148,7 @@ def test_black_at_the_lowest_code_hides_no_pixel(tmp_path: Path) -> None:
     told = result.transport @ pattern
     told *= (truth * told).sum() / (told**2).sum()
     error = np.linalg.norm(told - truth) / np.linalg.norm(truth)
-    assert error < result.bound < 0.05
+    assert error < result.bound < 0.1
 
 
 @pytest.mark.rare
