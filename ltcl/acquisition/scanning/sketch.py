@@ -505,12 +505,13 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
 class _Estimate:
     """T as it is estimated, and how it was judged.
 
-    `squares` are those of the relative errors of the judges, `scales` the factors of the variances
-    of T by which they explain these.
+    `squares` are those of the relative errors of the judges, `deviations` theirs by noise, and
+    `scales` the factors of the variances of T by which they explain these.
     """
 
     estimator: Estimator | RefinedEstimator
     squares: np.ndarray
+    deviations: np.ndarray
     scales: np.ndarray
     wrong_patterns: list[int]
 
@@ -526,7 +527,7 @@ class _Estimate:
             own_variance=self.estimator.own_variance() * self.scales[:, None],
             errors=np.sqrt(self.squares),
             error=self.error,
-            bound=error_bound(self.error, len(self.squares)),
+            bound=error_bound(self.error, self.deviations),
             wrong_patterns=self.wrong_patterns,
         )
 
@@ -554,6 +555,7 @@ def _judged(
 ) -> _Estimate:
     """The error of an estimator for pairs that it has not seen; `white` is its squared light."""
     squares = np.zeros(len(pairs))
+    deviations = np.zeros(len(pairs))
     is_lit = np.zeros(len(pairs), bool)
     residual_squares = np.zeros(estimator.channels)
     for number in range(len(pairs)):
@@ -563,22 +565,36 @@ def _judged(
         explained = estimator.explain(judge.patterns)
         unexplained = np.where(is_known, judge.photographs - explained, 0.0)
         of_channels = (unexplained**2).sum(axis=(0, 1))
-        noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
+        noise = np.where(is_known, variance, 0.0).astype(np.float64)
         energy = max(_squared_light(judge), np.finfo(float).tiny)
-        squares[number] = max(of_channels.sum() - noise, 0.0) / energy
+        squares[number] = max(of_channels.sum() - noise.sum(), 0.0) / energy
+        deviations[number] = deviation_of_squares(noise) / energy
         is_lit[number] = is_lit_judge(judge.patterns, energy, white)
         residual_squares += of_channels
     return _Estimate(
         estimator=estimator,
         squares=squares[is_lit],
+        deviations=deviations[is_lit],
         scales=estimator.scale_of_variance(pairs.patterns, residual_squares),
         wrong_patterns=wrong_patterns,
     )
 
 
-def error_bound(error: float, judges: int) -> float:
-    """Bound of the error of other pictures, by the root mean square of that of some judges."""
-    return error * math.sqrt(judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges))
+def deviation_of_squares(variance: np.ndarray) -> float:
+    """Standard deviation of the sum of squares of noise of these variances."""
+    return math.sqrt(2.0 * float((variance**2).sum()))
+
+
+def error_bound(error: float, deviations: np.ndarray) -> float:
+    """Bound of the error of other pictures, by the root mean square of that of some judges.
+
+    `deviations` (judges,) are those of the squared relative errors by noise: an error that is lost
+    in noise is not 0.
+    """
+    judges = len(deviations)
+    by_judges = error**2 * judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges)
+    mean_deviation = float(np.linalg.norm(deviations)) / judges
+    return math.sqrt(by_judges + scipy.stats.norm.ppf(CONFIDENCE) * mean_deviation)
 
 
 def finish(store: BlockStore, sketch: Sketch) -> None:

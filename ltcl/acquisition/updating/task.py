@@ -535,6 +535,13 @@ def _judged_errors(pictures: _Pictures, explained: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy)
 
 
+def _deviations(pictures: _Pictures) -> np.ndarray:
+    """Standard deviations by noise of the squares of `_judged_errors`, (k,)."""
+    noise = np.where(pictures.variance < KNOWN_VARIANCE, pictures.variance, 0.0)
+    energy = np.maximum(pictures.squared_light(), np.finfo(float).tiny)
+    return np.array([sketch.deviation_of_squares(variance) for variance in noise]) / energy
+
+
 def _flat(patterns: Sequence[np.ndarray]) -> np.ndarray:
     """Patterns (k, N) of pictures (h, w)."""
     rows = [np.ravel(pattern) for pattern in patterns]
@@ -749,7 +756,7 @@ class _Judgement:
             previous_errors=previous_errors,
             error=error,
             previous_error=previous_error,
-            bound=sketch.error_bound(error, int(np.count_nonzero(is_lit))),
+            bound=sketch.error_bound(error, _deviations(pictures)[is_lit]),
             holds=error <= allowed,
             failing=_failing_cells(T.grid, pictures, explained, FAILING_RATIO * allowed),
         )
