@@ -14,9 +14,10 @@ a channel), for pictures that no scan has seen:
 and a picture like nature is compensated and shown with the true T. Scenes are a corner of two walls
 on the pixel grid, and five in perspective, as a projector sees them (`scenes.perspective`).
 
-Of these, at 32 x 32 pixels, a picture like nature is separated into bounces, with T of a sketch and
-with T of a scan one pixel at a time, and compared with the true bounces. The errors with the true T
-are given, too: pixels are no points, and surfaces that the projector does not light bounce light.
+Of these, at 32 x 32 pixels, a picture like nature is separated into bounces, with T of a sketch of
+100 photographs and of a scan one pixel at a time, and compared with the true bounces. The errors
+with the true T are given, too: pixels are no points, and surfaces that the projector does not light
+bounce light.
 Scans of direct light alone are compared with the true one, as is the light that they say they left
 out.
 
@@ -279,9 +280,15 @@ def compare_bounces(
         return left / np.linalg.norm(exact, axis=(1, 2))
 
     measured = {}
-    for strategy in ("sketch", "pixel"):
+    for strategy, photographs in (("sketch", MAX_PHOTOGRAPHS), ("pixel", None)):
         rig = make_rig(truth, "12 bits")
-        T = acquire(rig, geometry="aligned", strategy=strategy, device=options.device)
+        T = acquire(
+            rig,
+            geometry="aligned",
+            strategy=strategy,
+            photographs=photographs,
+            device=options.device,
+        )
         measured[strategy] = errors(T)
     return BounceErrors(
         name=name, sketched=measured["sketch"], scanned=measured["pixel"], true=errors(truth)

@@ -129,6 +129,21 @@ def difference(first: RadiancePicture, second: RadiancePicture, file: ImageFile)
     return result
 
 
+def completed(first: RadiancePicture, second: RadiancePicture, file: ImageFile) -> StoredRadiance:
+    """A picture, and where it is not valid another one, in a file."""
+    result = StoredRadiance.reserve(file, first.shape)
+    for rows in row_strips(first.shape):
+        own = first.rows(rows)
+        other = second.rows(rows)
+        strip = Radiance(
+            np.where(own.valid, own.value, other.value),
+            np.where(own.valid, own.variance, other.variance),
+            own.valid | other.valid,
+        )
+        result.write(rows.start, strip)
+    return result
+
+
 def strips(picture: RadiancePicture) -> Iterator[Radiance]:
     """All rows of a picture, strip by strip."""
     for rows in row_strips(picture.shape):

@@ -119,7 +119,7 @@ def acquire(
         rounds of 16 more patterns, as long as they help. Only a sketch takes it, as `photographs`.
     photographs : int, optional
         Photographs that a sketch takes at most, those of the set-up included; without `rtol` it
-        takes them all.
+        takes them all, but for less than a round of 4 patterns.
     device : Device or str, optional
         As in `Transport`; opened before the first photograph.
 
@@ -453,9 +453,9 @@ def _store_sizes(
     if strategy in PICTURE_STRATEGIES:
         if strategy == "sketch":
             first = chosen.photographs
-            rounds = sketch.most_rounds(settings.photographs, settings.rtol, first, exposures)
+            sizes = sketch.round_sizes(settings.photographs, settings.rtol, first, exposures)
             stripes = len(grid.calibration.stripes)
-            most = sketch.most_patterns(grid.grid, rounds, stripes)
+            most = sketch.most_patterns(grid.grid, len(sizes), stripes)
         elif strategy == "direct":
             most = direct.most_patterns(grid.grid)
         else:
@@ -545,8 +545,8 @@ def _rounds(store: BlockStore, settings: ScanSettings) -> sketch.Rounds:
     planned = store.attributes["plan"]
     exposures = len(Calibration.of(store).exposures)
     first = int(planned["photographs"])
-    most = sketch.most_rounds(settings.photographs, settings.rtol, first, exposures)
-    return sketch.Rounds(most=most, rtol=settings.rtol)
+    sizes = sketch.round_sizes(settings.photographs, settings.rtol, first, exposures)
+    return sketch.Rounds(sizes=sizes, rtol=settings.rtol)
 
 
 def _tell_left_out(share: float) -> None:

@@ -139,7 +139,7 @@ def _plan(project: Any, overhead: float) -> PlanReport:
         channels=facts["channels"],
         megapixels=facts["megapixels"],
         pace=pace,
-        rounds=sketch.most_rounds(settings.photographs, settings.rtol, first, exposures),
+        rounds=len(sketch.round_sizes(settings.photographs, settings.rtol, first, exposures)),
         photographs_of_round=sketch.photographs_of_round(exposures),
         plans={},
     )
@@ -179,8 +179,8 @@ def _plan_lines(report: PlanReport) -> list[str]:
     ]
     if report.rounds:
         lines.append(
-            f"a sketch goes on for up to {report.rounds} rounds of {report.photographs_of_round} "
-            "photographs each, as asked for by rtol or photographs"
+            f"a sketch goes on for up to {report.rounds} rounds, of at most "
+            f"{report.photographs_of_round} photographs each, as asked for by rtol or photographs"
         )
     return [*lines, advice]
 

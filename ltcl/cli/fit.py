@@ -161,14 +161,25 @@ def _read_frames(
             size = grid
         if size != picture.shape[:2]:
             picture = images.resize(picture, size)
-        if frames and picture.shape != frames[0].shape:
+        if frames and picture.shape[:2] != frames[0].shape[:2]:
             raise FileError(
-                f"{path}: {frame.name} has shape {picture.shape}, the first {frames[0].shape}; all "
-                "must be alike"
+                f"{path}: {frame.name} has {picture.shape[0]} x {picture.shape[1]} pixels, the "
+                f"first {frames[0].shape[0]} x {frames[0].shape[1]}; all must be alike"
             )
         frames.append(picture)
         context.progress(path.name, frame.number, source.count)
-    return np.stack(frames)
+    return _stack_frames(frames)
+
+
+def _stack_frames(frames: list[np.ndarray]) -> np.ndarray:
+    """Frames as one array; grey ones among coloured ones, such as black, get three channels."""
+    has_colour = any(picture.ndim == 3 for picture in frames)
+    stacked = []
+    for picture in frames:
+        if has_colour and picture.ndim == 2:
+            picture = np.repeat(picture[..., None], 3, axis=2)
+        stacked.append(picture)
+    return np.stack(stacked)
 
 
 def _read_black(context: Context, path: Path, source: Path, photographs: np.ndarray) -> np.ndarray:

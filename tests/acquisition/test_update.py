@@ -19,10 +19,11 @@ from ltcl.acquisition import Calibration, Report, VirtualRig, acquire
 from ltcl.acquisition.calibration import stored_map
 from ltcl.acquisition.estimation.windows import hat_matrix
 from ltcl.acquisition.updating.movement import Movement, interpolation
+from ltcl.acquisition.updating.photographs import all_patterns
 from ltcl.acquisition.updating.warp import HostTransport
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.store import BlockStore
-from tests.acquisition.moved_corner import AMBIENT, GRID, camera_transport, rig
+from tests.acquisition.moved_corner import AMBIENT, CAMERA, GRID, camera_transport, rig
 
 Scan = Callable[[str], Path]
 
@@ -130,6 +131,26 @@ def test_what_did_not_move_stays(scan: Scan, tmp_path: Path, lamp: float, ambien
     assert "nothing has moved" in str(result)
 
 
+def test_black_at_the_lowest_code_hides_no_pixel(tmp_path: Path) -> None:
+    """In a dark room black has a value at few pixels, or none; in the scan it had one at all."""
+    T = scenes.dihedral(8, albedo=0.6).transport()
+    options: dict[str, Any] = {"geometry": "aligned", "strategy": "sketch"}
+    acquire(VirtualRig(T, T.grid, bits=12), store=tmp_path / "scan.zarr", **options)
+    aged = VirtualRig([0.9 * T.matrices[0]], T.grid, bits=12)
+    store = tmp_path / "new.zarr"
+    result = ltcl.update(aged, tmp_path / "scan.zarr", store=store)
+    assert result.holds
+    assert Calibration.of(store).ambient.valid.all()
+    # An error that is lost in noise is not stated as 0.
+    random = np.random.default_rng(3)
+    pattern = random.random(T.grid)
+    truth = 0.9 * (T @ pattern)
+    told = result.transport @ pattern
+    told *= (truth * told).sum() / (told**2).sum()
+    error = np.linalg.norm(told - truth) / np.linalg.norm(truth)
+    assert error < result.bound < 0.1
+
+
 @pytest.mark.rare
 def test_a_wider_picture(scan: Scan, tmp_path: Path) -> None:
     """A movement that is no shift: 4 % wider, and higher, from the middle."""
@@ -164,6 +185,83 @@ def test_too_far_and_another_scene_are_refused(
     assert not store.exists()
 
 
+def without_right_third(T: np.ndarray) -> np.ndarray:
+    """T of a scene that ends there: the camera sees none of the light."""
+    seen = T.reshape(*CAMERA, -1).copy()
+    seen[:, 44:] = 0.0
+    return seen.reshape(T.shape)
+
+
+@pytest.mark.rare
+def test_a_picture_that_falls_beside_the_scene_in_part(tmp_path: Path) -> None:
+    old = tmp_path / "scan.zarr"
+    acquire(rig(without_right_third(camera_transport())), strategy="sketch", store=old)
+    truth = without_right_third(camera_transport(0.5, -0.5))
+    store = tmp_path / "new.zarr"
+    result = ltcl.update(rig(truth), old, store=store)
+    assert result.shift == pytest.approx((0.5, -0.5), abs=0.05)
+    assert result.masked >= 64
+    assert result.holds
+    assert true_error(store, result.transport, truth) < 0.02
+
+
+def test_a_picture_without_light_judges_no_update(tmp_path: Path) -> None:
+    """The lit patch lies where the projector lights nothing."""
+    truth = scenes.dihedral(8, albedo=0.6).transport().matrices[0].copy()
+    truth[:, 64:] = 0.0
+    truth[64:] = 0.0
+    old = tmp_path / "scan.zarr"
+    acquire(VirtualRig(truth, (8, 16), bits=12), geometry="aligned", strategy="sketch", store=old)
+    camera = VirtualRig(0.95 * truth, (8, 16), bits=12)
+    result = ltcl.update(camera, old, store=tmp_path / "new.zarr")
+    assert np.isnan(result.errors).sum() == 1
+    assert result.holds
+    assert result.gain == pytest.approx(0.95, abs=0.01)
+
+
+class MistakenRig:
+    """A rig that photographs another pattern for one of the first twelve."""
+
+    def __init__(self, rig: VirtualRig, number: int, other: int) -> None:
+        self._rig = rig
+        self._number = number
+        self._other = other
+        self._taken = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._rig, name)
+
+    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+        self._taken += 1
+        if self._taken == self._number:
+            codes = all_patterns(GRID)[self._other - 1]
+        return self._rig.photograph(codes, seconds)
+
+
+@pytest.mark.rare
+@pytest.mark.parametrize(
+    ("number", "other", "reason"),
+    [
+        (4, 8, "photograph 4 shows the pattern of photograph 8"),
+        (5, 1, "photograph 5 shows the pattern of photograph 1;"),
+        (11, 10, "photograph 11 shows the pattern of photograph 10"),
+        (2, 1, "0% more light under white than under black"),
+    ],
+)
+def test_a_photograph_of_another_pattern_is_named(
+    scan: Scan, tmp_path: Path, number: int, other: int, reason: str
+) -> None:
+    camera = MistakenRig(rig(camera_transport(0.5, 0.4)), number, other)
+    with pytest.raises(AcquisitionError, match=reason):
+        ltcl.update(cast("Any", camera), scan("sketch"), store=tmp_path / "new.zarr")
+
+
+@pytest.mark.rare
+def test_a_new_lamp_that_saturates_the_camera_is_refused(scan: Scan, tmp_path: Path) -> None:
+    with pytest.raises(AcquisitionError, match=r"saturated at \d+% of the pixels"):
+        ltcl.update(rig(2.5 * camera_transport()), scan("sketch"), store=tmp_path / "new.zarr")
+
+
 def mirrored() -> np.ndarray:
     """T after a mirror in the upper left corner sends light of pixels there elsewhere."""
     truth = camera_transport().copy()
@@ -184,7 +282,7 @@ def test_a_place_that_has_changed_is_named(
     assert not result.holds
     assert result.failing[:4, :4].mean() > 0.5
     assert result.failing[8:, 8:].mean() < 0.1
-    assert "a new scan is needed" in caplog.text
+    assert "up to 60 photographs measure it again" in caplog.text
 
 
 def turned(height: int) -> np.ndarray:

@@ -113,8 +113,9 @@ def test_a_plan_says_rounds(program, simulated):
     with (simulated / "acquisition.toml").open("a") as file:
         file.write(f"photographs = {first + 40}\n")
     report = program("acquire", "plan", simulated, "--json").json
-    assert (report["rounds"], report["photographs_of_round"]) == (2, 17)
-    assert "up to 2 rounds of 17 photographs each" in program("acquire", "plan", simulated).out
+    assert (report["rounds"], report["photographs_of_round"]) == (3, 17)
+    text = program("acquire", "plan", simulated).out
+    assert "up to 3 rounds, of at most 17 photographs each" in text
 
 
 def test_overhead_counts_for_each_photograph(program, simulated):

@@ -60,6 +60,25 @@ def test_films_and_another_grid(program, pairs, T, tmp_path):
     assert ltcl.load(folder / "transport.npz").grid == (4, 8)
 
 
+def test_a_film_in_colour_begins_in_black(program, T, tmp_path):
+    """Its black frames are read as grey."""
+    random = np.random.default_rng(0)
+    shown = []
+    seen = []
+    for number in range(30):
+        pattern = np.repeat(random.random((8, 16, 1)), 3, axis=2)
+        pattern[..., 2] *= 0.5
+        if number < 2:
+            pattern[:] = 0.0
+        shown.append(pattern)
+        seen.append(T @ pattern)
+    write_video(tmp_path / "patterns.mkv", shown)
+    write_video(tmp_path / "photographs.mkv", seen)
+    outcome = program("acquire", "fit", tmp_path)
+    assert "8 x 16 pixels, from 30 pairs" in outcome.out, outcome.err
+    assert ltcl.load(tmp_path / "transport.npz").channels == 3
+
+
 def test_what_is_missing_is_named(program, pairs, tmp_path):
     program("acquire", "fit", tmp_path).assert_refused(str(tmp_path), "no patterns")
     (tmp_path / "patterns").mkdir()

@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.estimation.pairs import Pairs, gains
+from ltcl.acquisition.estimation.pairs import MIN_LIGHT_SHARE, Pairs, gains
 from ltcl.acquisition.estimation.refinement import make_estimator
 from ltcl.acquisition.estimation.view import find_view
 from ltcl.acquisition.geometry import Correspondence, Resampling
-from ltcl.errors import InputError, InputTypeError
+from ltcl.errors import AcquisitionError, InputError, InputTypeError
 from ltcl.transport.matrices import check_mixing
 from ltcl.transport.transport import Transport
 
@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 # Stretches of neighbouring pairs that are held out: frames of a film are like those beside them.
 HELD_OUT_STRETCHES = 4
+# Share of the lit pixels at which pairs must show direct light.
+MIN_DIRECT_SHARE = 0.5
 # Change of brightness from the first pair to the last that is corrected.
 NOTABLE_DRIFT = 0.005
 
@@ -47,7 +49,7 @@ class Fit:
         On the pixels of the photographs, in a basis of hat functions; fitted to all pairs.
     error : float
         Error of T p for pairs that the fit had not seen, relative to their photographs: the root
-        mean square over them.
+        mean square over them. Frames that are black are not among them.
     errors : (held out,)
         That of each of them.
     held_out : (held out,)
@@ -90,12 +92,13 @@ class Fit:
         photographs: Any,
         progress: Callable[[str, int, int], object] | None = None,
     ) -> Fit:
-        """Fit to these pairs, too, which come after those before.
+        """Fit to these pairs, too, one or more, which come after those before.
 
         Parameters and errors are those of `ltcl.fit`.
         """
-        more = Pairs.of(patterns, photographs)
-        return _fit(self.pairs.joined(more), **self.options, progress=progress)
+        pairs = self.pairs.joined(Pairs.of(patterns, photographs))
+        pairs.check_values()
+        return _fit(pairs, **self.options, progress=progress)
 
 
 def fit(
@@ -140,12 +143,13 @@ def fit(
     Raises
     ------
     InputError, InputTypeError
-        Shapes that do not fit together, NaN, too few pairs, patterns that are all the same,
-        photographs that are saturated.
+        Shapes that do not fit together, NaN, too few pairs, patterns that are all the same
+        or negative, photographs that are saturated.
     MemoryLimitError
         More pixels than the host has memory for.
     AcquisitionError
-        Photographs in another order than the patterns; pairs that do not show the geometry.
+        Photographs in another order than the patterns, or of other pixels; pairs that do not show
+        the geometry.
 
     Examples
     --------
@@ -158,6 +162,7 @@ def fit(
     True
     """
     pairs = Pairs.of(patterns, photographs)
+    pairs.check_values()
     share = checks.number("held_out", held_out, above=0.0, most=0.5)
     if progress is not None and not callable(progress):
         raise InputTypeError(
@@ -211,7 +216,8 @@ def _fit(
             mapping = find_view(pairs)
         pairs = pairs.resampled(Resampling.of(mapping))
         pairs.check_order()
-    judges = _held_out(len(pairs), held_out)
+    lit = pairs.lit_frames()
+    judges = lit[_held_out(len(lit), held_out)]
     is_judge = np.zeros(len(pairs), bool)
     is_judge[judges] = True
 
@@ -241,8 +247,10 @@ def _fit(
 
     # 3. The transport, from all pairs.
     estimator.solve(steady)
+    arrays = estimator.arrays(scales)
+    _check_direct_light(arrays["first_bounce"], pairs.photographs)
     return Fit(
-        transport=Transport.from_arrays(estimator.arrays(scales), device=device),
+        transport=Transport.from_arrays(arrays, device=device),
         error=error,
         errors=errors,
         held_out=judges,
@@ -251,6 +259,19 @@ def _fit(
         pairs=original_pairs,
         options={"geometry": geometry, "mixing": mixing, "held_out": held_out, "device": device},
     )
+
+
+def _check_direct_light(first_bounce: np.ndarray, photographs: np.ndarray) -> None:
+    """Refuse pairs that show the light of its own at too few of the pixels that are lit."""
+    light = photographs.mean(axis=0).T
+    is_lit = light > MIN_LIGHT_SHARE * light.max(axis=1, keepdims=True)
+    share = float(np.mean(first_bounce[is_lit] > 0))
+    if share < MIN_DIRECT_SHARE:
+        raise AcquisitionError(
+            f"photographs follow the light of their own pattern at {share:.0%} of the lit pixels; "
+            "they are in another order, flipped or of another view (geometry='pairs'), or patterns "
+            "vary too little"
+        )
 
 
 def _held_out(count: int, share: float) -> np.ndarray:

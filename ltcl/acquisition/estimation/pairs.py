@@ -31,6 +31,8 @@ COMPARED_PIXELS = 2000
 # Values, and share of all, that may be the largest: of a saturated camera, more are.
 MAX_LARGEST_VALUES = 10
 MAX_SATURATED_SHARE = 1e-3
+# Light of a photograph that can judge, relative to the brightest one.
+MIN_LIGHT_SHARE = 0.02
 # A photograph is of another pattern if that explains it with so much less error.
 SWAPPED_ERROR_RATIO = 0.5
 
@@ -68,14 +70,12 @@ class Pairs:
             shown = np.repeat(shown, 3, axis=3)
         frames, height, width, channels = seen.shape
         grid = (shown.shape[1], shown.shape[2])
-        pairs = cls(
+        return cls(
             grid=grid,
             camera_grid=(height, width),
             patterns=shown.reshape(frames, -1, channels),
             photographs=seen.reshape(frames, -1, channels),
         )
-        pairs._check_values()
-        return pairs
 
     def __len__(self) -> int:
         return len(self.patterns)
@@ -130,11 +130,25 @@ class Pairs:
             variance=variance,
         )
 
-    def _check_values(self) -> None:
+    def check_values(self) -> None:
+        """Refuse pairs from which nothing can be learned: too few, dark, all alike, saturated."""
+        if len(self) < LEAST_PAIRS:
+            raise InputError(
+                f"patterns has {len(self)} frames; it must have at least {LEAST_PAIRS}"
+            )
         if not np.any(self.photographs):
             raise InputError("photographs is black; it must show light")
         if np.all(self.patterns == self.patterns[:1]):
             raise InputError("patterns are all the same; they must differ")
+        if self.patterns.min() < 0.0:
+            raise InputError(
+                f"patterns has values down to {self.patterns.min():g}; light must be at least 0"
+            )
+        if self.photographs.mean() <= 0.0:
+            raise InputError(
+                "photographs are darker than black, on average; what is taken off them, such as "
+                "ambient light, must be of the same exposure"
+            )
         largest = self.photographs.max()
         count = np.count_nonzero(self.photographs == largest)
         share = count / self.photographs.size
@@ -143,6 +157,11 @@ class Pairs:
                 f"photographs has {share:.1%} of its values at {largest:g}, the largest; the "
                 "camera is saturated: expose less"
             )
+
+    def lit_frames(self) -> np.ndarray:
+        """Numbers of the pairs whose photograph has light; of a black frame T p has no error."""
+        light = np.sqrt(np.square(self.photographs).sum(axis=(1, 2)))
+        return np.flatnonzero(light > MIN_LIGHT_SHARE * light.max())
 
     def check_order(self) -> None:
         """Refuse photographs that follow other patterns than their own, a few frames later."""
@@ -210,7 +229,8 @@ def _select_frames(frames: np.ndarray, chosen: np.ndarray | slice) -> np.ndarray
 
 def gains(photographs: np.ndarray, explained: np.ndarray) -> np.ndarray:
     """Brightness of each photograph relative to what T explains, (frames,), 1 on average."""
-    ratio = (photographs * explained).sum(axis=(1, 2)) / (explained**2).sum(axis=(1, 2))
+    squares = np.maximum((explained**2).sum(axis=(1, 2)), np.finfo(float).tiny)
+    ratio = (photographs * explained).sum(axis=(1, 2)) / squares
     return ratio / ratio.mean()
 
 
@@ -222,8 +242,8 @@ def _frames(name: str, value: Any) -> np.ndarray:
         raise InputError(
             f"{name} has shape {array.shape}; it must be (frames, h, w) or (frames, h, w, 3)"
         )
-    if len(array) < LEAST_PAIRS:
-        raise InputError(f"{name} has {len(array)} frames; it must have at least {LEAST_PAIRS}")
+    if not array.size:
+        raise InputError(f"{name} has shape {array.shape}; it must hold frames")
     checks.finite(name, array)
     light = array.astype(np.float64)
     return light if is_colour else light[..., None]

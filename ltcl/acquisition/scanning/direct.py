@@ -29,6 +29,7 @@ from ltcl.acquisition.scanning.picture_log import BATCH_SIZE, PictureLog
 from ltcl.acquisition.scanning.pictures import Picture, ScanGrid
 from ltcl.acquisition.scanning.sketch import (
     SEED,
+    deviation_of_squares,
     error_bound,
     like_nature,
     text,
@@ -211,6 +212,7 @@ def _judged(
     shape = len(judging), len(channels)
     squares = np.zeros(shape)
     noise = np.zeros(shape)
+    noise_squares = np.zeros(shape)
     energy = np.zeros(shape)
     expected = np.zeros(shape)
     for c, light in enumerate(channels):
@@ -224,17 +226,19 @@ def _judged(
             variance = np.where(is_known, picture.variance[c] + grid.ambient[c], 0.0)
             squares[k, c] = (residual**2).sum(dtype=np.float64)
             noise[k, c] = variance.sum(dtype=np.float64)
+            noise_squares[k, c] = deviation_of_squares(variance.astype(np.float64)) ** 2
             energy[k, c] = (direct**2)[is_known].sum(dtype=np.float64)
             expected[k, c] = (V @ pattern.ravel())[is_known].sum(dtype=np.float64)
     tiny = np.finfo(float).tiny
     measured = np.maximum(squares - noise, 0.0)
     scales = measured.sum(axis=0) / np.maximum(expected.sum(axis=0), tiny)
-    of_judges = measured.sum(axis=1) / np.maximum(energy.sum(axis=1), tiny)
+    energy_of_judges = np.maximum(energy.sum(axis=1), tiny)
+    of_judges = measured.sum(axis=1) / energy_of_judges
     error = math.nan
     bound = math.nan
     if len(judging):
         error = math.sqrt(of_judges.mean())
-        bound = error_bound(error, len(judging))
+        bound = error_bound(error, np.sqrt(noise_squares.sum(axis=1)) / energy_of_judges)
     return DirectScan(
         channels=channels,
         scales=np.maximum(scales, LEAST_SCALE),

@@ -50,6 +50,9 @@ JUDGES = 8
 # Fields of the checkerboard, and lit patches, along the shorter side.
 CHECKERBOARD_FIELDS = 6
 PATCH_SHARE = 8
+# Squared light of a judge, relative to that of as many pixels of white, of which it must have more:
+# a patch may lie where the projector lights nothing, and have no relative error.
+MIN_JUDGE_LIGHT = 0.01
 # Text is drawn so many times as large; letters of size 1 take so many rows, with their spacing.
 TEXT_SCALE = 4
 FONT_HEIGHT = 64
@@ -59,6 +62,8 @@ SEED = 0
 # Rounds at most, and by which share one must lower the error for another to follow.
 MAX_ROUNDS = 24
 LEAST_GAIN = 0.03
+# Patterns of a round at least.
+LEAST_PATTERNS = 4
 # Pixels from which on there are patterns for rounds.
 LEAST_PIXELS = 16
 # Why a picture contradicts all others.
@@ -291,20 +296,32 @@ def most_patterns(grid: tuple[int, int], rounds: int = 0, stripes: int = 0) -> i
     return BATCH_SIZE * batches
 
 
-def photographs_of_round(exposures: int) -> int:
+def photographs_of_round(exposures: int, patterns: int = BATCH_SIZE) -> int:
     """Photographs of a round; a batch ends with one that was taken before."""
-    return exposures * BATCH_SIZE + 1
+    return exposures * patterns + 1
 
 
-def most_rounds(photographs: int | None, rtol: float | None, first: int, exposures: int) -> int:
-    """Rounds at most within some photographs, of which set-up and first patterns take `first`.
+def round_sizes(
+    photographs: int | None, rtol: float | None, first: int, exposures: int
+) -> list[int]:
+    """Patterns of each round within some photographs; set-up and first patterns take `first`.
 
-    >>> most_rounds(150, None, 98, 1), most_rounds(None, None, 98, 1)
-    (3, 0)
+    The last round has as many as there are photographs left.
+
+    >>> round_sizes(150, None, 98, 1), round_sizes(145, None, 98, 1), round_sizes(None, None, 98, 1)
+    ([16, 16, 16], [16, 16, 12], [])
     """
     if photographs is None:
-        return 0 if rtol is None else MAX_ROUNDS
-    return min(max((photographs - first) // photographs_of_round(exposures), 0), MAX_ROUNDS)
+        return [] if rtol is None else MAX_ROUNDS * [BATCH_SIZE]
+    sizes: list[int] = []
+    left = photographs - first
+    while len(sizes) < MAX_ROUNDS:
+        patterns = min((left - 1) // exposures, BATCH_SIZE)
+        if patterns < LEAST_PATTERNS:
+            break
+        sizes.append(patterns)
+        left -= photographs_of_round(exposures, patterns)
+    return sizes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,22 +330,23 @@ class Rounds:
 
     Attributes
     ----------
-    most : int
-        Rounds at most.
+    sizes : sequence of int
+        Patterns of each round.
     rtol : float, optional
         Error of the judges that is small enough; None: all rounds are taken.
     """
 
-    most: int = 0
+    sizes: Sequence[int] = ()
     rtol: float | None = None
 
     def go_on(self, errors: list[float]) -> bool:
         """True if another round follows, given the errors after the first patterns and each round.
 
-        >>> Rounds(most=3, rtol=0.01).go_on([0.03, 0.02]), Rounds(most=3, rtol=0.01).go_on([0.009])
+        >>> rounds = Rounds(sizes=[16, 16, 9], rtol=0.01)
+        >>> rounds.go_on([0.03, 0.02]), rounds.go_on([0.009])
         (True, False)
         """
-        if len(errors) > self.most:
+        if len(errors) > len(self.sizes):
             return False
         if self.rtol is None:
             return True
@@ -391,7 +409,8 @@ def scan(
     errors = [estimate.error]
     while rounds.go_on(errors) and log.can_take:
         number = len(errors)
-        shown = _patterns_of_round(grid.grid, log, estimate.estimator, number)
+        size = rounds.sizes[number - 1]
+        shown = _patterns_of_round(grid.grid, log, estimate.estimator, number, size)
         log.announce(shown)
         pictures.take(shown)
         estimate = _estimate(grid, pictures, progress)
@@ -403,16 +422,20 @@ def scan(
 
 
 def _patterns_of_round(
-    grid: tuple[int, int], log: PictureLog, estimator: Estimator | RefinedEstimator, number: int
+    grid: tuple[int, int],
+    log: PictureLog,
+    estimator: Estimator | RefinedEstimator,
+    number: int,
+    size: int,
 ) -> list[np.ndarray]:
     """The patterns of a round: each place is divided at the scales that are unknown there.
 
     They are kept with the pictures, since an estimate that is rounded in another way, on another
-    machine, would make others.
+    machine, would make others, and so would another number of photographs.
     """
 
     def make() -> np.ndarray:
-        shown = refined_patterns(estimator.unknown_light(), BATCH_SIZE, (SEED, number))
+        shown = refined_patterns(estimator.unknown_light(), size, (SEED, number))
         return np.packbits(np.array(shown, bool), axis=2)
 
     bits = np.unpackbits(log.keep(f"round_{number}", make), axis=2, count=grid[1])
@@ -436,9 +459,12 @@ def _estimate(
         estimator.learn(fitted.without(wrong_fitted))
         return estimator
 
+    white = _squared_light(pairs.select(slice(0, 1)))
+
     def judge(wrong: list[int], estimator: Estimator | RefinedEstimator) -> _Estimate:
         judges_left = pairs.select(np.setdiff1d(judging, wrong))
-        return _judged(estimator, judges_left, [pictures.numbers[number] for number in wrong])
+        wrong_patterns = [pictures.numbers[number] for number in wrong]
+        return _judged(estimator, judges_left, white, wrong_patterns)
 
     def error_without(wrong: list[int], estimator: Estimator | RefinedEstimator) -> float:
         return judge(wrong, estimator).error
@@ -479,12 +505,13 @@ def _known_mixing(mixing: np.ndarray | None, channels: int) -> np.ndarray:
 class _Estimate:
     """T as it is estimated, and how it was judged.
 
-    `squares` are those of the relative errors of the judges, `scales` the factors of the variances
-    of T by which they explain these.
+    `squares` are those of the relative errors of the judges, `deviations` theirs by noise, and
+    `scales` the factors of the variances of T by which they explain these.
     """
 
     estimator: Estimator | RefinedEstimator
     squares: np.ndarray
+    deviations: np.ndarray
     scales: np.ndarray
     wrong_patterns: list[int]
 
@@ -500,16 +527,35 @@ class _Estimate:
             own_variance=self.estimator.own_variance() * self.scales[:, None],
             errors=np.sqrt(self.squares),
             error=self.error,
-            bound=error_bound(self.error, len(self.squares)),
+            bound=error_bound(self.error, self.deviations),
             wrong_patterns=self.wrong_patterns,
         )
 
 
+def is_lit_judge(pattern: np.ndarray, light: float, white: float) -> bool:
+    """True if a picture of a pattern has light; squared ones are those of it and of white.
+
+    Letters vanish in a picture of few rows, and a patch where the projector lights nothing.
+    """
+    return light > MIN_JUDGE_LIGHT * white * float(np.mean(pattern))
+
+
+def _squared_light(pair: Pairs) -> float:
+    """The sum of squares of the known light of a picture."""
+    variance: Any = pair.variance
+    light = np.where(variance < KNOWN_VARIANCE, pair.photographs, 0.0).astype(np.float64)
+    return float((light**2).sum())
+
+
 def _judged(
-    estimator: Estimator | RefinedEstimator, pairs: Pairs, wrong_patterns: list[int]
+    estimator: Estimator | RefinedEstimator,
+    pairs: Pairs,
+    white: float,
+    wrong_patterns: list[int],
 ) -> _Estimate:
-    """The error of an estimator for pairs that it has not seen."""
+    """The error of an estimator for pairs that it has not seen; `white` is its squared light."""
     squares = np.zeros(len(pairs))
+    deviations = np.zeros(len(pairs))
     is_lit = np.zeros(len(pairs), bool)
     residual_squares = np.zeros(estimator.channels)
     for number in range(len(pairs)):
@@ -519,24 +565,36 @@ def _judged(
         explained = estimator.explain(judge.patterns)
         unexplained = np.where(is_known, judge.photographs - explained, 0.0)
         of_channels = (unexplained**2).sum(axis=(0, 1))
-        noise = np.where(is_known, variance, 0.0).sum(dtype=np.float64)
-        light = np.where(is_known, judge.photographs, 0.0).astype(np.float64)
-        energy = max((light**2).sum(), np.finfo(float).tiny)
-        squares[number] = max(of_channels.sum() - noise, 0.0) / energy
-        # Letters vanish in a picture of few rows.
-        is_lit[number] = judge.patterns.any()
+        noise = np.where(is_known, variance, 0.0).astype(np.float64)
+        energy = max(_squared_light(judge), np.finfo(float).tiny)
+        squares[number] = max(of_channels.sum() - noise.sum(), 0.0) / energy
+        deviations[number] = deviation_of_squares(noise) / energy
+        is_lit[number] = is_lit_judge(judge.patterns, energy, white)
         residual_squares += of_channels
     return _Estimate(
         estimator=estimator,
         squares=squares[is_lit],
+        deviations=deviations[is_lit],
         scales=estimator.scale_of_variance(pairs.patterns, residual_squares),
         wrong_patterns=wrong_patterns,
     )
 
 
-def error_bound(error: float, judges: int) -> float:
-    """Bound of the error of other pictures, by the root mean square of that of some judges."""
-    return error * math.sqrt(judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges))
+def deviation_of_squares(variance: np.ndarray) -> float:
+    """Standard deviation of the sum of squares of noise of these variances."""
+    return math.sqrt(2.0 * float((variance**2).sum()))
+
+
+def error_bound(error: float, deviations: np.ndarray) -> float:
+    """Bound of the error of other pictures, by the root mean square of that of some judges.
+
+    `deviations` (judges,) are those of the squared relative errors by noise: an error that is lost
+    in noise is not 0.
+    """
+    judges = len(deviations)
+    by_judges = error**2 * judges / scipy.stats.chi2.ppf(1.0 - CONFIDENCE, judges)
+    mean_deviation = float(np.linalg.norm(deviations)) / judges
+    return math.sqrt(by_judges + scipy.stats.norm.ppf(CONFIDENCE) * mean_deviation)
 
 
 def finish(store: BlockStore, sketch: Sketch) -> None:

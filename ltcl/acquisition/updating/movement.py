@@ -58,6 +58,9 @@ MAX_DAMPING = 1e6
 SEARCHED_PIXELS = 64
 # Share of the light under white that a model of the picture is off by.
 MODEL_ERROR = 0.01
+# Share of the light of a pixel under white that the old transport must know: what is masked there,
+# or was dark and is lit now, tells nothing.
+MIN_KNOWN_LIGHT = 0.1
 # Share of an old pixel that must be lit to count.
 MIN_LIT_SHARE = 0.99
 # Least footprint of a camera pixel, so that pictures vary smoothly with the movement.
@@ -322,7 +325,8 @@ class _Search:
         self.views = views
         self.lighting = lighting
         self.products = products
-        self.known = views.known
+        known_light = products(views.patterns[:1])[0]
+        self.known = views.known & (known_light > MIN_KNOWN_LIGHT * views.pictures[0])
         light = np.maximum(views.pictures[0], np.finfo(float).tiny)
         deviation = np.sqrt(views.variance[1:] + (MODEL_ERROR * light) ** 2)
         self.weight = np.where(self.known, 1.0 / deviation, 0.0)

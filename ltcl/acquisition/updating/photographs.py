@@ -72,6 +72,12 @@ def judging_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
     return [pictures[place] for place in judge_places(grid)]
 
 
+def all_patterns(grid: tuple[int, int]) -> list[np.ndarray]:
+    """The patterns (h, w) of all photographs, in their order."""
+    black = np.zeros(grid, np.float32)
+    return [black, black + 1.0, *fitted_patterns(grid), *judging_patterns(grid)]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UpdateLight:
     """Radiance of the photographs on the camera's pixels, with the ambient light.
@@ -93,8 +99,7 @@ def photograph(
     shots: Shots, seconds: float, camera: CameraModel, progress: ProgressFunction
 ) -> UpdateLight:
     """Take the photographs; errors are those of `Shots.expose` and `merge_photographs`."""
-    black = np.zeros(shots.grid, np.float32)
-    shown = [black, black + 1.0, *fitted_patterns(shots.grid), *judging_patterns(shots.grid)]
+    shown = all_patterns(shots.grid)
     black_light, white_light, *others = _take(shots, shown, seconds, camera, progress, 0)
     return UpdateLight(
         black=black_light,

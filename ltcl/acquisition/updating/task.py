@@ -30,7 +30,13 @@ from ltcl.acquisition.calibration import Calibration, StoredMap, is_calibrated, 
 from ltcl.acquisition.estimation.estimator import BASIS, FIRST_BOUNCE_SIGMAS
 from ltcl.acquisition.estimation.windows import ROW_BYTES, functions_of_row
 from ltcl.acquisition.geometry import Correspondence, Resampling
-from ltcl.acquisition.radiance import RadiancePicture, StoredRadiance, difference, planes
+from ltcl.acquisition.radiance import (
+    RadiancePicture,
+    StoredRadiance,
+    completed,
+    difference,
+    planes,
+)
 from ltcl.acquisition.rig import Rig, RigError, Shots
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.picture_log import BATCH_SIZE
@@ -48,10 +54,12 @@ from ltcl.acquisition.updating.movement import (
     no_movement,
     search_shift,
 )
+from ltcl.acquisition.updating.order import check_order
 from ltcl.acquisition.updating.photographs import (
     JUDGES,
     PHOTOGRAPHS,
     UpdateLight,
+    all_patterns,
     fitted_patterns,
     judge_places,
     judging_patterns,
@@ -85,6 +93,10 @@ SEARCH_RATIO = 1.5
 # What the moved transport may leave of pictures at the median pixel; more is another scene, or
 # another kind of change.
 MAX_MISFIT = 0.1
+# Share of the pixels that may be saturated under white, and least light there, relative to that in
+# the scan: a lamp does not age by as much.
+MAX_SATURATED_SHARE = 0.25
+MIN_WHITE_LIGHT = 0.02
 # What is left without a movement, relative to that with it, and of the light, up to which there is
 # none: one by a hundredth of a pixel leaves about half a percent of the light.
 NOTABLE_MISFIT_RATIO = 1.1
@@ -118,13 +130,13 @@ class Update:
     gain : (channels,)
         Light of the lamp, relative to that in the scan.
     masked : int
-        Pixels that light places beyond the old picture, or that the camera does not tell from
-        others, of which nothing is known.
+        Pixels that light places beyond the old picture, that are saturated or covered, or that the
+        camera does not tell from others, of which nothing is known.
     measured_again : int
         Pixels whose rows of T failed after the first photographs, and were measured again.
     errors, previous_errors : (judges,)
-        Relative error of T p for each of these pictures, and what that was in the scan; NaN of a
-        scan that no picture has judged.
+        Relative error of T p for each of these pictures, and what that was in the scan; NaN where
+        a picture has no light, and of a scan that no picture has judged.
     error, previous_error : float
         Their root mean squares.
     bound : float
@@ -192,7 +204,8 @@ class Update:
         if self.masked:
             lines.append(
                 f"{self.masked} pixels ({self.masked / (h * w):.1%}) are masked: they light places "
-                "beyond the old picture, or the camera does not tell them from others"
+                "beyond the old picture, are saturated or covered, or the camera does not tell "
+                "them from others"
             )
         if self.measured_again:
             lines.append(
@@ -218,9 +231,12 @@ class Update:
             return f"the update holds; but {place}"
         if self.holds:
             return "the update holds"
+        advice = "a new scan is needed"
+        if self.photographs + BATCH_SIZE <= MAX_PHOTOGRAPHS:
+            advice = f"up to {MAX_PHOTOGRAPHS} photographs measure it again"
         if place:
-            return f"the update does not hold: {place}; a new scan is needed"
-        return "the update does not hold; a new scan is needed"
+            return f"the update does not hold: {place}; {advice}"
+        return f"the update does not hold; {advice}"
 
 
 def _place(failing: np.ndarray) -> str:
@@ -364,10 +380,14 @@ def _carry_over(
     # 1. The photographs, on the old pixels.
     seconds = calibration.exposures[0]
     light = photograph(shots, seconds, calibration.camera, progress)
+    # At the lowest code of a camera black has no value; longer exposures of the scan have one.
+    black = completed(light.black, calibration.ambient, ImageFile())
+    light = replace(light, black=black)
     old_grid = ScanGrid(calibration)
     unit = _unit_of_light(T, old_grid.white)
 
     # 2. The movement.
+    _check_white(old_grid, light, unit)
     fit = _find_movement(T, old_grid, mapping, light, unit)
     movement = fit.movement
 
@@ -446,7 +466,7 @@ def _write(path: Path, shots: Shots, previous: BlockStore, carried: _Carried) ->
         sketch={
             "error": judgement.error,
             "bound": judgement.bound,
-            "errors": judgement.errors.tolist(),
+            "errors": judgement.errors[np.isfinite(judgement.errors)].tolist(),
         },
         update={
             "of": str(previous.path),
@@ -511,9 +531,15 @@ def _judged_errors(pictures: _Pictures, explained: np.ndarray) -> np.ndarray:
     is_known = pictures.variance < KNOWN_VARIANCE
     left = np.where(is_known, pictures.value - explained, 0.0)
     noise = np.where(is_known, pictures.variance, 0.0).sum(axis=(1, 2))
-    light = np.where(is_known, pictures.value, 0.0)
-    energy = np.maximum((light**2).sum(axis=(1, 2)), np.finfo(float).tiny)
+    energy = np.maximum(pictures.squared_light(), np.finfo(float).tiny)
     return np.sqrt(np.maximum((left**2).sum(axis=(1, 2)) - noise, 0.0) / energy)
+
+
+def _deviations(pictures: _Pictures) -> np.ndarray:
+    """Standard deviations by noise of the squares of `_judged_errors`, (k,)."""
+    noise = np.where(pictures.variance < KNOWN_VARIANCE, pictures.variance, 0.0)
+    energy = np.maximum(pictures.squared_light(), np.finfo(float).tiny)
+    return np.array([sketch.deviation_of_squares(variance) for variance in noise]) / energy
 
 
 def _flat(patterns: Sequence[np.ndarray]) -> np.ndarray:
@@ -554,11 +580,39 @@ class _Pictures:
             variances.append(np.where(is_known, variance, float(UNKNOWN)))
         return cls(value=np.stack(values), variance=np.stack(variances))
 
+    def squared_light(self) -> np.ndarray:
+        """The sums of squares of the known light of each picture, (k,)."""
+        light = np.where(self.variance < KNOWN_VARIANCE, self.value, 0.0)
+        return (light**2).sum(axis=(1, 2))
+
     def joined(self, others: _Pictures) -> _Pictures:
         """These pictures and others."""
         return _Pictures(
             value=np.concatenate([self.value, others.value]),
             variance=np.concatenate([self.variance, others.variance]),
+        )
+
+
+def _check_white(grid: ScanGrid, light: UpdateLight, unit: np.ndarray) -> None:
+    """Refuse photographs of white that are saturated, or hardly brighter than black."""
+    white = _Pictures.of(grid, light.black, [light.white], unit)
+    was_known = grid.white.known.T
+    light_before = np.where(was_known, grid.white.value.T, 0.0) / unit
+    was_lit = light_before > MIN_WHITE_LIGHT * light_before.max()
+    is_known = was_lit & (white.variance[0] < KNOWN_VARIANCE)
+    saturated = 1.0 - np.count_nonzero(is_known) / max(np.count_nonzero(was_lit), 1)
+    if saturated > MAX_SATURATED_SHARE:
+        raise AcquisitionError(
+            f"photographs of white are saturated at {saturated:.0%} of the pixels; there is more "
+            "light than in the scan: darken the projector or the room, or scan anew"
+        )
+    before = light_before[is_known].sum()
+    now = white.value[0][is_known].sum()
+    if now < MIN_WHITE_LIGHT * before:
+        raise AcquisitionError(
+            f"photographs have {max(now / before, 0.0):.0%} more light under white than under "
+            "black, relative to the scan; was the projector on, and its pattern shown? take them "
+            "again"
         )
 
 
@@ -587,6 +641,14 @@ def _find_movement(
     still = no_movement(views, T.products)
     if still.misfit <= NOTABLE_MISFIT_RATIO * fit.misfit + NOTABLE_MISFIT:
         fit = still
+    shown = _flat(all_patterns(grid.grid))
+    taken = [light.black, light.white, *light.fitted, *light.judging]
+    all_pictures = _Pictures.of(grid, light.black, taken, unit)
+    for movement in (first, fit.movement):
+        lit = views.resampled(movement) @ shown.T
+        foretold = fit.gain * T.products(lit.T)
+        is_known = all_pictures.variance.max(axis=0) < KNOWN_VARIANCE
+        check_order(foretold, all_pictures.value, is_known)
     if fit.typical_misfit > MAX_MISFIT:
         raise AcquisitionError(
             f"no movement of the projector by up to {largest:.1f} pixels explains the photographs: "
@@ -666,14 +728,26 @@ class _Judgement:
 
     @classmethod
     def of(
-        cls, T: HostTransport, patterns: np.ndarray, pictures: _Pictures, previous: BlockStore
+        cls,
+        T: HostTransport,
+        patterns: np.ndarray,
+        pictures: _Pictures,
+        white: float,
+        previous: BlockStore,
     ) -> _Judgement:
-        """The judgement on T by pictures of patterns that it was not fitted to."""
+        """The judgement on T by pictures of patterns that it was not fitted to.
+
+        `white` is the squared light of white.
+        """
         explained = T.products(patterns)
         errors = _judged_errors(pictures, explained)
-        error = math.sqrt((errors**2).mean())
+        is_lit = np.zeros(len(patterns), bool)
+        for number, light in enumerate(pictures.squared_light()):
+            is_lit[number] = sketch.is_lit_judge(patterns[number], light, white)
+        errors = np.where(is_lit, errors, math.nan)
+        error = math.sqrt((errors[is_lit] ** 2).mean())
         previous_errors = _previous_errors(previous, T.grid)
-        previous_error = math.sqrt((previous_errors**2).mean())
+        previous_error = math.sqrt((previous_errors[is_lit] ** 2).mean())
         allowed = MAX_UNKNOWN_ERROR
         if not math.isnan(previous_error):
             allowed = MAX_ERROR_RATIO * previous_error
@@ -682,7 +756,7 @@ class _Judgement:
             previous_errors=previous_errors,
             error=error,
             previous_error=previous_error,
-            bound=sketch.error_bound(error, len(errors)),
+            bound=sketch.error_bound(error, _deviations(pictures)[is_lit]),
             holds=error <= allowed,
             failing=_failing_cells(T.grid, pictures, explained, FAILING_RATIO * allowed),
         )
@@ -773,7 +847,8 @@ class _Correction:
             centres,
         )
         shown = _flat(judging_patterns(self._grid.grid))
-        judgement = _Judgement.of(changed.transport, shown, self._judging, self._previous)
+        white = float(self._pictures.squared_light()[0])
+        judgement = _Judgement.of(changed.transport, shown, self._judging, white, self._previous)
         return _Corrected(changed=changed, matches=matches, judgement=judgement)
 
     def _pictures_of(self, light: Sequence[StoredRadiance]) -> _Pictures:
@@ -787,7 +862,7 @@ def _previous_errors(previous: BlockStore, grid: tuple[int, int]) -> np.ndarray:
         return errors
     if len(errors) == sketch.JUDGES:
         return errors[judge_places(grid)]
-    # Of a sketch that left out one of its judges, which is not known, the mean.
+    # Of a sketch that left out some of its judges, which are not known, the mean.
     error = math.nan
     if len(errors):
         error = math.sqrt((errors**2).mean())

@@ -92,7 +92,7 @@ class PlanReport(FolderReport):
     megapixels: Annotated[float | None, "Pixels of the camera in millions; null if not known."]
     pace: Annotated[float, "Seconds of computing for each photograph and megapixel, as measured."]
     rounds: Annotated[int, "Rounds at most that a sketch takes beyond its plan, as asked for."]
-    photographs_of_round: Annotated[int, "Photographs of each of these rounds."]
+    photographs_of_round: Annotated[int, "Photographs of each of these rounds, at most."]
     plans: Annotated[
         dict[str, StrategyPlan],
         "Plans by strategy, as `ltcl.acquisition.scanning.Plan`.",

@@ -135,6 +135,13 @@ def test_more_pairs_are_added(T, pairs, result):
     assert error_of(T, more.transport, unseen) < error_of(T, result.transport, unseen)
 
 
+def test_a_single_pair_is_added(device):
+    patterns = pictures(12)
+    photographs = 0.5 * patterns + np.random.default_rng(1).normal(0.0, 1e-3, patterns.shape)
+    fitted = ltcl.fit(patterns[:11], photographs[:11], device=device)
+    assert len(fitted.add(patterns[11:], photographs[11:]).pairs) == 12
+
+
 @pytest.mark.slow
 def test_a_lamp_that_fades_is_corrected(T, pairs, device, caplog):
     patterns, photographs = pairs
@@ -234,6 +241,28 @@ def test_two_photographs_that_are_swapped_are_named(pairs):
         ltcl.fit(patterns, swapped)
 
 
+@pytest.mark.parametrize("order", ["shuffled", "flipped"])
+def test_photographs_without_the_light_of_their_patterns_are_refused(pairs, order):
+    patterns, photographs = pairs
+    if order == "shuffled":
+        photographs = photographs[np.random.default_rng(4).permutation(len(photographs))]
+    else:
+        photographs = photographs[:, :, ::-1]
+    with pytest.raises(AcquisitionError, match="the light of their own pattern"):
+        ltcl.fit(patterns, photographs)
+
+
+def test_black_frames_of_a_film_judge_nothing(T, device):
+    """Their photographs are noise, of which T p explains nothing."""
+    patterns = pictures(FRAMES)
+    patterns[5:25] = 0.0
+    fitted = ltcl.fit(patterns, photograph(T, patterns), device=device)
+    assert not np.isin(np.arange(5, 25), fitted.held_out).any()
+    error = error_of(T, fitted.transport, pictures(20, seed=5))
+    assert 0.5 * error < fitted.error < 2.0 * error
+    assert abs(fitted.drift) < 0.01
+
+
 ONES = np.ones((20, 4, 4))
 NOISE_PICTURES = np.random.default_rng(0).random((20, 4, 4))
 
@@ -248,6 +277,9 @@ NOISE_PICTURES = np.random.default_rng(0).random((20, 4, 4))
         (NOISE_PICTURES * np.nan, NOISE_PICTURES, {}, "patterns has 320 NaN"),
         (NOISE_PICTURES, NOISE_PICTURES.repeat(2, 1), {}, r"\(8, 4\) pixels"),
         (ONES, NOISE_PICTURES, {}, "patterns are all the same"),
+        (NOISE_PICTURES[:, :0], NOISE_PICTURES[:, :0], {}, r"patterns has shape \(20, 0, 4\)"),
+        (NOISE_PICTURES - 0.5, NOISE_PICTURES, {}, "patterns has values down to -0.4"),
+        (NOISE_PICTURES, NOISE_PICTURES - 0.6, {}, "darker than black"),
         (NOISE_PICTURES, 0 * ONES, {}, "photographs is black"),
         (NOISE_PICTURES, np.minimum(NOISE_PICTURES, 0.8), {}, "saturated"),
         (np.stack([NOISE_PICTURES] * 3, -1), NOISE_PICTURES, {}, "patterns has colours"),

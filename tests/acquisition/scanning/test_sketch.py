@@ -245,6 +245,25 @@ def test_bounces_of_a_clean_sketch_carry_no_warning(
 
 
 @pytest.mark.slow
+def test_a_patch_where_the_projector_lights_nothing_judges_nothing(tmp_path: Path) -> None:
+    """A patch that judges lies on the left half, which is dark: it has no relative error."""
+    truth = corner(8).reshape(8, 16, 8, 16).copy()
+    truth[:, :8] = 0.0
+    truth[:, :, :, :8] = 0.0
+    path = tmp_path / "T.zarr"
+    T = acquire(
+        Unplugged(truth.reshape(128, 128), (8, 16)),
+        geometry="aligned",
+        strategy="sketch",
+        store=path,
+    )
+    report = Report.of(path)
+    assert T.masked.sum() == 64
+    error = relative_error(dense(T), truth.reshape(128, 128), (8, 16))
+    assert 0.5 * error < report.judged_error < 2.0 * error
+
+
+@pytest.mark.slow
 def test_where_light_is_not_smooth_the_error_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -360,7 +379,7 @@ def test_rounds_make_the_error_smaller_within_the_photographs_allowed(
 ) -> None:
     errors = []
     for rounds in (0, 3):
-        allowed = first_count + rounds * ROUND + 5
+        allowed = first_count + rounds * ROUND + sketch.LEAST_PATTERNS
         rig = Unplugged(corner(), SMALL)
         path = tmp_path / f"{rounds}.zarr"
         acquire(rig, geometry="aligned", strategy="sketch", store=path, photographs=allowed)
@@ -369,6 +388,19 @@ def test_rounds_make_the_error_smaller_within_the_photographs_allowed(
         assert report.patterns == sketch.count_patterns(SMALL) + 16 * rounds
         errors.append(report.judged_error)
     assert errors[1] < 0.9 * errors[0]
+
+
+@pytest.mark.slow
+def test_the_last_round_takes_the_photographs_that_are_left(
+    tmp_path: Path, first_count: int
+) -> None:
+    path = tmp_path / "T.zarr"
+    settings: dict[str, Any] = {"geometry": "aligned", "strategy": "sketch"}
+    allowed = first_count + 10
+    rig = Unplugged(corner(), SMALL)
+    acquire(rig, store=path, photographs=allowed, **settings)
+    assert rig.count == allowed
+    assert Report.of(path).patterns == sketch.count_patterns(SMALL) + 9
 
 
 @pytest.mark.rare
