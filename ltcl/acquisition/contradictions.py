@@ -9,7 +9,7 @@ Comparisons are of photographs, or sums of them, that should show the same light
 
 An explanation is one photograph, without which all comparisons agree; or a change from one
 photograph on, if all before it agree, and all from it on; or two neighbours, without which all
-agree. It names all that would do.
+agree; or a missing one, if all agree where the next ones have moved up. It names all that would do.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -69,12 +70,14 @@ class Explanation:
     """Numbers of photographs any of which explains all contradictions.
 
     `single` ones deviate alone; from one of `changes` on the others deviate; `pairs` are the first
-    of two neighbours that deviate together.
+    of two neighbours that deviate together; one of `missing` is missing, and the next ones have
+    moved up.
     """
 
     single: tuple[int, ...]
     changes: tuple[int, ...]
     pairs: tuple[int, ...]
+    missing: tuple[int, ...] = ()
 
     @property
     def suspects(self) -> set[int]:
@@ -88,6 +91,13 @@ class Explanation:
         if self.pairs:
             names = [f"{name(k)} and {name(k + 1)}" for k in self.pairs]
             return f"{', or '.join(names)} deviate: they are exchanged, or show other patterns"
+        if self.missing:
+            first = self.missing[0]
+            last = self.missing[-1]
+            subject = name(first)
+            if first != last:
+                subject = f"one of photographs {first} to {last}"
+            return f"{subject} is missing, and the next ones have moved up by one"
         texts = []
         if self.single:
             names = [name(k) for k in self.single]
@@ -121,6 +131,8 @@ class Contradictions:
     """Comparisons of the photographs of a calibration."""
 
     def __init__(self, photographs: Sequence[RecordedPhotograph], camera: CameraModel) -> None:
+        self.photographs = photographs
+        self.camera = camera
         self.numbers = [photograph.number for photograph in photographs]
         self._scores: dict[tuple[int, tuple[int, ...]], float] = {}
         self.comparisons = _pattern_comparisons(photographs, camera)
@@ -137,7 +149,25 @@ class Contradictions:
         pairs = []
         if not single and not changes:
             pairs = [k for k in self.numbers[:-1] if self._agree_without({k, k + 1})]
-        return Explanation(single=tuple(single), changes=tuple(changes), pairs=tuple(pairs))
+        missing: list[int] = []
+        if not single and not changes and not pairs:
+            missing = [k for k in self.numbers[:-1] if self._agree_if_missing(k)]
+        return Explanation(
+            single=tuple(single),
+            changes=tuple(changes),
+            pairs=tuple(pairs),
+            missing=tuple(missing),
+        )
+
+    def _agree_if_missing(self, number: int) -> bool:
+        """True if all agree where photographs from a number on are those after them in the list."""
+        moved = []
+        for photograph, following in pairwise(self.photographs):
+            if photograph.number < number:
+                moved.append(photograph)
+            else:
+                moved.append(replace(following, sample=photograph.sample, number=photograph.number))
+        return Contradictions(moved, self.camera)._agree_without(set())
 
     def _agree_without(self, wrong: set[int]) -> bool:
         return self._agree_where(wrong.isdisjoint, MAX_SCORE)

@@ -135,11 +135,19 @@ def test_two_neighbours_that_are_exchanged() -> None:
     assert "photograph 28 and photograph 29 deviate: they are exchanged" in text
 
 
-def test_more_than_a_change_is_not_explained() -> None:
-    """A photograph is missing, and all others move up: they agree with nothing."""
+@pytest.mark.parametrize("number", [11, 20, 22])
+def test_a_photograph_is_missing_and_the_others_move_up(number: int) -> None:
     codes = set_up()
-    images = photographs([*codes[:12], *codes[13:], codes[-1]])
-    assert described(images) == "None"
+    place = number - FIRST
+    explanation = explain(photographs([*codes[:place], *codes[place + 1 :], codes[-1]]))
+    assert number in explanation.missing
+    assert len(explanation.missing) <= 3
+    text = str(explanation.describe(name_by_number))
+    assert "is missing, and the next ones have moved up by one" in text
+
+
+def test_another_order_altogether_is_not_explained() -> None:
+    assert described(photographs(set_up()[::-1])) == "None"
 
 
 def through_eight_bits(image: np.ndarray) -> np.ndarray:
