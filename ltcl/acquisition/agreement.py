@@ -23,9 +23,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import combinations, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -155,15 +155,16 @@ def find_deviation(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RecordedPhotograph:
+class RecordedPhotograph:
     """Pattern, seconds and number of a photograph, and its image at some pixels.
 
     `pattern` is the key of its codes, which need not stay in memory, `inverse` that of the inverse
-    pattern, if they are 0 and 1.
+    pattern, if they are 0 and 1, and `uniform` the code if all are the same.
     """
 
     pattern: str
     inverse: str | None
+    uniform: float | None
     seconds: float
     sample: np.ndarray
     number: int
@@ -173,8 +174,8 @@ class AgreementRecord:
     """Photographs of a calibration, at some pixels, to be compared when its noise is known."""
 
     def __init__(self) -> None:
-        self._by_pattern: dict[str, list[_RecordedPhotograph]] = defaultdict(list)
-        self._by_exposure: dict[float, list[_RecordedPhotograph]] = defaultdict(list)
+        self._by_pattern: dict[str, list[RecordedPhotograph]] = defaultdict(list)
+        self._by_exposure: dict[float, list[RecordedPhotograph]] = defaultdict(list)
 
     def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
         """Record one photograph, (H, W) or (H, W, c) in [0, 1]."""
@@ -185,9 +186,10 @@ class AgreementRecord:
     ) -> None:
         """Record one photograph by its values (n, c) at the pixels of `sample`."""
         is_binary = bool(np.all((codes == 0) | (codes == 1)))
-        photograph = _RecordedPhotograph(
+        photograph = RecordedPhotograph(
             pattern=shot_key(codes),
             inverse=shot_key(1.0 - codes) if is_binary else None,
+            uniform=float(codes.flat[0]) if codes.min() == codes.max() else None,
             seconds=seconds,
             sample=sample,
             number=number,
@@ -200,13 +202,22 @@ class AgreementRecord:
 
         It names the photograph, or the few of which one must be wrong; of several, the first.
         """
-        findings: list[tuple[int, str]] = []
+        finding = self.first_finding(camera, name)
+        if finding is not None:
+            raise AcquisitionError(f"{finding.text}; {ADVICE}")
 
-        def note(group: list[_RecordedPhotograph], deviation: Deviation | None) -> None:
+    def first_finding(
+        self, camera: CameraModel, name: PhotographName = name_by_number
+    ) -> Finding | None:
+        """The first deviation among photographs of a pattern, or of it and its inverse, if any."""
+        findings = []
+
+        def note(group: list[RecordedPhotograph], deviation: Deviation | None) -> None:
             if deviation is not None:
                 numbers = [photograph.number for photograph in group]
-                last = numbers[max(deviation.suspects)]
-                findings.append((last, deviation.describe(numbers, name)))
+                suspects = [numbers[k] for k in deviation.suspects]
+                text = deviation.describe(numbers, name)
+                findings.append(Finding(tuple(suspects), text, deviation.is_exchange))
 
         for group in self._by_pattern.values():
             samples = [photograph.sample for photograph in group]
@@ -214,13 +225,26 @@ class AgreementRecord:
             note(group, find_deviation(samples, seconds, camera))
         for group in self._by_exposure.values():
             note(group, _deviation_of_inverses(group, camera))
-        if findings:
-            _, text = min(findings)
-            raise AcquisitionError(f"{text}; {ADVICE}")
+        return min(findings, key=lambda finding: max(finding.suspects), default=None)
+
+    @property
+    def photographs(self) -> list[RecordedPhotograph]:
+        """All photographs, in order."""
+        groups = self._by_exposure.values()
+        photographs = [photograph for group in groups for photograph in group]
+        return sorted(photographs, key=lambda photograph: photograph.number)
+
+
+class Finding(NamedTuple):
+    """Numbers of photographs one of which deviates, or two exchanged ones; and that in words."""
+
+    suspects: tuple[int, ...]
+    text: str
+    is_exchange: bool
 
 
 def _deviation_of_inverses(
-    group: Sequence[_RecordedPhotograph], camera: CameraModel
+    group: Sequence[RecordedPhotograph], camera: CameraModel
 ) -> Deviation | None:
     """Patterns and inverses, at one exposure, that do not add up to the same as the others."""
     first = []
@@ -341,15 +365,16 @@ class LinearLight:
             dim_bias=np.zeros(shape),
             clipping=np.zeros(value.shape),
         )
-        return LinearLight(
-            seconds=np.concatenate([self.seconds, known.seconds]),
-            value=np.concatenate([self.value, known.value]),
-            variance=np.concatenate([self.variance, known.variance]),
-            limit=np.concatenate([self.limit, known.limit]),
-            bias=np.concatenate([self.bias, known.bias]),
-            dim_bias=np.concatenate([self.dim_bias, known.dim_bias]),
-            clipping=np.concatenate([self.clipping, known.clipping]),
-        )
+        return LinearLight.joined([self, known])
+
+    @classmethod
+    def joined(cls, parts: Sequence[LinearLight]) -> LinearLight:
+        """Photographs of several parts, in order."""
+
+        def join(name: str) -> np.ndarray:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        return cls(**{field.name: join(field.name) for field in fields(cls)})
 
     def select(self, numbers: Sequence[int]) -> LinearLight:
         """Select photographs by their places."""

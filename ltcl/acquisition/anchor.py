@@ -43,6 +43,10 @@ MAX_LAMP_CHANGE = 0.15
 MAX_LAMP_DOUBT = 0.25
 # Relative variance of the light of blocks, below which their contrast tells nothing.
 MIN_CONTRAST = 0.05
+# Movement in camera pixels that is clear; and the least median cosine of its angle with those of
+# other pictures, if all are that of the camera. Single pixels exaggerate large movements.
+MIN_MOVEMENT = 0.3
+MIN_COSINE = 0.8
 
 
 def sparse_pattern(grid: tuple[int, int]) -> np.ndarray:
@@ -226,3 +230,21 @@ def first_moved(shifts: Sequence[np.ndarray], moved: np.ndarray) -> int:
     along = np.array([moved @ shift for shift in shifts]) / length
     evidence = np.clip(along, 0.0, 1.0) - 0.5
     return int(np.argmin(np.cumsum([0.0, *evidence])))
+
+
+def are_moved_alike(shifts: Sequence[np.ndarray]) -> bool:
+    """True if the last of some pictures is clearly moved, and most of them in its direction.
+
+    >>> are_moved_alike([np.array([x, 0.5]) for x in (1.0, 2.2, 1.1)])
+    True
+    >>> are_moved_alike([np.array([x, 0.5]) for x in (-1.0, 3.0, 1.1)])
+    False
+    """
+    *earlier, last = shifts
+    if not earlier:
+        return False
+    lengths = np.linalg.norm(shifts, axis=1)
+    if np.median(lengths) < MIN_MOVEMENT or lengths[-1] < MIN_MOVEMENT:
+        return False
+    cosines = (np.stack(earlier) @ last) / np.maximum(lengths[:-1] * lengths[-1], 1e-12)
+    return float(np.median(cosines)) >= MIN_COSINE

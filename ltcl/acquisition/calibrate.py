@@ -33,6 +33,7 @@ from ltcl.acquisition.metering import (
     MAX_EXPOSURE_RATIO,
     SATURATED_CODE,
     WHITE_LEVEL,
+    OtherLight,
     bracket,
     brightness,
     check_full_scale,
@@ -348,7 +349,8 @@ def measure(
     with session.naming_photographs():
         view = _measure_geometry(session, effort, geometry, white_exposure)
     if view.sharpness is not None:
-        view.sharpness.check(side)
+        with session.naming_photographs():
+            view.sharpness.check(side)
 
     # 3. Black, white, uniform codes and blocks.
     times = _choose_times(session, effort, white_exposure, exposures, sparing)
@@ -462,10 +464,11 @@ def _response_from_ramps(
     if shots.channels == 3:
         _expose_dark_colours(session, ramps, hot, times, exposed)
     images = [_side_by_side(group, hot) for group in exposed]
-    check_full_scale(shots, times, images)
+    names = [_name_group(session, group) for group in exposed]
+    check_full_scale(shots, times, images, names)
     first = exposed[0][0].number
     subject = f"the response of the camera, photographs {first} to {shots.number}"
-    with acquisition_error(subject):
+    with acquisition_error(subject, names):
         response = radiometry.calibrate(
             images,
             times,
@@ -474,6 +477,14 @@ def _response_from_ramps(
             samples=RESPONSE_SAMPLES,
         )
     return response, hot
+
+
+def _name_group(session: CaptureSession, group: Sequence[Photograph]) -> str:
+    """Name of the photographs of one exposure."""
+    names = [session.name(photograph) for photograph in group]
+    if len(names) == 1:
+        return names[0]
+    return f"{names[0]} to {names[-1]}"
 
 
 def _expose_dark_colours(
@@ -583,8 +594,14 @@ def _check_black_and_white(
     """Check that black does not change, and that white reaches the full scale of the camera."""
     of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
     consistency.check_black(session, of_white_exposure)
-    by_exposure = {photograph.seconds: photograph.sampled for photograph in bright}
-    check_full_scale(session.shots, list(by_exposure), list(by_exposure.values()))
+    by_exposure = {photograph.seconds: photograph for photograph in bright}
+    images = [photograph.sampled for photograph in by_exposure.values()]
+    names = [session.name(photograph) for photograph in by_exposure.values()]
+    try:
+        check_full_scale(session.shots, list(by_exposure), images, names)
+    except OtherLight:
+        session.check_agreement()
+        raise
 
 
 def _measure_camera(

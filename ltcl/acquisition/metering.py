@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.acquisition.agreement import sample
+from ltcl.acquisition.agreement import ADVICE, sample
 from ltcl.acquisition.rig import Shots, nearest
 from ltcl.acquisition.scratch import row_strips
 from ltcl.acquisition.session import CaptureSession, Photograph
@@ -60,6 +60,9 @@ MIN_BRIGHT_CODE = 0.05
 MAX_FULL_SPREAD = 0.1
 # Relative width of the codes of saturated pixels.
 SATURATION_WIDTH = 0.02
+# Codes, relative to those, of pixels that must rise, if there are so many.
+HALF_FULL = (0.3, 0.7)
+MIN_HALF_FULL = 8
 # Largest number of exposures that are tried for white.
 MAX_PROBES = 10
 
@@ -240,10 +243,16 @@ def _check_bits(shots: Shots, level: float) -> None:
         )
 
 
-def check_full_scale(shots: Shots, seconds: Sequence[float], images: Sequence[np.ndarray]) -> None:
+def check_full_scale(
+    shots: Shots,
+    seconds: Sequence[float],
+    images: Sequence[np.ndarray],
+    names: Sequence[str] = (),
+) -> None:
     """Refuse a camera that is full below its last code: longer exposures are no brighter.
 
-    `images` (H, W[, c]) in [0, 1] are of one scene for so many seconds.
+    `images` (H, W[, c]) in [0, 1] are of one scene for so many seconds, and have `names`. If one
+    shows something else instead, that is refused.
     """
     for c in range(shots.channels):
         planes = []
@@ -252,14 +261,36 @@ def check_full_scale(shots: Shots, seconds: Sequence[float], images: Sequence[np
             plane = sample(image)[:, c]
             planes.append(plane)
             levels.append(float(np.quantile(plane, BRIGHT_QUANTILE)))
-        for a, b in combinations(np.argsort(seconds), 2):
+        for a, b in combinations(np.argsort(seconds).tolist(), 2):
             ratio = seconds[b] / seconds[a]
             is_below_full = levels[a] > MIN_BRIGHT_CODE and levels[b] < SATURATED_CODE
             is_flat = levels[b] < levels[a] * ratio**MIN_RISE_POWER
             # Noise alone is flat, too, at short exposures; but a full camera gets no brighter.
             is_flat &= levels[b] >= (1.0 - MAX_FULL_SPREAD) * max(levels)
             if ratio >= MIN_EXPOSURE_RATIO and is_below_full and is_flat:
+                if names and not _is_full(planes[a], planes[b], levels[a], ratio):
+                    raise OtherLight(
+                        f"{names[b]} of {seconds[b]:.3g} s and {names[a]} of {seconds[a]:.3g} s "
+                        "show different patterns, or were exposed alike: the longer exposure is "
+                        f"no brighter; {ADVICE}"
+                    )
                 raise AcquisitionError(_full_scale_error(shots, planes[b], levels[b]))
+
+
+class OtherLight(AcquisitionError):
+    """Two photographs of one pattern that show different light."""
+
+
+def _is_full(short: np.ndarray, long: np.ndarray, level: float, ratio: float) -> bool:
+    """True if pixels (n,) that are full in a short exposure stay so, and half-full ones rise."""
+    top = short >= (1.0 - SATURATION_WIDTH) * level
+    stays_full = np.median(long[top]) >= (1.0 - MAX_FULL_SPREAD) * level
+    low, high = HALF_FULL
+    half = (short > low * level) & (short < high * level)
+    if np.count_nonzero(half) < MIN_HALF_FULL:
+        return bool(stays_full)
+    rise = np.median(long[half] / short[half])
+    return bool(stays_full and rise >= ratio**MIN_RISE_POWER)
 
 
 def _full_scale_error(shots: Shots, plane: np.ndarray, level: float) -> str:

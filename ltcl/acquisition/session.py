@@ -23,7 +23,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ltcl.acquisition.agreement import AgreementRecord, CameraModel, sample
+from ltcl.acquisition.agreement import (
+    ADVICE,
+    AgreementRecord,
+    CameraModel,
+    name_by_number,
+    sample,
+)
+from ltcl.acquisition.contradictions import Contradictions, first_of_fewer_bits
 from ltcl.acquisition.radiance import StoredRadiance
 from ltcl.acquisition.radiometry import Radiance, Response, merge
 from ltcl.acquisition.radiometry.exposures import exposure_stack
@@ -187,7 +194,8 @@ def merge_photographs(
 def _about(photographs: Sequence[Photograph]) -> Iterator[None]:
     """Name photographs in an AcquisitionError that the block raises as an InputError."""
     numbers = [photograph.number for photograph in photographs]
-    with acquisition_error(f"photographs {min(numbers)} to {max(numbers)}"):
+    names = [name_by_number(number) for number in numbers]
+    with acquisition_error(f"photographs {min(numbers)} to {max(numbers)}", names):
         yield
 
 
@@ -278,7 +286,19 @@ class CaptureSession:
 
     def check_agreement(self) -> None:
         """Raise AcquisitionError with the names of photographs that deviate, if any."""
-        self.record.check(self.camera, self.shots.name)
+        finding = self.record.first_finding(self.camera, self.shots.name)
+        if finding is None:
+            return
+        text = finding.text
+        photographs = self.record.photographs
+        coarse = first_of_fewer_bits(photographs, self.shots.levels)
+        if coarse is not None:
+            text = coarse.describe(self.shots.name)
+        elif not finding.is_exchange:
+            explanation = Contradictions(photographs, self.camera).explain()
+            if explanation.suspects != set(finding.suspects):
+                text = explanation.describe(self.shots.name) or text
+        raise AcquisitionError(f"{text}; {ADVICE}")
 
     @contextlib.contextmanager
     def naming_photographs(self) -> Iterator[None]:
@@ -327,12 +347,18 @@ def _named(requests: Iterable[Request]) -> Iterator[tuple[str, Request]]:
 
 
 @contextlib.contextmanager
-def acquisition_error(subject: str) -> Iterator[None]:
-    """Raise an InputError about photographs as an AcquisitionError about `subject`."""
+def acquisition_error(subject: str, names: Sequence[str] = ()) -> Iterator[None]:
+    """Raise an InputError about photographs as an AcquisitionError about `subject`.
+
+    `names` replace images[0], images[1] and so on.
+    """
     try:
         yield
     except InputError as error:
-        raise AcquisitionError(f"{subject}: {error}") from error
+        text = str(error)
+        for k, name in enumerate(names):
+            text = text.replace(f"images[{k}]", name)
+        raise AcquisitionError(f"{subject}: {text}") from error
 
 
 def calibration_folder(store: Path) -> Path:

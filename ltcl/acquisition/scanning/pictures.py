@@ -221,6 +221,13 @@ class _ExposedPattern:
     light: StoredImage | None = None
 
 
+class _OtherPattern(NamedTuple):
+    """The first picture of a batch that shows another pattern than its own, and all in words."""
+
+    number: int
+    text: str
+
+
 class ScanCamera(ScanGrid):
     """A rig that was calibrated, as a camera on the pixels of the scan."""
 
@@ -270,9 +277,11 @@ class ScanCamera(ScanGrid):
             stored = anchor.compact(light, self._compact)
             exposed.append(replace(photographs, images=[], light=stored))
             progress(1)
-        self._check_patterns(patterns, pictures, exposed)
-        self.names = [self._names(photographs) for photographs in exposed]
+        unlike = self._find_other_pattern(patterns, pictures, exposed)
         blocks = self._photograph(anchor.marked(batch), times[:1])
+        if unlike is not None:
+            self._refuse_pattern(unlike, blocks, exposed)
+        self.names = [self._names(photographs) for photographs in exposed]
         first = self.lamp_gain
         self.lamp_gain = self._check_anchor(blocks, exposed)
         gains = np.linspace(first, self.lamp_gain, len(pictures)).tolist()
@@ -326,22 +335,41 @@ class ScanCamera(ScanGrid):
                 text = order
         raise AcquisitionError(f"{text}; {ADVICE}")
 
-    def _check_patterns(
+    def _find_other_pattern(
         self,
         patterns: Sequence[np.ndarray],
         pictures: Sequence[Picture],
         exposed: Sequence[_ExposedPattern],
-    ) -> None:
-        """Raise AcquisitionError if a picture shows another pattern than its own."""
+    ) -> _OtherPattern | None:
+        """Find pictures that show another pattern than their own."""
         comparison = _BatchComparison(self.white, patterns, pictures, self.lit)
-        unlike = comparison.unlike_their_patterns()
-        if len(unlike):
-            names = " and ".join(self._names(exposed[a]) for a in unlike.tolist())
-            raise AcquisitionError(f"{names}: another pattern than in the list; {ADVICE}")
+        unlike = comparison.unlike_their_patterns().tolist()
+        if unlike:
+            names = " and ".join(self._names(exposed[a]) for a in unlike)
+            return _OtherPattern(unlike[0], f"{names}: another pattern than in the list")
         for a, b in comparison.mixed_up():
             first = self._names(exposed[a])
             second = self._names(exposed[b])
-            raise AcquisitionError(f"{first} shows the pattern of {second}; {ADVICE}")
+            return _OtherPattern(min(a, b), f"{first} shows the pattern of {second}")
+        return None
+
+    def _refuse_pattern(
+        self,
+        unlike: _OtherPattern,
+        blocks: _ExposedPattern,
+        exposed: Sequence[_ExposedPattern],
+    ) -> None:
+        """Raise AcquisitionError about pictures of another pattern.
+
+        The camera may have moved instead: then the pattern of blocks is moved, too, as all pictures
+        since then are.
+        """
+        shifts = self._shifts(blocks, exposed)
+        if len(shifts) == len(exposed) + 1:
+            first = anchor.first_moved(shifts[:-1], shifts[-1])
+            if first <= unlike.number and anchor.are_moved_alike(shifts[first:]):
+                self._check_anchor(blocks, exposed)
+        raise AcquisitionError(f"{unlike.text}; {ADVICE}")
 
     def _names(self, photographs: _ExposedPattern) -> str:
         return " or ".join(self.shots.name(number) for number in photographs.numbers)
@@ -363,13 +391,8 @@ class ScanCamera(ScanGrid):
         gain = known.anchor.lamp_gain(*shot)
         if known.anchor.deviation(*shot, gain) is None:
             return gain
-        light = anchor.compact(self.merge(blocks.images), self._compact)
-        series = [*exposed, replace(blocks, images=[], light=light)]
-        setup = known.white, known.ambient, known.resampling
-        shifts = []
-        for photographs in series:
-            if photographs.light is not None:
-                shifts.append(anchor.shift_of(photographs.codes, photographs.light, *setup))
+        series = [*exposed, blocks]
+        shifts = self._shifts(blocks, exposed)
         *earlier, moved = shifts
         first = anchor.first_moved(earlier, moved)
         start = series[max(first - 1, 0)].numbers[0]
@@ -380,6 +403,19 @@ class ScanCamera(ScanGrid):
             "projector, the scene or the light changed "
             f"(moved by {np.hypot(*moved):.2g} camera pixels); {ADVICE}"
         )
+
+    def _shifts(
+        self, blocks: _ExposedPattern, exposed: Sequence[_ExposedPattern]
+    ) -> list[np.ndarray]:
+        """Movements of the pictures of a batch, and of the pattern of blocks after it."""
+        known = self.calibration
+        light = anchor.compact(self.merge(blocks.images), self._compact)
+        setup = known.white, known.ambient, known.resampling
+        shifts = []
+        for photographs in [*exposed, replace(blocks, images=[], light=light)]:
+            if photographs.light is not None:
+                shifts.append(anchor.shift_of(photographs.codes, photographs.light, *setup))
+        return shifts
 
     def keep_lamp_gain(self, store: BlockStore) -> None:
         """Keep the gain of the lamp in the store of a scan, which may go on from there."""
