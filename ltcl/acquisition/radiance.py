@@ -129,16 +129,25 @@ def difference(first: RadiancePicture, second: RadiancePicture, file: ImageFile)
     return result
 
 
-def completed(first: RadiancePicture, second: RadiancePicture, file: ImageFile) -> StoredRadiance:
-    """A picture, and where it is not valid another one, in a file."""
+def completed(
+    first: RadiancePicture,
+    second: RadiancePicture,
+    file: ImageFile,
+    *,
+    where: RadiancePicture | None = None,
+) -> StoredRadiance:
+    """A picture, and where it is not valid, but `where` is, another one, in a file."""
     result = StoredRadiance.reserve(file, first.shape)
     for rows in row_strips(first.shape):
         own = first.rows(rows)
         other = second.rows(rows)
+        is_other = ~own.valid & other.valid
+        if where is not None:
+            is_other &= where.rows(rows).valid
         strip = Radiance(
-            np.where(own.valid, own.value, other.value),
-            np.where(own.valid, own.variance, other.variance),
-            own.valid | other.valid,
+            np.where(is_other, other.value, own.value),
+            np.where(is_other, other.variance, own.variance),
+            own.valid | is_other,
         )
         result.write(rows.start, strip)
     return result

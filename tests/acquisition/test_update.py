@@ -152,6 +152,20 @@ def test_black_at_the_lowest_code_hides_no_pixel(tmp_path: Path) -> None:
 
 
 @pytest.mark.rare
+def test_pixels_at_the_lowest_code_are_black(tmp_path: Path) -> None:
+    """A dark wall, and a camera without an offset: pixels that are not lit have no value."""
+    options: dict[str, Any] = {"ambient": 0.0, "black": 0.0}
+    old = tmp_path / "scan.zarr"
+    acquire(rig(camera_transport(albedo=0.05), **options), strategy="sketch", store=old)
+    truth = camera_transport(0.5, -0.6, albedo=0.05)
+    store = tmp_path / "new.zarr"
+    result = ltcl.update(rig(truth, **options), old, store=store)
+    assert result.shift == pytest.approx((0.5, -0.6), abs=0.01)
+    assert result.gain == pytest.approx(1.0, abs=0.01)
+    assert true_error(store, result.transport, truth) < 0.03
+
+
+@pytest.mark.rare
 def test_a_wider_picture(scan: Scan, tmp_path: Path) -> None:
     """A movement that is no shift: 4 % wider, and higher, from the middle."""
     truth = camera_transport(spread=0.04)

@@ -382,7 +382,12 @@ def _carry_over(
     light = photograph(shots, seconds, calibration.camera, progress)
     # At the lowest code of a camera black has no value; longer exposures of the scan have one.
     black = completed(light.black, calibration.ambient, ImageFile())
-    light = replace(light, black=black)
+    light = replace(
+        light,
+        black=black,
+        fitted=_with_dark(light.fitted, black, light.white),
+        judging=_with_dark(light.judging, black, light.white),
+    )
     old_grid = ScanGrid(calibration)
     unit = _unit_of_light(T, old_grid.white)
 
@@ -410,7 +415,8 @@ def _carry_over(
     while not corrected.judgement.holds and photographs + BATCH_SIZE <= most_photographs:
         _tell_round(corrected, photographs, most_photographs)
         number = (photographs - PHOTOGRAPHS) // BATCH_SIZE
-        more = photograph_round(shots, number, seconds, calibration.camera, progress)
+        taken = photograph_round(shots, number, seconds, calibration.camera, progress)
+        more = _with_dark(taken, black, light.white)
         correction.add(sketch.more_patterns(shots.grid, number), more, corrected.judgement.failing)
         photographs += BATCH_SIZE
         corrected = correction.correct(progress)
@@ -426,6 +432,14 @@ def _carry_over(
         own_variance=noise.own_variance,
         arrays=_arrays(corrected, noise, now.mixing),
     )
+
+
+def _with_dark(
+    pictures: Sequence[StoredRadiance], black: RadiancePicture, white: RadiancePicture
+) -> list[StoredRadiance]:
+    """Pictures that are black where they are at the lowest code: white is not saturated there."""
+    file = ImageFile()
+    return [completed(picture, black, file, where=white) for picture in pictures]
 
 
 def _tell_round(corrected: _Corrected, photographs: int, most: int) -> None:
