@@ -68,8 +68,13 @@ CAMERAS = {"12 bits": ("linear", 12), "8 bits, film": ("film", 8)}
 MAX_PHOTOGRAPHS = 100
 # Photographs of a sketch that goes on in rounds.
 LONGER_SCAN = 150
-MAX_ERRORS = {"nature": 0.01, "text": 0.01, "checkerboard": 0.015, "patches": 0.015}
-MAX_COMPENSATED_ERROR = 0.01
+MAX_ERRORS = {
+    "nature": 0.01,
+    "text": 0.01,
+    "checkerboard": 0.015,
+    "patches": 0.015,
+    "compensated": 0.01,
+}
 # Pixels along each side of scenes in perspective, and of those whose bounces are compared.
 SIDE = 64
 BOUNCES_SIDE = 32
@@ -523,24 +528,8 @@ def hand_claims(side: int, options: Options) -> list[Claim]:
         T = acquire(rig, strategy="sketch", store=path, device=options.device)
         errors = errors_on_camera(path, T, rig)
     name = f"by hand, {side} x {side}"
-    checked = [
-        Claim(
-            text=f"{name}: photographs",
-            measured=str(rig.count),
-            wanted=f"at most {MAX_PHOTOGRAPHS_BY_HAND}",
-            holds=rig.count <= MAX_PHOTOGRAPHS_BY_HAND,
-        )
-    ]
-    for kind, error in errors.items():
-        checked.append(
-            Claim(
-                text=f"{name}: {kind}",
-                measured=f"{error:.2%}",
-                wanted=f"at most {MAX_ERROR_BY_HAND:.1%}",
-                holds=error <= MAX_ERROR_BY_HAND,
-            )
-        )
-    return checked
+    limits = dict.fromkeys(errors, MAX_ERROR_BY_HAND)
+    return budget_claims(f"{name}: ", rig.count, MAX_PHOTOGRAPHS_BY_HAND, errors, limits)
 
 
 def update_claims(updated: Updated) -> list[Claim]:
@@ -570,9 +559,13 @@ def update_claims(updated: Updated) -> list[Claim]:
 
 
 def budget_claims(
-    prefix: str, photographs: int, most: int, errors: dict[str, float], compensated: float
+    prefix: str,
+    photographs: int,
+    most: int,
+    errors: dict[str, float],
+    limits: dict[str, float] = MAX_ERRORS,
 ) -> list[Claim]:
-    """Check the photographs of a sketch, its errors, and that of a compensated picture."""
+    """Check the photographs of a sketch, and its errors."""
     checked = [
         Claim(
             text=f"{prefix}photographs",
@@ -581,8 +574,7 @@ def budget_claims(
             holds=photographs <= most,
         )
     ]
-    limits = {**MAX_ERRORS, "compensated": MAX_COMPENSATED_ERROR}
-    for kind, error in {**errors, "compensated": compensated}.items():
+    for kind, error in errors.items():
         checked.append(
             Claim(
                 text=f"{prefix}{kind}",
@@ -600,8 +592,7 @@ def claims(result: Result) -> list[Claim]:
         f"{result.name}: ",
         result.photographs,
         MAX_PHOTOGRAPHS,
-        result.errors,
-        result.compensated,
+        result.errors | {"compensated": result.compensated},
     )
     nature = result.errors["nature"]
     checked.append(
@@ -706,7 +697,8 @@ def main() -> None:
             facts[f"{updated.name}, {kind}"] = error
             facts[f"{updated.name}, {kind} in the scan"] = updated.old_errors[kind]
         checked += update_claims(updated)
-    for hand_side in HAND_SIDES[:1] if options.smoke else HAND_SIDES:
+    hand_sides = HAND_SIDES[:1] if options.smoke else HAND_SIDES
+    for hand_side in hand_sides:
         checked += hand_claims(hand_side, options)
     if options.smoke:
         # So few pixels show that it runs, not how few photographs a larger scene takes.

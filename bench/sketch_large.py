@@ -201,9 +201,8 @@ def prepared_rate(T: ltcl.Transport, bounces_every: int = 1) -> float:
 
 def claims(result: LargeSketch, is_large: bool) -> list[Claim]:
     """Check a sketch."""
-    checked = budget_claims(
-        "", result.photographs, MAX_PHOTOGRAPHS, result.errors, result.compensated
-    )
+    errors = result.errors | {"compensated": result.compensated}
+    checked = budget_claims("", result.photographs, MAX_PHOTOGRAPHS, errors)
     if is_large:
         amounts = [
             ("memory", result.cost.bytes / 1e6, MAX_LARGE_BYTES / 1e6, "MB"),

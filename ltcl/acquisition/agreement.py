@@ -31,7 +31,6 @@ import numpy as np
 
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import shot_key
-from ltcl.errors import AcquisitionError
 
 # Systematic errors, relative to light and to full scale.
 SCALE_ERROR = 0.02
@@ -197,19 +196,13 @@ class AgreementRecord:
         self._by_pattern[photograph.pattern].append(photograph)
         self._by_exposure[seconds].append(photograph)
 
-    def check(self, camera: CameraModel, name: PhotographName = name_by_number) -> None:
-        """Raise AcquisitionError if photographs of a pattern, or of it and its inverse, deviate.
-
-        It names the photograph, or the few of which one must be wrong; of several, the first.
-        """
-        finding = self.first_finding(camera, name)
-        if finding is not None:
-            raise AcquisitionError(f"{finding.text}; {ADVICE}")
-
     def first_finding(
         self, camera: CameraModel, name: PhotographName = name_by_number
     ) -> Finding | None:
-        """The first deviation among photographs of a pattern, or of it and its inverse, if any."""
+        """The first deviation among photographs of a pattern, or of it and its inverse, if any.
+
+        It names the photograph, or the few of which one must be wrong.
+        """
         findings = []
 
         def note(group: list[RecordedPhotograph], deviation: Deviation | None) -> None:
@@ -372,7 +365,7 @@ class LinearLight:
         """Photographs of several parts, in order."""
 
         def join(name: str) -> np.ndarray:
-            return np.concatenate([getattr(part, name) for part in parts])
+            return np.concatenate([getattr(light, name) for light in parts])
 
         return cls(**{field.name: join(field.name) for field in fields(cls)})
 

@@ -595,8 +595,11 @@ def _check_black_and_white(
     of_white_exposure = [shot for shot in dark if shot.seconds == white_exposure]
     consistency.check_black(session, of_white_exposure)
     by_exposure = {photograph.seconds: photograph for photograph in bright}
-    images = [photograph.sampled for photograph in by_exposure.values()]
-    names = [session.name(photograph) for photograph in by_exposure.values()]
+    images = []
+    names = []
+    for photograph in by_exposure.values():
+        images.append(photograph.sampled)
+        names.append(session.name(photograph))
     try:
         check_full_scale(session.shots, list(by_exposure), images, names)
     except OtherLight:

@@ -109,7 +109,9 @@ class Explanation:
         if changes:
             where = self._describe_changes(changes, name)
             texts.append(f"{where}: the camera or scene moved, or the light changed")
-        return "; or ".join(texts) if texts else None
+        if not texts:
+            return None
+        return "; or ".join(texts)
 
     def _describe_changes(self, changes: Sequence[int], name: PhotographName) -> str:
         """The photographs from one of which on the others deviate."""
@@ -337,21 +339,21 @@ def _stretched(
     """Light of a uniform code as if it were white's; None without enough."""
     light = _linear_light([photograph], camera, white)
     full = photograph.seconds * white - black
-    part = light.value[0] - black
+    lit = light.value[0] - black
     shares = []
     for c in range(full.shape[1]):
         bright = full[:, c] >= BRIGHT_SHARE * np.quantile(full[:, c], 0.99)
-        bright &= np.isfinite(part[:, c])
+        bright &= np.isfinite(lit[:, c])
         if not bright.any():
             return None
-        shares.append(np.median(part[bright, c] / np.maximum(full[bright, c], 1e-9)))
+        shares.append(np.median(lit[bright, c] / np.maximum(full[bright, c], 1e-9)))
     share = np.array(shares)
     if share.min() < MIN_UNIFORM_SHARE:
         return None
     unevenness = (PROJECTOR_UNEVENNESS * full) ** 2
     return replace(
         light,
-        value=(black + part / share)[None],
+        value=(black + lit / share)[None],
         variance=light.variance / share**2 + unevenness,
         limit=np.full(light.limit.shape, np.inf),
         bias=light.bias / share,
@@ -392,8 +394,10 @@ def first_of_fewer_bits(
             trailing_zeros.append((union & -union).bit_length() - 1)
             numbers.append(photograph.number)
     is_coarse = np.array(trailing_zeros) >= MIN_TRAILING_ZEROS
-    first = len(is_coarse) - int(np.argmin(is_coarse[::-1])) if len(is_coarse) else 0
-    if first == 0 or first == len(is_coarse) or is_coarse[:first].any():
+    if is_coarse.all() or not is_coarse.any():
+        return None
+    first = int(is_coarse.argmax())
+    if not is_coarse[first:].all():
         return None
     zeros = min(trailing_zeros[first:])
     bits = (levels - 1).bit_length() - zeros

@@ -18,7 +18,6 @@ from ltcl.acquisition.agreement import ROUGH_NOISE, AgreementRecord, CameraModel
 from ltcl.acquisition.calibrate import measure
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
-from ltcl.errors import AcquisitionError
 
 from .stopping import Unplugged
 
@@ -53,11 +52,8 @@ def message(images: Any, seconds: Any, codes: Any = None, camera: CameraModel = 
     numbers = range(FIRST, FIRST + len(images))
     for pattern, image, t, number in zip(codes, images, seconds, numbers, strict=True):
         record.add(pattern, t, image, number)
-    try:
-        record.check(camera)
-    except AcquisitionError as error:
-        return str(error)
-    return ""
+    finding = record.first_finding(camera)
+    return "" if finding is None else finding.text
 
 
 def named(text: str) -> set[int]:

@@ -655,14 +655,11 @@ def _find_movement(
     still = no_movement(views, T.products)
     if still.misfit <= NOTABLE_MISFIT_RATIO * fit.misfit + NOTABLE_MISFIT:
         fit = still
-    shown = _flat(all_patterns(grid.grid))
     taken = [light.black, light.white, *light.fitted, *light.judging]
     all_pictures = _Pictures.of(grid, light.black, taken, unit)
+    # A fit to a picture of another pattern may be off; the search is less so.
     for movement in (first, fit.movement):
-        lit = views.resampled(movement) @ shown.T
-        foretold = fit.gain * T.products(lit.T)
-        is_known = all_pictures.variance.max(axis=0) < KNOWN_VARIANCE
-        check_order(foretold, all_pictures.value, is_known)
+        _check_order_of(all_pictures, T, views, movement, fit.gain)
     if fit.typical_misfit > MAX_MISFIT:
         raise AcquisitionError(
             f"no movement of the projector by up to {largest:.1f} pixels explains the photographs: "
@@ -675,6 +672,15 @@ def _find_movement(
             f"follows {largest:.1f} at most, an eighth of the picture; a new scan is needed"
         )
     return fit
+
+
+def _check_order_of(
+    pictures: _Pictures, T: HostTransport, views: Views, movement: Movement, gain: np.ndarray
+) -> None:
+    """Refuse pictures of all photographs of which one shows the pattern of another."""
+    lit = views.resampled(movement) @ _flat(all_patterns(views.grid)).T
+    is_known = pictures.variance.max(axis=0) < KNOWN_VARIANCE
+    check_order(gain * T.products(lit.T), pictures.value, is_known)
 
 
 def _moved_calibration(

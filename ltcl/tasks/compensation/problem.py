@@ -78,7 +78,10 @@ class Limits:
         """Rows whose arrays fit the caches, and the largest light of each, (rows, 1) or (1, 1)."""
         for first in range(0, len(self.masked), ROWS_AT_ONCE):
             rows = slice(first, first + ROWS_AT_ONCE)
-            yield rows, self.highest if self.ceilings is None else self.highest[rows]
+            highest = self.highest
+            if self.ceilings is not None:
+                highest = highest[rows]
+            yield rows, highest
 
     def clip(self, light: np.ndarray) -> np.ndarray:
         """Light (N, k) moved within the bounds, as float32."""
@@ -232,10 +235,14 @@ class CompensationProblem:
         lower = np.empty(len(limits.masked), np.float32)
         upper = np.empty(len(limits.masked), np.float32)
         for rows, highest in limits.blocks():
-            free_scale = np.where(limits.masked[rows], 0.0, self.systems[index].scale[rows])
+            free_scale = self._free_scale(index, rows)
             lower[rows] = free_scale * limits.low
             upper[rows] = free_scale * highest[:, 0]
         return lower, upper
+
+    def _free_scale(self, index: int, rows: slice) -> np.ndarray:
+        """The unknowns of some pixels of a system for their light, 0 where they are masked."""
+        return np.where(self.limits.masked[rows], 0.0, self.systems[index].scale[rows])
 
     def _box_problem(self, index: int, target: np.ndarray, start: np.ndarray) -> BoxProblem:
         """The unknowns of one system within the limits, from a start (N, k) of light."""
@@ -273,9 +280,7 @@ class CompensationProblem:
         nearest = np.empty(x.shape, np.float32)
         for rows, highest in limits.blocks():
             block = x[rows]
-            free_scale = np.where(limits.masked[rows], 0.0, self.systems[index].scale[rows])[
-                :, None
-            ]
+            free_scale = self._free_scale(index, rows)[:, None]
             is_free = free_scale > 0
             light = np.divide(block, free_scale, out=np.zeros(block.shape), where=is_free)
             # Division rounds: values at a bound are to stay there.

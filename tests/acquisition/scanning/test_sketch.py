@@ -23,6 +23,7 @@ from ltcl.acquisition import (
 )
 from ltcl.acquisition.calibrate import expected_photographs
 from ltcl.acquisition.estimation import refinement, windows
+from ltcl.acquisition.estimation.contradiction import find_wrong_pictures
 from ltcl.acquisition.geometry import GrayCode
 from ltcl.acquisition.scanning import sketch
 from ltcl.acquisition.scanning.plan import choose, plans
@@ -344,6 +345,26 @@ def test_several_pictures_that_all_others_contradict_are_refused(tmp_path: Path)
         scan_with_fault(tmp_path / "T.zarr", with_lamp, wrong)
     for number in wrong:
         assert f"pattern {number} (photograph" in str(error.value)
+
+
+def test_a_light_is_weighed_against_the_error_of_the_judges_that_are_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = []
+
+    def find(pairs: Any, learn: Any, error_without: Any) -> Any:
+        wrong, estimator = find_wrong_pictures(pairs, learn, error_without)
+        last = len(pairs) - 1
+        errors.extend([error_without([], estimator), error_without([last], estimator)])
+        return wrong, estimator
+
+    monkeypatch.setattr(sketch, "find_wrong_pictures", find)
+    path = tmp_path / "T.zarr"
+    acquire(Unplugged(corner(), SMALL), geometry="aligned", strategy="sketch", store=path)
+    of_all, without_last = errors
+    report = Report.of(path)
+    assert of_all == pytest.approx(report.judged_error)
+    assert 0.0 < without_last != of_all
 
 
 ROUND = 17  # photographs: 16 patterns, and the one that all batches end with
